@@ -1,0 +1,29 @@
+"""The errors vioframe raises on purpose. Each message is one line that says what is wrong and what to do about it."""
+
+
+class VioframeError(Exception):
+    """Root of all errors raised by vioframe; the command line turns it into one line and exit code 2."""
+
+
+class ConfigError(VioframeError):
+    """A configuration file or option is invalid."""
+
+
+class PluginError(VioframeError):
+    """A plug-in is unknown, registered twice, or broke its contract."""
+
+
+class DatasetError(VioframeError):
+    """A data set cannot be read as asked."""
+
+
+class CalibrationError(VioframeError):
+    """A calibration file is missing, unreadable or inconsistent."""
+
+
+class TrajectoryError(VioframeError):
+    """A trajectory file is malformed, or two trajectories cannot be compared."""
+
+
+class RunError(VioframeError):
+    """A run folder exists already, is incomplete, or cannot be written."""

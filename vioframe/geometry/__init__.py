@@ -1,0 +1,1 @@
+"""Rotations, cameras and multiple-view geometry: pure functions of arrays."""

@@ -1,0 +1,149 @@
+"""Pinhole cameras with radial-tangential or equidistant distortion.
+
+A point on the z = 1 plane (``xy_normalised``) maps to a pixel ``xy`` = (fx u + cx, fy v + cy), where (u, v) is the
+distorted point. Pixels are (x, y) with integers at pixel centres.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from vioframe.errors import CalibrationError
+from vioframe.types import Float
+
+DistortionModel = Literal["radtan", "equidistant"]
+
+
+@dataclass(frozen=True)
+class Camera:
+    """``resolution`` is (width, height) px; ``distortion`` is (4,): k1 k2 p1 p2 (radtan) or k1 k2 k3 k4 (equidistant)."""
+
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    distortion: tuple[float, float, float, float]
+    resolution: tuple[int, int]
+    model: DistortionModel = "radtan"
+
+    def __post_init__(self) -> None:
+        if self.model not in ("radtan", "equidistant"):
+            raise CalibrationError(f"unknown distortion model {self.model!r}; use radtan or equidistant")
+        numbers = [self.fx, self.fy, self.cx, self.cy, *self.distortion]
+        if len(self.distortion) != 4 or not np.all(np.isfinite(numbers)) or self.fx <= 0.0 or self.fy <= 0.0:
+            raise CalibrationError(f"camera needs fx, fy > 0 and four finite distortion coefficients, got {numbers}")
+
+    @property
+    def K(self) -> Float:
+        """(3, 3) intrinsic matrix."""
+        return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
+
+    @property
+    def focal_px(self) -> float:
+        """Mean focal length, for turning pixels into normalised units."""
+        return 0.5 * (self.fx + self.fy)
+
+    @cached_property
+    def _focal(self) -> Float:
+        return np.array([self.fx, self.fy])
+
+    @cached_property
+    def _centre(self) -> Float:
+        return np.array([self.cx, self.cy])
+
+    def project(self, p_C: ArrayLike) -> Float:
+        """(N, 3) points in the camera frame, z > 0 -> (N, 2) px."""
+        p_C = np.asarray(p_C, dtype=np.float64)
+        return self.distort(p_C[:, :2] / p_C[:, 2:])
+
+    def distort(self, xy_normalised: ArrayLike) -> Float:
+        """(N, 2) undistorted points on the z = 1 plane -> (N, 2) px."""
+        return self._distort(np.asarray(xy_normalised, dtype=np.float64)) * self._focal + self._centre
+
+    def undistort(self, xy: ArrayLike) -> Float:
+        """(N, 2) px -> (N, 2) undistorted points on the z = 1 plane, by Newton's method; the inverse of :meth:`distort`.
+
+        Points so far outside the image that the model cannot be inverted come back as NaN.
+        """
+        target = (np.asarray(xy, dtype=np.float64).reshape(-1, 2) - self._centre) / self._focal
+        guess = target.copy()
+        if self.model == "equidistant":
+            # The distorted radius is nearly the angle from the axis; start from the undistorted tangent.
+            theta = np.linalg.norm(target, axis=1, keepdims=True)
+            guess *= np.tan(np.minimum(theta, 1.5)) / np.where(theta < 1e-9, 1.0, theta)
+        for _ in range(20):
+            error = self._distort(guess) - target
+            if np.all(np.abs(error) < 1e-12):
+                break
+            J = self._distort_jacobian(guess)
+            det = J[:, 0, 0] * J[:, 1, 1] - J[:, 0, 1] * J[:, 1, 0]
+            det = np.where(np.abs(det) < 1e-9, np.nan, det)
+            guess[:, 0] -= (J[:, 1, 1] * error[:, 0] - J[:, 0, 1] * error[:, 1]) / det
+            guess[:, 1] -= (J[:, 0, 0] * error[:, 1] - J[:, 1, 0] * error[:, 0]) / det
+        with np.errstate(invalid="ignore"):
+            diverged = ~(np.abs(self._distort(guess) - target) < 1e-6).all(axis=1)
+        guess[diverged] = np.nan
+        return guess
+
+    def distort_jacobian(self, xy_normalised: ArrayLike) -> Float:
+        """d xy / d xy_normalised, (N, 2, 2) px."""
+        return self._distort_jacobian(np.asarray(xy_normalised, dtype=np.float64)) * self._focal[:, None]
+
+    def contains(self, xy: ArrayLike, border_px: float = 0.0) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
+        """(N,) whether pixels lie in the image, at least ``border_px`` from its outermost pixel centres."""
+        xy = np.asarray(xy, dtype=np.float64).reshape(-1, 2)
+        limit = np.array(self.resolution) - 1.0 - border_px
+        inside: np.ndarray[tuple[int], np.dtype[np.bool_]] = ((xy >= border_px) & (xy <= limit)).all(axis=1)
+        return inside
+
+    def _distort(self, xy: Float) -> Float:
+        x, y = xy[:, 0], xy[:, 1]
+        r2 = x * x + y * y
+        if self.model == "radtan":
+            k1, k2, p1, p2 = self.distortion
+            radial = 1.0 + r2 * (k1 + k2 * r2)
+            return np.stack(
+                [
+                    x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x),
+                    y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y,
+                ],
+                axis=1,
+            )
+        return xy * self._equidistant_scale(r2)[0][:, None]
+
+    def _distort_jacobian(self, xy: Float) -> Float:
+        x, y = xy[:, 0], xy[:, 1]
+        r2 = x * x + y * y
+        J = np.empty((len(xy), 2, 2))
+        if self.model == "radtan":
+            k1, k2, p1, p2 = self.distortion
+            radial = 1.0 + r2 * (k1 + k2 * r2)
+            slope = 2.0 * (k1 + 2.0 * k2 * r2)  # d radial / d r2, times 2
+            J[:, 0, 0] = radial + slope * x * x + 2.0 * p1 * y + 6.0 * p2 * x
+            J[:, 1, 1] = radial + slope * y * y + 6.0 * p1 * y + 2.0 * p2 * x
+            J[:, 0, 1] = J[:, 1, 0] = slope * x * y + 2.0 * p1 * x + 2.0 * p2 * y
+            return J
+        scale, slope = self._equidistant_scale(r2)
+        J[:, 0, 0] = scale + slope * x * x
+        J[:, 1, 1] = scale + slope * y * y
+        J[:, 0, 1] = J[:, 1, 0] = slope * x * y
+        return J
+
+    def _equidistant_scale(self, r2: Float) -> tuple[Float, Float]:
+        """theta_d / r, and its derivative by r divided by r (Kannala and Brandt 2006)."""
+        k1, k2, k3, k4 = self.distortion
+        r = np.sqrt(r2)
+        small = r < 1e-6
+        safe = np.where(small, 1.0, r)
+        theta = np.arctan(r)
+        t2 = theta * theta
+        theta_d = theta * (1.0 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4))))
+        d_theta = 1.0 + t2 * (3.0 * k1 + t2 * (5.0 * k2 + t2 * (7.0 * k3 + t2 * 9.0 * k4)))
+        scale = np.where(small, 1.0, theta_d / safe)
+        slope = np.where(small, 2.0 * (k1 - 1.0 / 3.0), (d_theta / (1.0 + r2) - scale) / safe**2)
+        return scale, slope

@@ -1,0 +1,126 @@
+"""The rotation group SO(3): batched over leading axes, safe near the identity and near pi.
+
+Perturbations act on the right, ``R <- R Exp(dtheta)``. Formulas follow Solà, Deray, Atchuthan, "A micro Lie theory for
+state estimation in robotics" (2018), equation numbers in brackets.
+"""
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from vioframe.types import Float
+
+# Below this angle the Taylor series, cut after two terms, is exact to double precision.
+_SMALL = 1e-4
+
+
+def hat(phi: ArrayLike) -> Float:
+    """(..., 3) -> (..., 3, 3), the skew matrix with ``hat(a) @ b == cross(a, b)``."""
+    phi = np.asarray(phi, dtype=np.float64)
+    out = np.zeros((*phi.shape, 3))
+    out[..., 0, 1], out[..., 0, 2], out[..., 1, 2] = -phi[..., 2], phi[..., 1], -phi[..., 0]
+    out[..., 1, 0], out[..., 2, 0], out[..., 2, 1] = phi[..., 2], -phi[..., 1], phi[..., 0]
+    return out
+
+
+def _coefficients(angle: Float) -> tuple[Float, Float, Float]:
+    """sin(a)/a, (1 - cos(a))/a^2 and (a - sin(a))/a^3, by series where a is small."""
+    small = angle < _SMALL
+    a = np.where(small, 1.0, angle)
+    a2 = angle * angle
+    sinc = np.where(small, 1.0 - a2 / 6.0, np.sin(a) / a)
+    cosc = np.where(small, 0.5 - a2 / 24.0, (1.0 - np.cos(a)) / a**2)
+    sinc3 = np.where(small, 1.0 / 6.0 - a2 / 120.0, (a - np.sin(a)) / a**3)
+    return sinc, cosc, sinc3
+
+
+def exp(phi: ArrayLike) -> Float:
+    """(..., 3) rad -> (..., 3, 3), Rodrigues' formula [132]."""
+    phi = np.asarray(phi, dtype=np.float64)
+    sinc, cosc, _ = _coefficients(np.linalg.norm(phi, axis=-1))
+    K = hat(phi)
+    out: Float = np.eye(3) + sinc[..., None, None] * K + cosc[..., None, None] * (K @ K)
+    return out
+
+
+def log(R: ArrayLike) -> Float:
+    """(..., 3, 3) -> (..., 3) rad with norm <= pi [133]; through the quaternion, which keeps it exact near pi."""
+    quat = to_quat_xyzw(R)
+    vector, w = quat[..., :3], quat[..., 3]
+    norm = np.linalg.norm(vector, axis=-1)
+    small = norm < _SMALL
+    # 2 atan2(n, w) / n, which tends to 2 + n^2 / 3.
+    scale = np.where(small, 2.0 + norm**2 / 3.0, 2.0 * np.arctan2(norm, w) / np.where(small, 1.0, norm))
+    return scale[..., None] * vector
+
+
+def right_jacobian(phi: ArrayLike) -> Float:
+    """J_r with ``Exp(phi + d) ~ Exp(phi) Exp(J_r(phi) d)`` [143], (..., 3, 3)."""
+    phi = np.asarray(phi, dtype=np.float64)
+    _, cosc, sinc3 = _coefficients(np.linalg.norm(phi, axis=-1))
+    K = hat(phi)
+    out: Float = np.eye(3) - cosc[..., None, None] * K + sinc3[..., None, None] * (K @ K)
+    return out
+
+
+def left_jacobian(phi: ArrayLike) -> Float:
+    """J_l(phi) = J_r(-phi) [145], (..., 3, 3)."""
+    return right_jacobian(-np.asarray(phi, dtype=np.float64))
+
+
+def right_jacobian_inverse(phi: ArrayLike) -> Float:
+    """J_r^-1 with ``Log(Exp(phi) Exp(d)) ~ phi + J_r^-1(phi) d`` [144], (..., 3, 3)."""
+    phi = np.asarray(phi, dtype=np.float64)
+    angle = np.linalg.norm(phi, axis=-1)
+    small = angle < _SMALL
+    a = np.where(small, 1.0, angle)
+    half = 0.5 * a
+    c = np.where(small, 1.0 / 12.0 + angle**2 / 720.0, (1.0 - half * np.cos(half) / np.sin(half)) / a**2)
+    K = hat(phi)
+    out: Float = np.eye(3) + 0.5 * K + c[..., None, None] * (K @ K)
+    return out
+
+
+def to_quat_xyzw(R: ArrayLike) -> Float:
+    """(..., 3, 3) -> (..., 4), Hamilton, unit norm, w >= 0 (Shepperd's method: the largest component is divided by)."""
+    R = np.asarray(R, dtype=np.float64)
+    m = R.reshape(-1, 3, 3)
+    diagonal = m[:, [0, 1, 2], [0, 1, 2]]
+    trace = diagonal.sum(axis=1)
+    # Four times the products q_i q_j; the row of the largest diagonal entry is proportional to q.
+    Q = np.empty((len(m), 4, 4))
+    for i in range(3):
+        Q[:, i, i] = 1.0 - trace + 2.0 * diagonal[:, i]
+        for j in range(i):
+            Q[:, i, j] = Q[:, j, i] = m[:, i, j] + m[:, j, i]
+        k, n = (i + 1) % 3, (i + 2) % 3
+        Q[:, i, 3] = Q[:, 3, i] = m[:, n, k] - m[:, k, n]
+    Q[:, 3, 3] = 1.0 + trace
+    best = np.argmax(Q[:, [0, 1, 2, 3], [0, 1, 2, 3]], axis=1)
+    quat = Q[np.arange(len(m)), best]
+    quat *= (np.where(quat[:, 3] < 0.0, -1.0, 1.0) / np.linalg.norm(quat, axis=1))[:, None]
+    return quat.reshape(*R.shape[:-2], 4)
+
+
+def from_quat_xyzw(quat: ArrayLike) -> Float:
+    """(..., 4) Hamilton quaternions of any norm but zero -> (..., 3, 3)."""
+    quat = np.asarray(quat, dtype=np.float64)
+    q = quat / np.linalg.norm(quat, axis=-1, keepdims=True)
+    K = hat(q[..., :3])
+    out: Float = np.eye(3) + 2.0 * (q[..., 3, None, None] * K + K @ K)
+    return out
+
+
+def interpolate(R_0: ArrayLike, R_1: ArrayLike, fraction: ArrayLike) -> Float:
+    """Geodesic from ``R_0`` (fraction 0) to ``R_1`` (fraction 1), (..., 3, 3)."""
+    R_0 = np.asarray(R_0, dtype=np.float64)
+    phi = log(np.swapaxes(R_0, -1, -2) @ np.asarray(R_1, dtype=np.float64))
+    out: Float = R_0 @ exp(np.asarray(fraction, dtype=np.float64)[..., None] * phi)
+    return out
+
+
+def project(M: ArrayLike) -> Float:
+    """The rotation nearest to ``M`` (..., 3, 3) in the Frobenius norm."""
+    U, _, Vt = np.linalg.svd(np.asarray(M, dtype=np.float64))
+    U[..., :, 2] *= np.linalg.det(U @ Vt)[..., None]
+    out: Float = U @ Vt
+    return out

@@ -1,0 +1,75 @@
+"""What a plug-in must provide. Plain protocols: nothing to inherit from, nothing to register but a name."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
+
+from vioframe.types import Calibration, Estimate, FrameTracks, Image, ImuSegment, Keypoints, Measurement
+
+if TYPE_CHECKING:
+    from vioframe.trajectory import Trajectory
+
+
+@runtime_checkable
+class Detector(Protocol):
+    """Finds keypoints in one image. It gets no mask: the front-end keeps the candidates that are away from live tracks."""
+
+    def detect(self, image: Image, max_points: int) -> Keypoints:
+        """At most ``max_points`` keypoints of ``image`` (H, W) uint8, strongest first."""
+        ...
+
+
+@runtime_checkable
+class Backend(Protocol):
+    """Estimates motion from inertial segments and feature tracks, one frame at a time."""
+
+    def process(self, imu: ImuSegment, tracks: FrameTracks) -> Estimate:
+        """Take the readings since the last frame and the tracks of this one; say what is known now."""
+        ...
+
+
+@runtime_checkable
+class Dataset(Protocol):
+    """A recorded flight, read once from front to back."""
+
+    @property
+    def name(self) -> str:
+        """Short name, such as ``MH_05_difficult``."""
+        ...
+
+    @property
+    def calibration(self) -> Calibration:
+        """Calibration of the camera and IMU that are read."""
+        ...
+
+    @property
+    def frame_count(self) -> int | None:
+        """Number of images, for progress bars; None where it is not known."""
+        ...
+
+    @property
+    def ground_truth(self) -> Trajectory | None:
+        """The body's true trajectory where the data set itself brings one in the body frame, else None."""
+        ...
+
+    def measurements(self) -> Iterator[Measurement]:
+        """IMU samples and frames in roughly ascending order of their header stamps."""
+        ...
+
+
+class DatasetFactory(Protocol):
+    """Opens a recording. Usually the data set's class itself, with ``accepts`` as a static method."""
+
+    def __call__(self, path: Path, **options: Any) -> Dataset:
+        """Open ``path``; raises :class:`vioframe.errors.DatasetError` where it cannot be read."""
+        ...
+
+    def accepts(self, path: Path) -> bool:
+        """Whether ``path`` looks like this reader's format (a look at names and magic bytes, no parsing)."""
+        ...
+
+
+DetectorFactory = Callable[..., Detector]
+BackendFactory = Callable[..., Backend]

@@ -1,0 +1,191 @@
+"""The types that cross a stage border: vioframe's glossary.
+
+Conventions (``docs/conventions.md``): W world (z up), B body = IMU, C camera, F feature. ``p_A = R_AB @ p_B + p_AB``.
+A trailing letter names the frame of expression. Time is integer nanoseconds of the *camera* clock: synchronisation moves
+IMU stamps there (``t_imu = t_cam + time_offset``), so that nothing downstream knows of two clocks.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from enum import StrEnum
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from vioframe.geometry.cameras import Camera
+
+Float = NDArray[np.float64]
+Int = NDArray[np.int64]
+Image = NDArray[np.uint8]
+
+NS_PER_S = 1_000_000_000
+
+GRAVITY_M_S2 = 9.81
+"""Magnitude of gravity used everywhere, m/s^2."""
+
+g_W: Float = np.array([0.0, 0.0, -GRAVITY_M_S2])
+"""Gravity in the world frame, (3,) m/s^2; ``accel_B = R_WB.T @ (a_W - g_W) + bias + noise``."""
+g_W.flags.writeable = False
+
+# The error state [dtheta dp dv dbg dba], (15,), with R <- R Exp(dtheta) and everything else additive.
+DTHETA = slice(0, 3)
+DP = slice(3, 6)
+DV = slice(6, 9)
+DBG = slice(9, 12)
+DBA = slice(12, 15)
+
+
+@dataclass(frozen=True, slots=True)
+class ImuSample:
+    """One reading of the IMU: ``gyro_B`` (3,) rad/s and ``accel_B`` (3,) m/s^2, the specific force."""
+
+    t_ns: int
+    gyro_B: Float
+    accel_B: Float
+
+
+@dataclass(frozen=True, slots=True)
+class Frame:
+    """One image, (H, W) uint8 and read-only, with the stamp of its exposure."""
+
+    t_ns: int
+    image: Image
+
+
+Measurement = ImuSample | Frame
+
+
+@dataclass(frozen=True, slots=True)
+class ImuSegment:
+    """All inertial readings from one frame to the next; both ends are interpolated onto the two frame stamps.
+
+    ``t_ns`` (N,) strictly increasing, ``gyro_B`` (N, 3) rad/s, ``accel_B`` (N, 3) m/s^2. The segment of the very first
+    frame holds a single reading. ``largest_gap_s`` is the longest stretch without a *recorded* reading.
+    """
+
+    t_ns: Int
+    gyro_B: Float
+    accel_B: Float
+    largest_gap_s: float = 0.0
+
+    @property
+    def dt(self) -> Float:
+        """(N - 1,) seconds between readings."""
+        return np.diff(self.t_ns) * 1e-9
+
+    @property
+    def duration_s(self) -> float:
+        return float(self.t_ns[-1] - self.t_ns[0]) * 1e-9
+
+
+@dataclass(frozen=True, slots=True)
+class Keypoints:
+    """What a detector found, strongest first: ``xy`` (N, 2) float32 px, ``score`` (N,), ``descriptors`` (N, D) or None.
+
+    Integers are pixel centres.
+    """
+
+    xy: NDArray[np.float32]
+    score: NDArray[np.float32]
+    descriptors: NDArray[np.generic] | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class FrameTracks:
+    """The features seen in one frame: ``ids`` (N,) unique, ``xy`` (N, 2) px, ``xy_normalised`` (N, 2) undistorted z = 1."""
+
+    t_ns: int
+    ids: Int
+    xy: Float
+    xy_normalised: Float
+
+
+@dataclass(frozen=True, slots=True)
+class NavState:
+    """Where the body is and how it moves: pose, velocity and biases at one instant.
+
+    ``R_WB`` (3, 3), ``p_WB`` (3,) m, ``v_WB`` (3,) m/s, ``bias_gyro_B`` (3,) rad/s, ``bias_accel_B`` (3,) m/s^2. ``cov``
+    (15, 15) covers [dtheta dp dv dbg dba] (right perturbation), or is None where the back-end does not know it.
+    """
+
+    t_ns: int
+    R_WB: Float
+    p_WB: Float
+    v_WB: Float
+    bias_gyro_B: Float
+    bias_accel_B: Float
+    cov: Float | None = None
+
+
+class Status(StrEnum):
+    """What a back-end can say of itself after a frame."""
+
+    INITIALISING = "initialising"
+    TRACKING = "tracking"
+    LOST = "lost"
+
+
+def _no_ids() -> Int:
+    return np.empty(0, np.int64)
+
+
+def _no_points() -> Float:
+    return np.empty((0, 3))
+
+
+@dataclass(frozen=True, slots=True)
+class Estimate:
+    """What a back-end knows after one frame. ``state`` is None until it is initialised.
+
+    ``landmark_ids`` (M,) and ``p_WF`` (M, 3) m are the landmarks estimated or refined at this frame. ``events`` are
+    one-line notes worth keeping (an initialisation refused and why, a reset); ``stage_seconds`` is the back-end's own
+    breakdown of its time.
+    """
+
+    status: Status
+    state: NavState | None = None
+    landmark_ids: Int = field(default_factory=_no_ids)
+    p_WF: Float = field(default_factory=_no_points)
+    is_keyframe: bool = False
+    events: tuple[str, ...] = ()
+    stage_seconds: Mapping[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """One turn of the main loop: the frame, its tracks, the estimate, and seconds spent by stage."""
+
+    frame: Frame
+    tracks: FrameTracks
+    estimate: Estimate
+    stage_seconds: Mapping[str, float]
+
+
+@dataclass(frozen=True, slots=True)
+class ImuNoise:
+    """Continuous-time noise densities of an IMU, as Kalibr and EuRoC state them; ``rate_hz`` is its nominal rate."""
+
+    gyro_density: float
+    """White noise of the gyroscope, rad/s/sqrt(Hz)."""
+    accel_density: float
+    """White noise of the accelerometer, m/s^2/sqrt(Hz)."""
+    gyro_walk: float
+    """Diffusion of the gyroscope's bias, rad/s^2/sqrt(Hz)."""
+    accel_walk: float
+    """Diffusion of the accelerometer's bias, m/s^3/sqrt(Hz)."""
+    rate_hz: float = 200.0
+
+
+@dataclass(frozen=True, slots=True)
+class Calibration:
+    """One camera and one IMU: ``p_B = R_BC @ p_C + p_BC`` and ``t_imu = t_cam + time_offset_ns``."""
+
+    camera: Camera
+    R_BC: Float
+    p_BC: Float
+    imu: ImuNoise
+    time_offset_ns: int = 0
