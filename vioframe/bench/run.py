@@ -1,0 +1,74 @@
+"""Running a back-end on tracks alone: no images, no front-end."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass
+from time import perf_counter
+
+import numpy as np
+
+from vioframe.errors import TrajectoryError
+from vioframe.interfaces import Backend
+from vioframe.simulation.sequence import TrackSequence, Trajectory
+from vioframe.types import Estimate, Float, NavState, Status
+
+
+@dataclass(frozen=True)
+class BackendRun:
+    """What a back-end said after each packet, and how long it took: ``estimates`` and ``seconds`` (N,), one a packet."""
+
+    t_ns: tuple[int, ...]
+    estimates: tuple[Estimate, ...]
+    seconds: Float
+
+    @property
+    def states(self) -> tuple[NavState, ...]:
+        """The states of the frames at which the back-end was tracking."""
+        return tuple(e.state for e in self.estimates if e.status is Status.TRACKING and e.state is not None)
+
+    @property
+    def trajectory(self) -> Trajectory:
+        """Their poses; raises :class:`TrajectoryError` where there are none."""
+        states = self.states
+        if not states:
+            raise TrajectoryError("the back-end never got past initialisation; its events say why")
+        return Trajectory(
+            np.array([s.t_ns for s in states], np.int64),
+            np.array([s.R_WB for s in states]),
+            np.array([s.p_WB for s in states]),
+        )
+
+    @property
+    def initialised_after_s(self) -> float | None:
+        """Time from the first packet to the first state, or None."""
+        states = self.states
+        return (states[0].t_ns - self.t_ns[0]) * 1e-9 if states else None
+
+    @property
+    def resets(self) -> int:
+        """How often tracking was lost after it had begun."""
+        statuses = [e.status for e in self.estimates]
+        return sum(
+            a is Status.TRACKING and b is not Status.TRACKING for a, b in zip(statuses, statuses[1:], strict=False)
+        )
+
+    @property
+    def stage_ms(self) -> dict[str, float]:
+        """Mean milliseconds a packet, in all (``total``) and by the back-end's own stages."""
+        total: Counter[str] = Counter()
+        for estimate in self.estimates:
+            total.update(estimate.stage_seconds)
+        per_packet = 1e3 / len(self.estimates)
+        return {"total": float(self.seconds.mean()) * 1e3, **{k: v * per_packet for k, v in total.items()}}
+
+
+def run_backend(sequence: TrackSequence, backend: Backend) -> BackendRun:
+    """Feed every packet of ``sequence`` to ``backend`` in order."""
+    estimates, seconds = [], []
+    for imu, tracks in sequence.packets:
+        begin = perf_counter()
+        estimates.append(backend.process(imu, tracks))
+        seconds.append(perf_counter() - begin)
+    stamps = tuple(tracks.t_ns for _, tracks in sequence.packets)
+    return BackendRun(stamps, tuple(estimates), np.array(seconds))

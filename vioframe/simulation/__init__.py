@@ -1,0 +1,6 @@
+"""Track sequences whose truth is known: simulated landmarks along real or exactly known motion."""
+
+from vioframe.simulation.real_motion import REAL_MOTION_SEQUENCES, real_motion_sequence
+from vioframe.simulation.sequence import Packet, TrackSequence
+
+__all__ = ["REAL_MOTION_SEQUENCES", "Packet", "TrackSequence", "real_motion_sequence"]
