@@ -1,0 +1,8 @@
+"""Trajectories: files, association, alignment and error metrics. Everything is pure; nothing mutates its input."""
+
+from vioframe.trajectory.alignment import ALIGNMENTS, Alignment
+from vioframe.trajectory.association import associate
+from vioframe.trajectory.formats import load_trajectory, tum_line, write_tum
+from vioframe.trajectory.trajectory import Trajectory
+
+__all__ = ["ALIGNMENTS", "Alignment", "Trajectory", "associate", "load_trajectory", "tum_line", "write_tum"]
