@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from vioframe.errors import TrajectoryError
 from vioframe.trajectory.trajectory import Trajectory
@@ -54,12 +55,8 @@ def _nearest(sparse: Trajectory, dense: Trajectory, max_dt_s: float) -> tuple[Tr
     return sparse.select(keep), dense.select(partner[keep])
 
 
-def _nonempty(
-    mask: np.ndarray[tuple[int, ...], np.dtype[np.bool_]], a: Trajectory, b: Trajectory
-) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
+def _nonempty(mask: NDArray[np.bool_], a: Trajectory, b: Trajectory) -> NDArray[np.bool_]:
     if not mask.any():
         spans = " and ".join(f"{x.t_ns[0] * 1e-9:.3f} .. {x.t_ns[-1] * 1e-9:.3f} s" for x in (a, b))
-        raise TrajectoryError(
-            f"no stamps in common: the trajectories span {spans}; do they share a clock and a flight?"
-        )
+        raise TrajectoryError(f"no stamps in common: the trajectories span {spans}; are they of one flight and clock?")
     return mask
