@@ -1,0 +1,37 @@
+"""Detector ``fast``: FAST corners (Rosten and Drummond, ECCV 2006), the strongest of each small cell."""
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from vioframe.hookspecs import hookimpl
+from vioframe.interfaces import DetectorFactory
+from vioframe.types import Image, Keypoints
+
+
+class Fast:
+    """``threshold``: contrast to the ring of 16 pixels, grey levels; ``cell_px``: side of the cells that keep one each."""
+
+    def __init__(self, *, threshold: int = 15, cell_px: int = 12) -> None:
+        import cv2
+
+        self._fast = cv2.FastFeatureDetector.create(threshold)
+        self._cell_px = cell_px
+
+    def detect(self, image: Image, max_points: int) -> Keypoints:
+        """Whole-pixel corners, at most one a cell."""
+        import cv2
+
+        found = self._fast.detect(image)
+        xy = np.reshape(cv2.KeyPoint.convert(found), (-1, 2)).astype(np.float32)
+        score = np.array([k.response for k in found], np.float32)
+        order = np.argsort(-score, kind="stable")
+        column, row = (xy[order] // self._cell_px).astype(np.int64).T
+        _, first = np.unique(row * (image.shape[1] // self._cell_px + 1) + column, return_index=True)
+        best = order[np.sort(first)][:max_points]
+        return Keypoints(xy[best], score[best])
+
+
+@hookimpl
+def vioframe_detectors() -> Mapping[str, DetectorFactory]:
+    return {"fast": Fast}

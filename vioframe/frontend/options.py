@@ -1,0 +1,64 @@
+"""What can be chosen about the front-end."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+from vioframe.errors import ConfigError
+
+Equalisation = Literal["none", "clahe", "histogram"]
+Rejection = Literal["none", "essential", "fundamental", "magsac", "two_point"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FrontendOptions:
+    """Options of :class:`vioframe.frontend.Frontend`; raises :class:`ConfigError` on a value out of range."""
+
+    max_points: int = 150
+    """Tracks kept alive at once."""
+    min_distance_px: float = 15.0
+    """New points keep this far from every track and from each other."""
+    grid: tuple[int, int] = (6, 8)
+    """Rows and columns of the grid whose emptiest cells are refilled first."""
+    border_px: float = 5.0
+    """Points closer than this to the edge of the image are dropped."""
+    equalisation: Equalisation = "none"
+    """Contrast equalisation before tracking and detection: none, clahe (local) or histogram (global)."""
+    klt_window_px: int = 21
+    """Side of the square patch that is followed; odd."""
+    klt_levels: int = 3
+    """Pyramid levels above the full image."""
+    predict_with_gyro: bool = True
+    """Start each search where the gyroscope says that the point went."""
+    forward_backward_px: float = 0.5
+    """A point tracked forth and back must return to within this of where it was."""
+    rejection: Rejection = "essential"
+    """Epipolar outlier rejection: essential, fundamental, magsac, two_point (rotation from the gyroscope) or none."""
+    rejection_px: float = 1.0
+    """Largest distance of an inlier from the epipolar geometry, scaled by the focal length."""
+    refill_below: float = 0.9
+    """The detector is asked for new points once fewer than this share of ``max_points`` is alive."""
+    candidates_per_point: int = 4
+    """Candidates asked of the detector, as a multiple of ``max_points``; most fall near live tracks."""
+    subpixel_window_px: int = 5
+    """Half window for moving whole-pixel corners to their sub-pixel place; 0 leaves all as detected."""
+
+    def __post_init__(self) -> None:
+        for name, valid, remedy in (
+            ("max_points", self.max_points >= 1, "at least 1"),
+            ("min_distance_px", self.min_distance_px >= 0.0, "zero or more"),
+            ("grid", len(self.grid) == 2 and min(self.grid) >= 1, "[rows, columns], each at least 1"),
+            ("border_px", self.border_px >= 0.0, "zero or more"),
+            ("equalisation", self.equalisation in get_args(Equalisation), " or ".join(get_args(Equalisation))),
+            ("klt_window_px", self.klt_window_px >= 5 and self.klt_window_px % 2 == 1, "odd and at least 5"),
+            ("klt_levels", 0 <= self.klt_levels <= 8, "0 to 8"),
+            ("forward_backward_px", self.forward_backward_px > 0.0, "more than zero"),
+            ("rejection", self.rejection in get_args(Rejection), " or ".join(get_args(Rejection))),
+            ("rejection_px", self.rejection_px > 0.0, "more than zero"),
+            ("refill_below", 0.0 < self.refill_below <= 1.0, "in (0, 1]"),
+            ("candidates_per_point", self.candidates_per_point >= 1, "at least 1"),
+            ("subpixel_window_px", 0 <= self.subpixel_window_px <= 15, "0 to 15"),
+        ):
+            if not valid:
+                raise ConfigError(f"front-end option {name} must be {remedy}, got {getattr(self, name)!r}")

@@ -1,0 +1,70 @@
+"""Which of a detector's candidates become new tracks."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vioframe.types import Float, Image, Int
+
+_LARGEST_SHIFT_PX = 3.0
+
+
+def thin(xy: Float, ids: Int, min_distance_px: float) -> NDArray[np.bool_]:
+    """(N,) which tracks stay when of any two closer than ``min_distance_px`` the younger (larger id) goes."""
+    order = np.argsort(ids)
+    gap2 = ((xy[order, None] - xy[None, order]) ** 2).sum(axis=2)
+    close = np.tril(gap2 < min_distance_px**2, -1)
+    keep = np.ones(len(xy), bool)
+    for younger in np.flatnonzero(close.any(axis=1)):
+        keep[younger] = not np.any(close[younger] & keep)
+    out = np.empty(len(xy), bool)
+    out[order] = keep
+    return out
+
+
+def spread(
+    candidates: Float, live: Float, count: int, *, size: tuple[int, int], grid: tuple[int, int], min_distance_px: float
+) -> Int:
+    """(<= count,) indices of the candidates to take: strongest first from whichever grid cell holds the fewest points.
+
+    ``candidates`` (N, 2) px, strongest first, inside the image of ``size`` (width, height); ``live`` (M, 2) px.
+    Everything taken is at least ``min_distance_px`` from ``live`` and from each other.
+    """
+    rows, columns = grid
+
+    def cell(xy: Float) -> Int:
+        column = np.clip(xy[:, 0] * columns / size[0], 0, columns - 1).astype(np.int64)
+        row = np.clip(xy[:, 1] * rows / size[1], 0, rows - 1).astype(np.int64)
+        return row * columns + column
+
+    limit = min_distance_px**2
+    free = ~(((candidates[:, None] - live[None]) ** 2).sum(axis=2) < limit).any(axis=1)
+    cells = cell(candidates)
+    population = np.bincount(cell(live), minlength=rows * columns)
+    taken: list[int] = []
+    while len(taken) < count and free.any():
+        remaining = np.flatnonzero(free)
+        # argmin takes the first of equals, and candidates are sorted: the strongest of the emptiest cells.
+        best = remaining[np.argmin(population[cells[remaining]])]
+        taken.append(int(best))
+        population[cells[best]] += 1
+        free &= ((candidates - candidates[best]) ** 2).sum(axis=1) >= limit
+        free[best] = False
+    return np.array(taken, np.int64)
+
+
+def refine_whole_pixels(image: Image, xy: Float, half_window_px: int) -> Float:
+    """(N, 2) px with whole-pixel corners moved to their sub-pixel place; what is already sub-pixel stays as it is."""
+    import cv2
+
+    whole = (xy == np.round(xy)).all(axis=1)
+    if half_window_px == 0 or not whole.any():
+        return xy
+    corners = xy[whole].astype(np.float32)
+    criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 20, 0.01)
+    moved = cv2.cornerSubPix(image, corners.copy(), (half_window_px, half_window_px), (-1, -1), criteria)
+    near = np.linalg.norm(moved - corners, axis=1) < _LARGEST_SHIFT_PX
+    out = xy.copy()
+    out[whole] = np.where(near[:, None], moved, corners)
+    return out
