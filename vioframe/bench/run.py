@@ -4,19 +4,21 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass
+from itertools import pairwise
 from time import perf_counter
 
 import numpy as np
 
 from vioframe.errors import TrajectoryError
 from vioframe.interfaces import Backend
-from vioframe.simulation.sequence import TrackSequence, Trajectory
+from vioframe.simulation.sequence import TrackSequence
+from vioframe.trajectory import Trajectory
 from vioframe.types import Estimate, Float, NavState, Status
 
 
 @dataclass(frozen=True)
 class BackendRun:
-    """What a back-end said after each packet, and how long it took: ``estimates`` and ``seconds`` (N,), one a packet."""
+    """What a back-end said after each packet, and how long each took it: ``t_ns``, ``estimates``, ``seconds`` (N,)."""
 
     t_ns: tuple[int, ...]
     estimates: tuple[Estimate, ...]
@@ -49,9 +51,7 @@ class BackendRun:
     def resets(self) -> int:
         """How often tracking was lost after it had begun."""
         statuses = [e.status for e in self.estimates]
-        return sum(
-            a is Status.TRACKING and b is not Status.TRACKING for a, b in zip(statuses, statuses[1:], strict=False)
-        )
+        return sum(a is Status.TRACKING and b is not Status.TRACKING for a, b in pairwise(statuses))
 
     @property
     def stage_ms(self) -> dict[str, float]:

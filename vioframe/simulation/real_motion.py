@@ -6,104 +6,126 @@ from pathlib import Path
 
 import numpy as np
 
+from vioframe.calibration import packaged_calibration
 from vioframe.errors import DatasetError
-from vioframe.geometry import so3
-from vioframe.simulation.euroc import EUROC_CALIBRATION
 from vioframe.simulation.poses import interpolate_poses
 from vioframe.simulation.segments import cut_segments
-from vioframe.simulation.sequence import TrackSequence, Trajectory
+from vioframe.simulation.sequence import TrackSequence
 from vioframe.simulation.tracks import TrackOptions, TrackSimulator
+from vioframe.trajectory import Trajectory, load_trajectory
 from vioframe.types import Calibration, Float, Int, NavState
 
 REAL_MOTION_SEQUENCES = ("MH_02_easy", "MH_03_medium", "MH_05_difficult", "V1_01_easy", "V1_02_medium")
 """The flights of ``euroc_imu_gt`` in the shared data."""
 
-# In the order they are preferred: V1_01 has both of the last two, and the orientation in its csv file is off.
+# In the order they are preferred: V1_01 has the first and the last, and the orientation in its csv file is off.
 _GROUND_TRUTH_FILES = (
     "groundtruth_pose_recomputed_tum.txt.gz",
     "groundtruth_pose_vel_merged.csv.gz",
     "state_groundtruth_estimate0/data.csv.gz",
 )
+_VELOCITY, _BIASES = slice(0, 3), slice(3, 9)
+# The published positions follow their own velocity to within a micrometre, but for the jumps.
+_JUMP_M = 0.3e-3
 
 
 def real_motion_sequence(
     folder: Path,
-    calibration: Calibration = EUROC_CALIBRATION,
+    calibration: Calibration | None = None,
     *,
     pixel_sigma: float = 1.0,
     max_points: int = 150,
     seed: int = 0,
     start_s: float = 0.0,
     duration_s: float | None = None,
+    remove_jumps: bool = False,
 ) -> TrackSequence:
     """Landmarks seen from the true poses of ``folder`` at its camera's stamps, and its recorded IMU.
 
-    ``folder`` holds ``imu0/data.csv.gz``, ``cam0/timestamps_ns.txt.gz`` and a ground-truth file, which together decide
-    the frames: those that both the readings and the ground truth cover. ``start_s`` and ``duration_s`` count from the
-    first of these. Raises :class:`DatasetError` where a file is missing or nothing is left.
-    """
-    options = TrackOptions(max_points=max_points, pixel_sigma=pixel_sigma)
-    truth_t_ns, truth = _read_ground_truth(folder)
-    imu = _load(folder / "imu0/data.csv.gz", delimiter=",", columns=range(1, 7))
-    imu_t_ns = _load_stamps(folder / "imu0/data.csv.gz")
-    frames_ns = _load_stamps(folder / "cam0/timestamps_ns.txt.gz")
-    begin = max(truth_t_ns[0], imu_t_ns[0])
-    end = min(truth_t_ns[-1], imu_t_ns[-1])
-    frames_ns = frames_ns[(frames_ns >= begin) & (frames_ns <= end)]
-    if len(frames_ns):
-        elapsed_s = (frames_ns - frames_ns[0]) * 1e-9
-        frames_ns = frames_ns[(elapsed_s >= start_s) & (elapsed_s <= start_s + (duration_s or np.inf))]
-    if not len(frames_ns):
-        raise DatasetError(f"{folder}: no frame is left after start_s; start earlier")
+    ``folder`` holds ``imu0/data.csv.gz``, ``cam0/timestamps_ns.txt.gz`` and a ground-truth file; frames are those that
+    the readings and the ground truth both cover, and ``start_s`` and ``duration_s`` count from the first of them.
+    ``calibration`` is EuRoC's as published unless given.
 
-    R_WB, p_WB = interpolate_poses(truth_t_ns, so3.from_quat_xyzw(truth[:, 3:7]), truth[:, :3], frames_ns)
-    simulator = TrackSimulator(calibration, options, np.random.default_rng(seed))
+    The ground truth of the machine hall jumps, by up to 8 cm from one sample to the next, where its batch solution
+    corrects itself; no IMU feels that. ``remove_jumps`` closes these steps in position (in the truth that is returned
+    too), which leaves a motion that the readings do agree with. Raises :class:`DatasetError` where a file is missing or
+    no frame is left.
+    """
+    calibration = calibration or packaged_calibration("euroc")
+    truth, velocity_and_biases = _read_ground_truth(folder)
+    p_WB = _without_jumps(truth, velocity_and_biases[:, _VELOCITY]) if remove_jumps else truth.p_WB
+    imu_ns, imu = _read_csv(folder / "imu0/data.csv.gz", columns=6)
+    frames_ns, _ = _read_csv(folder / "cam0/timestamps_ns.txt.gz", columns=0)
+    covered = (frames_ns >= max(truth.t_ns[0], imu_ns[0])) & (frames_ns <= min(truth.t_ns[-1], imu_ns[-1]))
+    frames_ns = _window(frames_ns[covered], start_s, duration_s)
+    if not len(frames_ns):
+        raise DatasetError(f"{folder}: no frame lies in the time asked for; start earlier")
+
+    R_WB, p_WB = interpolate_poses(truth.t_ns, truth.R_WB, p_WB, frames_ns)
+    simulator = TrackSimulator(
+        calibration, TrackOptions(max_points=max_points, pixel_sigma=pixel_sigma), np.random.default_rng(seed)
+    )
     tracks = [simulator.observe(int(t), R, p) for t, R, p in zip(frames_ns, R_WB, p_WB, strict=True)]
-    segments = cut_segments(imu_t_ns, imu[:, :3], imu[:, 3:], frames_ns)
+    segments = cut_segments(imu_ns, imu[:, :3], imu[:, 3:], frames_ns)
+    motion = Trajectory(frames_ns, R_WB, p_WB)
     return TrackSequence(
         folder.name,
         calibration,
         tuple(zip(segments, tracks, strict=True)),
-        Trajectory(frames_ns, R_WB, p_WB),
-        _published_states(truth_t_ns, truth, frames_ns, R_WB, p_WB),
+        motion,
+        _published_states(truth.t_ns, velocity_and_biases, motion),
     )
 
 
-def _read_ground_truth(folder: Path) -> tuple[Int, Float]:
-    """Stamps (N,) and rows (N, 7, 10 or 16): position, quaternion xyzw, then velocity and biases where they are known."""
+def _window(frames_ns: Int, start_s: float, duration_s: float | None) -> Int:
+    elapsed_s = (frames_ns - frames_ns[:1]) * 1e-9
+    end_s = np.inf if duration_s is None else start_s + duration_s
+    return frames_ns[(elapsed_s >= start_s) & (elapsed_s <= end_s)]
+
+
+def _without_jumps(truth: Trajectory, v_WB: Float) -> Float:
+    """Positions (N, 3) m with every step that the published velocity does not explain taken out."""
+    if not v_WB.shape[1]:
+        # Without velocities there is nothing to tell a jump by; the one such file (V1_01) has none.
+        return truth.p_WB
+    dt = np.diff(truth.t_ns)[:, None] * 1e-9
+    jump = np.diff(truth.p_WB, axis=0) - 0.5 * (v_WB[1:] + v_WB[:-1]) * dt
+    jump[np.linalg.norm(jump, axis=1) < _JUMP_M] = 0.0
+    return truth.p_WB - np.vstack([np.zeros(3), np.cumsum(jump, axis=0)])
+
+
+def _read_ground_truth(folder: Path) -> tuple[Trajectory, Float]:
+    """Poses, and (N, 0, 3 or 9) velocity in W and biases of gyroscope and accelerometer as far as they are given."""
     for name in _GROUND_TRUTH_FILES:
-        path = folder / name
-        if not path.is_file():
+        if not (folder / name).is_file():
             continue
-        if "tum" in name:
-            # Decimal seconds: floats hold these stamps to about 0.2 us, and the file to 10 us.
-            rows = _load(path)
-            return np.round(rows[:, 0] * 1e9).astype(np.int64), rows[:, 1:]
-        rows = _load(path, delimiter=",")[:, 1:]
-        rows[:, 3:7] = rows[:, [4, 5, 6, 3]]  # wxyz -> xyzw
-        return _load_stamps(path), rows
+        truth = load_trajectory(folder / name)
+        if name.endswith(".csv.gz"):
+            return truth, _read_csv(folder / name)[1][:, 7:]
+        return truth, np.empty((len(truth), 0))
     raise DatasetError(f"{folder}: no ground truth here; expected one of {', '.join(_GROUND_TRUTH_FILES)}")
 
 
-def _published_states(t_ns: Int, rows: Float, frames_ns: Int, R_WB: Float, p_WB: Float) -> tuple[NavState, ...]:
+def _published_states(t_ns: Int, velocity_and_biases: Float, motion: Trajectory) -> tuple[NavState, ...]:
     """The published velocity and biases at the frames, where the file has both."""
-    if rows.shape[1] < 16:
+    if velocity_and_biases.shape[1] < 9:
         return ()
-    seconds = (t_ns - t_ns[0]) * 1e-9
-    rest = np.column_stack([np.interp((frames_ns - t_ns[0]) * 1e-9, seconds, column) for column in rows[:, 7:16].T])
+    seconds, frames_s = ((t - t_ns[0]) * 1e-9 for t in (t_ns, motion.t_ns))
+    x = np.column_stack([np.interp(frames_s, seconds, column) for column in velocity_and_biases.T])
+    v_WB, biases = x[:, _VELOCITY], x[:, _BIASES]
     return tuple(
-        NavState(int(t), R, p, x[:3], x[3:6], x[6:9]) for t, R, p, x in zip(frames_ns, R_WB, p_WB, rest, strict=True)
+        NavState(int(t), R, p, v, b[:3], b[3:])
+        for t, R, p, v, b in zip(motion.t_ns, motion.R_WB, motion.p_WB, v_WB, biases, strict=True)
     )
 
 
-def _load(path: Path, delimiter: str | None = None, columns: range | None = None) -> Float:
+def _read_csv(path: Path, columns: int | None = None) -> tuple[Int, Float]:
+    """Stamps (N,) and the ``columns`` after them (all if None): apart, for a float64 would round the stamps."""
     if not path.is_file():
         raise DatasetError(f"{path} is missing; a real-motion folder needs imu0, cam0 and ground truth")
-    return np.loadtxt(path, delimiter=delimiter, usecols=columns, ndmin=2)
-
-
-def _load_stamps(path: Path) -> Int:
-    """First column as integers: float64 would round nanosecond stamps by a hundred."""
-    if not path.is_file():
-        raise DatasetError(f"{path} is missing; a real-motion folder needs imu0, cam0 and ground truth")
-    return np.loadtxt(path, delimiter=",", usecols=0, dtype=np.int64)
+    t_ns = np.loadtxt(path, delimiter=",", usecols=0, dtype=np.int64)
+    if columns == 0:
+        return t_ns, np.empty((len(t_ns), 0))
+    used = None if columns is None else range(1, columns + 1)
+    values = np.loadtxt(path, delimiter=",", usecols=used, ndmin=2)
+    return t_ns, values if used is not None else values[:, 1:]

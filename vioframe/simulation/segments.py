@@ -9,8 +9,8 @@ from vioframe.types import Float, ImuSegment, Int
 def cut_segments(t_ns: Int, gyro_B: Float, accel_B: Float, frames_ns: Int) -> list[ImuSegment]:
     """One segment a frame, both ends interpolated onto the frame stamps; the first holds a single reading.
 
-    ``t_ns`` (N,) ascending, ``gyro_B`` (N, 3) rad/s, ``accel_B`` (N, 3) m/s^2, ``frames_ns`` (M,) ascending and within the
-    readings, or :class:`DatasetError` is raised.
+    ``t_ns`` (N,) ascending, ``gyro_B`` (N, 3) rad/s, ``accel_B`` (N, 3) m/s^2, ``frames_ns`` (M,) ascending and within
+    the readings, or :class:`DatasetError` is raised.
     """
     if frames_ns[0] < t_ns[0] or frames_ns[-1] > t_ns[-1]:
         raise DatasetError("frames lie outside the inertial readings; limit them to the stamps those cover")

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from vioframe.geometry.cameras import Camera
 from vioframe.types import Calibration, Float, FrameTracks, Int
@@ -31,8 +32,8 @@ class TrackOptions:
 class TrackSimulator:
     """Tracks landmarks frame by frame: one lives while it is in view and is never seen again after leaving it.
 
-    As in the simulator of OpenVINS (Geneva et al., ICRA 2020), a new landmark is put at a random pixel and a random depth
-    whenever there are fewer than wanted. ``p_WF`` maps each id that ever lived to its true position.
+    As in the simulator of OpenVINS (Geneva et al., ICRA 2020), a new landmark is put at a random pixel and a random
+    depth whenever there are fewer than wanted. ``p_WF`` maps each id that ever lived to its true position.
     """
 
     def __init__(self, calibration: Calibration, options: TrackOptions, rng: np.random.Generator) -> None:
@@ -58,9 +59,7 @@ class TrackSimulator:
         xy = self._disturb(xy)
         return FrameTracks(t_ns, self._ids.copy(), xy, self._camera.undistort(xy))
 
-    def _project(
-        self, R_WC: Float, p_WC: Float, p_WF: Float
-    ) -> tuple[Float, np.ndarray[tuple[int], np.dtype[np.bool_]]]:
+    def _project(self, R_WC: Float, p_WC: Float, p_WF: Float) -> tuple[Float, NDArray[np.bool_]]:
         p_CF = (p_WF - p_WC) @ R_WC
         in_front = p_CF[:, 2] > _NEAREST_M
         uv = p_CF[:, :2] / np.where(in_front, p_CF[:, 2], 1.0)[:, None]
