@@ -1,0 +1,70 @@
+"""The command line: one small module a sub-command, imported only when it is called."""
+
+from __future__ import annotations
+
+import logging
+from importlib import import_module
+
+import click
+
+import vioframe
+from vioframe.errors import VioframeError
+
+_COMMANDS = {
+    "run": "Estimate the motion along a recording and write a run folder.",
+    "evaluate": "Compare runs with the ground truth, as a table.",
+    "plot": "Draw trajectories and errors of one or more runs.",
+    "plugins": "List the detectors, back-ends and readers, or the options of one.",
+    "config": "Print a complete configuration, or check a file.",
+    "convert": "Convert a recording: ASL folder, ROS 1 bag, ROS 2 bag, MCAP.",
+}
+"""Sub-commands and their short help, kept here so that ``vioframe --help`` needs none of their modules."""
+
+EXIT_BAD_INPUT = 2
+EXIT_INTERRUPTED = 130
+
+
+class _LazyGroup(click.Group):
+    """Finds a sub-command's module by its name, and turns errors into one line and an exit code."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        return list(_COMMANDS)
+
+    def get_command(self, ctx: click.Context, name: str) -> click.Command | None:
+        if name not in _COMMANDS:
+            return None
+        command: click.Command = import_module(f"vioframe.cli.{name}").command
+        return command
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        with formatter.section("Commands"):
+            formatter.write_dl(list(_COMMANDS.items()))
+
+    def invoke(self, ctx: click.Context) -> object:
+        try:
+            return super().invoke(ctx)
+        except VioframeError as error:
+            if ctx.params["debug"]:
+                raise
+            click.echo(f"vioframe: error: {' '.join(str(error).split())}", err=True)
+            ctx.exit(EXIT_BAD_INPUT)
+        except KeyboardInterrupt:
+            click.echo("vioframe: interrupted", err=True)
+            ctx.exit(EXIT_INTERRUPTED)
+
+
+class _EchoHandler(logging.Handler):
+    """Log records on stderr as it is now: a progress bar, or a test, may have replaced it since the start."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        click.echo(f"vioframe: {record.levelname.lower()}: {self.format(record)}", err=True)
+
+
+@click.group(cls=_LazyGroup, context_settings={"help_option_names": ["-h", "--help"]})
+@click.version_option(vioframe.__version__, prog_name="vioframe")
+@click.option("--debug", is_flag=True, envvar="VIOFRAME_DEBUG", help="Show the traceback of an error.")
+def main(debug: bool) -> None:
+    """Plug-in visual-inertial odometry: EuRoC bag in, evaluated trajectory out."""
+    logger = logging.getLogger("vioframe")
+    if not logger.handlers:
+        logger.addHandler(_EchoHandler())

@@ -1,0 +1,130 @@
+"""A run put together: a configuration and the installed parts in, a recorded run folder out.
+
+The command line and the benchmarks both come through here; :mod:`vioframe.pipeline` is the loop itself.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from itertools import chain
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+from vioframe import config as configuration
+from vioframe import machine, pipeline
+from vioframe.config import Config
+from vioframe.errors import DatasetError, PluginError, VioframeError
+from vioframe.incidents import Incidents
+from vioframe.interfaces import Backend, Dataset, Detector
+from vioframe.recorder import Recorder, new_run_folder, write_json
+from vioframe.registry import BACKEND, DATASET, DETECTOR, Registry, describe
+from vioframe.trajectory import Trajectory, load_trajectory, write_tum
+from vioframe.types import Step
+
+# More threads than this gain nothing on images of this size, and cost on machines that have many.
+_MAX_OPENCV_THREADS = 4
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """A data set, the parts to run on it and what it is compared with. ``config`` is complete."""
+
+    config: Config
+    registry: Registry
+    dataset: Dataset
+    detector: Detector
+    backend: Backend
+    ground_truth: Trajectory | None
+    incidents: Incidents = field(default_factory=Incidents)
+
+    @property
+    def name(self) -> str:
+        return f"{self.dataset.name}_{self.config.detector.name}_{self.config.backend.name}"
+
+    def steps(self) -> Iterator[Step]:
+        """The main loop; what a plug-in raises comes out as a :class:`PluginError` that names it."""
+        import cv2
+        from threadpoolctl import threadpool_limits
+
+        cv2.setNumThreads(min(cv2.getNumThreads(), _MAX_OPENCV_THREADS))
+        # numpy and scipy bring a BLAS each; on matrices this small their threads only wait for one another.
+        with threadpool_limits(1):
+            try:
+                yield from pipeline.run(
+                    self.dataset,
+                    self.detector,
+                    self.backend,
+                    self.config.frontend_options,
+                    start_s=self.config.start_s,
+                    duration_s=self.config.duration_s,
+                    incidents=self.incidents,
+                )
+            except VioframeError:
+                raise
+            except Exception as error:
+                source = self.registry.blame(error.__traceback__)
+                if source is None:
+                    raise
+                raise PluginError(f"plug-in {source.entry_point!r} ({source}) failed: {describe(error)}") from error
+
+
+def prepare(config: Config, registry: Registry) -> Experiment:
+    """Check the whole of ``config``, then open the data set and create the parts."""
+    config = configuration.complete(config, registry)
+    if config.dataset.path is None:
+        raise DatasetError("no data set given; name a bag or folder, or set dataset.path in the configuration")
+    dataset = registry.open_dataset(config.dataset.path, config.dataset.reader, config.dataset.options)
+    return Experiment(
+        config,
+        registry,
+        dataset,
+        registry.create_detector(config.detector.name, config.detector.options),
+        registry.create_backend(config.backend.name, dataset.calibration, config.backend.options),
+        dataset.ground_truth if config.ground_truth is None else load_trajectory(config.ground_truth),
+    )
+
+
+def record(
+    experiment: Experiment,
+    folder: Path,
+    *,
+    overwrite: bool = False,
+    on_step: Callable[[Step], None] = lambda step: None,
+) -> dict[str, Any]:
+    """Run ``experiment`` and write ``folder`` as it goes; returns the summary.
+
+    Nothing is created or replaced before the first frame has gone through; after that the folder is completed
+    however the run ends.
+    """
+    begin_s = perf_counter()
+    steps = experiment.steps()
+    first = next(steps, None)
+    if first is None:
+        raise DatasetError(f"{experiment.dataset.name} has no image to process; check --start and --duration")
+    new_run_folder(folder, overwrite=overwrite)
+    config, registry = experiment.config, experiment.registry
+    (folder / "config.yaml").write_text(configuration.render(config, registry), encoding="utf-8")
+    write_json(folder / "machine.json", machine.describe())
+    if experiment.ground_truth is not None:
+        write_tum(experiment.ground_truth, folder / "ground_truth.tum")
+    with Recorder(folder, _about(experiment), experiment.incidents, begin_s) as recorder:
+        for step in chain([first], steps):
+            recorder.add(step)
+            on_step(step)
+    return recorder.summary
+
+
+def _about(experiment: Experiment) -> dict[str, Any]:
+    config = experiment.config
+    chosen = {DATASET: config.dataset.reader or "", DETECTOR: config.detector.name, BACKEND: config.backend.name}
+    return {
+        "name": experiment.name,
+        "dataset": experiment.dataset.name,
+        "detector": config.detector.name,
+        "backend": config.backend.name,
+        "plugins": {kind.name: str(experiment.registry.find(kind, name).source) for kind, name in chosen.items()},
+        "start_s": config.start_s,
+        "duration_s": config.duration_s,
+    }
