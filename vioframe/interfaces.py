@@ -55,7 +55,7 @@ class Dataset(Protocol):
         ...
 
     def measurements(self) -> Iterator[Measurement]:
-        """IMU samples and frames in roughly ascending order of their header stamps."""
+        """IMU samples and frames in roughly ascending order of their header stamps, and what could not be read."""
         ...
 
 

@@ -56,7 +56,19 @@ class Frame:
     image: Image
 
 
-Measurement = ImuSample | Frame
+@dataclass(frozen=True, slots=True)
+class Unreadable:
+    """Something in a recording that its reader had to pass over, so that synchronisation can count it.
+
+    ``kind`` is a name for :class:`~vioframe.incidents.Incidents`, such as ``frame_unreadable``.
+    """
+
+    t_ns: int
+    kind: str
+    detail: str
+
+
+Measurement = ImuSample | Frame | Unreadable
 
 
 @dataclass(frozen=True, slots=True)

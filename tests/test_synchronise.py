@@ -1,0 +1,250 @@
+"""Synchronisation: whatever order, repetition or damage comes in, complete and increasing segments come out."""
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from vioframe.incidents import Incidents
+from vioframe.synchronise import synchronise
+from vioframe.types import Frame, ImuSample, ImuSegment, Measurement, Unreadable
+
+IMU_PERIOD_NS = 5_000_000
+CAMERA_PERIOD_NS = 50_000_000
+IMAGE = np.zeros((2, 2), np.uint8)
+SLOPE = np.array([1.0, -2.0, 3.0])
+
+
+def reading(t_ns: int) -> ImuSample:
+    """A sample of readings that are linear in time, so that interpolation must be exact."""
+    return ImuSample(t_ns, SLOPE * t_ns * 1e-9, SLOPE * t_ns * 1e-9 + 10.0)
+
+
+def recording(imu_count: int = 200, frame_count: int = 18, first_frame_ns: int = 12_345_678) -> list[Measurement]:
+    """A flawless recording in order of time; frames fall between IMU samples."""
+    imu: list[Measurement] = [reading(i * IMU_PERIOD_NS) for i in range(imu_count)]
+    frames: list[Measurement] = [Frame(first_frame_ns + i * CAMERA_PERIOD_NS, IMAGE) for i in range(frame_count)]
+    return sorted(imu + frames, key=lambda measurement: measurement.t_ns)
+
+
+def play(measurements: list[Measurement], **options: float) -> tuple[list[tuple[ImuSegment, Frame]], dict[str, int]]:
+    incidents = Incidents()
+    packets = list(synchronise(iter(measurements), incidents=incidents, **options))
+    return packets, dict(incidents.counts)
+
+
+def assert_clean(packets: list[tuple[ImuSegment, Frame]]) -> None:
+    """What every back-end relies on."""
+    if packets:
+        imu, frame = packets[0]
+        assert imu.t_ns.tolist() == [frame.t_ns]
+    for (_, previous), (imu, frame) in pairwise(packets):
+        assert imu.t_ns[0] == previous.t_ns
+        assert imu.t_ns[-1] == frame.t_ns
+        assert (np.diff(imu.t_ns) > 0).all()
+        assert imu.gyro_B.shape == imu.accel_B.shape == (len(imu.t_ns), 3)
+        assert np.isfinite(imu.gyro_B).all()
+        assert np.isfinite(imu.accel_B).all()
+
+
+def assert_same(packets: list[tuple[ImuSegment, Frame]], expected: list[tuple[ImuSegment, Frame]]) -> None:
+    assert [frame.t_ns for _, frame in packets] == [frame.t_ns for _, frame in expected]
+    for (imu, _), (imu_expected, _) in zip(packets, expected, strict=True):
+        np.testing.assert_array_equal(imu.t_ns, imu_expected.t_ns)
+        np.testing.assert_array_equal(imu.gyro_B, imu_expected.gyro_B)
+        np.testing.assert_array_equal(imu.accel_B, imu_expected.accel_B)
+
+
+def test_flawless_recording() -> None:
+    packets, counts = play(recording())
+    assert counts == {}
+    assert len(packets) == 18
+    assert_clean(packets)
+    for imu, _ in packets:
+        np.testing.assert_allclose(imu.gyro_B, np.outer(imu.t_ns * 1e-9, SLOPE), rtol=0.0, atol=1e-12)
+        np.testing.assert_allclose(imu.accel_B, np.outer(imu.t_ns * 1e-9, SLOPE) + 10.0, rtol=0.0, atol=1e-12)
+        assert imu.largest_gap_s == pytest.approx(IMU_PERIOD_NS * 1e-9, abs=1e-12)
+    # Ten samples lie strictly between two frames.
+    assert {len(imu.t_ns) for imu, _ in packets[1:]} == {12}
+
+
+def test_frames_on_imu_stamps_use_those_samples_once() -> None:
+    packets, counts = play(recording(first_frame_ns=0))
+    assert counts == {}
+    assert_clean(packets)
+    assert {len(imu.t_ns) for imu, _ in packets[1:]} == {11}
+    assert packets[1][0].t_ns.tolist() == list(range(0, CAMERA_PERIOD_NS + 1, IMU_PERIOD_NS))
+
+
+def test_camera_faster_than_imu() -> None:
+    imu: list[Measurement] = [reading(i * 10_000_000) for i in range(30)]
+    frames: list[Measurement] = [Frame(1_000_000 + i * 3_000_000, IMAGE) for i in range(80)]
+    packets, counts = play(sorted(imu + frames, key=lambda measurement: measurement.t_ns))
+    assert counts == {}
+    assert len(packets) == 80
+    assert_clean(packets)
+    for segment, _ in packets:
+        np.testing.assert_allclose(segment.gyro_B, np.outer(segment.t_ns * 1e-9, SLOPE), rtol=0.0, atol=1e-12)
+
+
+@pytest.mark.parametrize("offset_ns", [7_000_000, -7_000_000])
+def test_imu_stamps_move_to_the_camera_clock(offset_ns: int) -> None:
+    packets, _ = play(recording(), time_offset_ns=offset_ns)
+    for imu, _ in packets:
+        # t_imu = t_cam + offset, and the readings are linear in t_imu.
+        np.testing.assert_allclose(imu.gyro_B, np.outer((imu.t_ns + offset_ns) * 1e-9, SLOPE), rtol=0.0, atol=1e-12)
+
+
+def test_start_and_duration_count_from_the_first_frame() -> None:
+    first_ns = recording()[3].t_ns
+    packets, counts = play(recording(), start_s=0.2, duration_s=0.3)
+    assert counts == {}
+    assert [frame.t_ns - first_ns for _, frame in packets] == [i * CAMERA_PERIOD_NS for i in range(4, 11)]
+    assert_clean(packets)
+
+
+def test_frames_outside_the_imu_are_dropped_and_counted() -> None:
+    imu = [reading(i * IMU_PERIOD_NS) for i in range(20, 100)]
+    frames = [Frame(1_000_000 + i * CAMERA_PERIOD_NS, IMAGE) for i in range(12)]
+    packets, counts = play(sorted([*imu, *frames], key=lambda measurement: measurement.t_ns))
+    # The IMU runs from 100 ms to 495 ms; frames come at 1, 51, ..., 551 ms.
+    assert [frame.t_ns for _, frame in packets] == [1_000_000 + i * CAMERA_PERIOD_NS for i in range(2, 10)]
+    assert counts == {"frame_before_imu": 2, "frame_after_imu": 2}
+    assert_clean(packets)
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+def test_readings_that_are_not_finite_are_dropped(bad: float) -> None:
+    measurements = recording()
+    measurements.insert(60, ImuSample(measurements[60].t_ns - 1, np.array([0.0, bad, 0.0]), np.zeros(3)))
+    measurements.insert(90, ImuSample(measurements[90].t_ns - 1, np.zeros(3), np.array([bad, 0.0, -bad])))
+    packets, counts = play(measurements)
+    assert counts == {"imu_nan": 2}
+    assert_same(packets, play(recording())[0])
+
+
+def test_a_late_sample_is_dropped_once_its_frame_is_gone() -> None:
+    measurements = recording()
+    late = next(i for i, m in enumerate(measurements) if m.t_ns == 20 * IMU_PERIOD_NS)
+    measurements.insert(late + 60, measurements.pop(late))
+    packets, counts = play(measurements)
+    assert counts == {"imu_out_of_order": 1}
+    assert len(packets) == 18
+    assert 20 * IMU_PERIOD_NS not in np.concatenate([imu.t_ns for imu, _ in packets])
+    assert_clean(packets)
+
+
+@pytest.mark.parametrize("stamp_ns", [0, -(10**18), 4 * 10**18])
+def test_one_wild_imu_stamp_harms_nothing_else(stamp_ns: int) -> None:
+    measurements = recording()
+    measurements.insert(80, ImuSample(stamp_ns, np.full(3, 99.0), np.full(3, 99.0)))
+    packets, counts = play(measurements)
+    assert sum(counts.values()) == 1
+    assert_same(packets, play(recording())[0])
+
+
+def test_one_wild_frame_stamp_harms_nothing_else() -> None:
+    measurements = recording()
+    measurements.insert(80, Frame(4 * 10**18, IMAGE))
+    measurements.insert(90, Frame(0, IMAGE))
+    packets, counts = play(measurements)
+    assert counts == {"frame_after_imu": 1, "frame_out_of_order": 2}
+    assert_same(packets, play(recording())[0])
+
+
+def test_an_imu_gap_is_counted_once_and_shown_in_each_segment() -> None:
+    gap = range(60 * IMU_PERIOD_NS, 90 * IMU_PERIOD_NS)
+    measurements = [m for m in recording() if isinstance(m, Frame) or m.t_ns not in gap]
+    packets, counts = play(measurements)
+    assert counts == {"imu_gap": 1}
+    assert len(packets) == 18
+    assert_clean(packets)
+    gaps = [imu.largest_gap_s for imu, _ in packets]
+    # Samples at 295 ms and 450 ms; the segments that end at 312, 362, 412 and 462 ms touch the gap.
+    assert gaps[6:10] == pytest.approx([0.155] * 4, abs=1e-12)
+    assert max(gaps[:6] + gaps[10:]) == pytest.approx(0.005, abs=1e-12)
+
+
+def test_a_camera_gap_is_counted_and_its_segment_is_complete() -> None:
+    frames = [m for m in recording() if isinstance(m, Frame)]
+    packets, counts = play([m for m in recording() if m not in frames[8:12]])
+    assert counts == {"camera_gap": 1}
+    assert len(packets) == 14
+    assert packets[8][0].duration_s == pytest.approx(0.25, abs=1e-12)
+    assert_clean(packets)
+
+
+def test_frames_do_not_pile_up_behind_a_silent_imu() -> None:
+    imu = [reading(i * IMU_PERIOD_NS) for i in range(20)]
+    frames = [Frame(1_000_000 + i * CAMERA_PERIOD_NS, IMAGE) for i in range(302)]
+    packets, counts = play(sorted([*imu, *frames], key=lambda measurement: measurement.t_ns))
+    assert len(packets) == 2
+    assert counts == {"frame_without_imu": 100, "frame_after_imu": 200}
+
+
+def test_what_the_reader_could_not_read_is_counted() -> None:
+    measurements = recording()
+    measurements.insert(50, Unreadable(measurements[50].t_ns, "frame_unreadable", "truncated"))
+    packets, counts = play(measurements)
+    assert counts == {"frame_unreadable": 1}
+    assert len(packets) == 18
+
+
+def test_it_streams() -> None:
+    """A frame is released as soon as ten IMU samples follow it, not when the recording ends."""
+    measurements = recording()
+    taken = 0
+
+    def source():
+        nonlocal taken
+        for taken, measurement in enumerate(measurements, start=1):  # noqa: B007
+            yield measurement
+
+    next(synchronise(source(), incidents=Incidents()))
+    assert taken == 3 + 1 + 10
+
+
+@st.composite
+def shuffled(draw: st.DrawFn) -> list[Measurement]:
+    """The flawless recording with measurements moved by a few places (each sensor's by at most nine) and repeated."""
+    measurements = recording(imu_count=100, frame_count=9)
+    jitter = draw(st.lists(st.integers(0, 9), min_size=len(measurements), max_size=len(measurements)))
+    order = sorted(range(len(measurements)), key=lambda i: (i + jitter[i], i))
+    out = [measurements[i] for i in order]
+    for place in draw(st.lists(st.integers(0, len(out) - 1), max_size=20)):
+        out.insert(place + 1, out[place])
+    return out
+
+
+@given(shuffled())
+def test_modest_disorder_and_repetition_change_nothing(measurements: list[Measurement]) -> None:
+    packets, counts = play(measurements)
+    assert_same(packets, play(recording(imu_count=100, frame_count=9))[0])
+    repeated = len(measurements) - len(recording(imu_count=100, frame_count=9))
+    assert counts.get("imu_duplicate", 0) + counts.get("frame_duplicate", 0) == repeated
+
+
+@given(
+    st.lists(
+        st.tuples(st.integers(0, 3000), st.sampled_from(["imu"] * 3 + ["frame", "nan"])),
+        min_size=1,
+        max_size=200,
+    )
+)
+def test_any_input_gives_clean_segments_and_every_frame_is_accounted_for(stream: list[tuple[int, str]]) -> None:
+    measurements: list[Measurement] = []
+    for t_ms, kind in stream:
+        t_ns = t_ms * 1_000_000
+        if kind == "frame":
+            measurements.append(Frame(t_ns, IMAGE))
+        else:
+            measurements.append(ImuSample(t_ns, np.full(3, np.nan), np.zeros(3)) if kind == "nan" else reading(t_ns))
+    packets, counts = play(measurements)
+    assert_clean(packets)
+    dropped = sum(counts.get(kind, 0) for kind in ("frame_duplicate", "frame_before_imu", "frame_after_imu"))
+    frames = sum(kind == "frame" for _, kind in stream)
+    assert len(packets) + dropped <= frames <= len(packets) + dropped + counts.get("frame_out_of_order", 0)
+    for imu, _ in packets:
+        np.testing.assert_allclose(imu.gyro_B, np.outer(imu.t_ns * 1e-9, SLOPE), rtol=0.0, atol=1e-9)
