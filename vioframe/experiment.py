@@ -110,9 +110,13 @@ def record(
     if experiment.ground_truth is not None:
         write_tum(experiment.ground_truth, folder / "ground_truth.tum")
     with Recorder(folder, _about(experiment), experiment.incidents, begin_s) as recorder:
-        for step in chain([first], steps):
-            recorder.add(step)
-            on_step(step)
+        try:
+            for step in chain([first], steps):
+                recorder.add(step)
+                on_step(step)
+        except BaseException as error:
+            error.add_note(f"what was estimated until then is in {folder}")
+            raise
     return recorder.summary
 
 

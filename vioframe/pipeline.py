@@ -47,4 +47,5 @@ def run(
         begin = perf_counter()
         estimate = backend.process(imu, tracks)
         backend_s = perf_counter() - begin
-        yield Step(frame, tracks, estimate, {**frontend.stage_seconds, "backend": backend_s, **estimate.stage_seconds})
+        within = {f"backend.{stage}": seconds for stage, seconds in estimate.stage_seconds.items()}
+        yield Step(frame, tracks, estimate, {**frontend.stage_seconds, "backend": backend_s, **within})

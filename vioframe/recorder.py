@@ -118,8 +118,7 @@ class Recorder:
         self._append("tracks.csv", "".join(f"{t_ns},{i},{x:.3f},{y:.3f}\n" for i, (x, y) in observations))
         self._points += len(step.tracks.ids)
         self._add_timings(t_ns, step.stage_seconds)
-        # The back-end's own stages are parts of its total, which is there already.
-        self._frame_seconds += sum(step.stage_seconds.values()) - sum(estimate.stage_seconds.values())
+        self._frame_seconds += sum(seconds for stage, seconds in step.stage_seconds.items() if "." not in stage)
         self._events += [{"t_ns": t_ns, "event": event} for event in estimate.events]
         if self._statuses and self._statuses[-1] is Status.TRACKING and estimate.status is not Status.TRACKING:
             self._landmarks.clear()  # a new start is a new world: old landmarks do not belong to it

@@ -169,7 +169,10 @@ class Estimate:
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """One turn of the main loop: the frame, its tracks, the estimate, and seconds spent by stage."""
+    """One turn of the main loop: the frame, its tracks, the estimate, and seconds spent by stage.
+
+    A stage named ``a.b`` is a part of ``a``: a back-end's own breakdown is found below ``backend``.
+    """
 
     frame: Frame
     tracks: FrameTracks

@@ -46,11 +46,17 @@ class _LazyGroup(click.Group):
         except VioframeError as error:
             if ctx.params["debug"]:
                 raise
-            click.echo(f"vioframe: error: {' '.join(str(error).split())}", err=True)
+            _say(f"error: {error}", error)
             ctx.exit(EXIT_BAD_INPUT)
-        except KeyboardInterrupt:
-            click.echo("vioframe: interrupted", err=True)
+        except KeyboardInterrupt as error:
+            _say("interrupted", error)
             ctx.exit(EXIT_INTERRUPTED)
+
+
+def _say(text: str, error: BaseException) -> None:
+    """One line on stderr: ``text`` and the notes that the error gathered on its way."""
+    line = "; ".join([text, *getattr(error, "__notes__", [])])
+    click.echo(f"vioframe: {' '.join(line.split())}", err=True)
 
 
 class _EchoHandler(logging.Handler):

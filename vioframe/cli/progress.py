@@ -1,0 +1,48 @@
+"""The progress bar of a run: frame rate, real-time factor, tracked points and what the back-end says."""
+
+from __future__ import annotations
+
+from types import TracebackType
+from typing import Self
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from vioframe.types import NS_PER_S, Step
+
+
+class RunProgress:
+    """Fed with each :class:`Step`; a context manager. ``frames`` is their expected number, None where unknown."""
+
+    def __init__(self, name: str, frames: int | None) -> None:
+        self._progress = Progress(
+            TextColumn("{task.description}"),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TextColumn("{task.fields[figures]}"),
+            TimeRemainingColumn(),
+            console=Console(stderr=True),
+        )
+        self._task = self._progress.add_task(name, total=frames, figures="")
+        self._first_t_ns: int | None = None
+
+    def __enter__(self) -> Self:
+        self._progress.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._progress.stop()
+
+    def __call__(self, step: Step) -> None:
+        if self._first_t_ns is None:
+            self._first_t_ns = step.frame.t_ns
+        task = self._progress.tasks[self._task]
+        wall_s = max(task.elapsed or 0.0, 1e-3)
+        data_s = (step.frame.t_ns - self._first_t_ns) / NS_PER_S
+        figures = (
+            f"{(task.completed + 1) / wall_s:5.1f} frames/s  {data_s / wall_s:5.2f} x real time  "
+            f"{len(step.tracks.ids):4d} points  {step.estimate.status}"
+        )
+        self._progress.update(self._task, advance=1, figures=figures)
