@@ -50,7 +50,7 @@ class Config(_Section):
     frontend: dict[str, Any] = {}
     ground_truth: Path | None = Field(default=None, description="trajectory file (TUM, or EuRoC csv) to compare with")
     start_s: float = Field(default=0.0, ge=0.0, allow_inf_nan=False, description="seconds skipped at the start")
-    duration_s: float | None = Field(default=None, gt=0.0, allow_inf_nan=False, description="seconds to run; null: to the end")
+    duration_s: float | None = Field(default=None, gt=0.0, allow_inf_nan=False, description="null: run to the end")
 
     @property
     def frontend_options(self) -> FrontendOptions:

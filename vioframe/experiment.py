@@ -5,7 +5,7 @@ The command line and the benchmarks both come through here; :mod:`vioframe.pipel
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from itertools import chain
 from pathlib import Path
@@ -15,7 +15,7 @@ from typing import Any
 from vioframe import config as configuration
 from vioframe import machine, pipeline
 from vioframe.config import Config
-from vioframe.errors import DatasetError, PluginError, VioframeError
+from vioframe.errors import DatasetError, PluginError, RunError, VioframeError
 from vioframe.incidents import Incidents
 from vioframe.interfaces import Backend, Dataset, Detector
 from vioframe.recorder import Recorder, new_run_folder, write_json
@@ -104,6 +104,15 @@ def record(
     if first is None:
         raise DatasetError(f"{experiment.dataset.name} has no image to process; check --start and --duration")
     new_run_folder(folder, overwrite=overwrite)
+    try:
+        return _write(experiment, folder, chain([first], steps), begin_s, on_step)
+    except OSError as error:
+        raise RunError(f"cannot write to {folder}: {error.strerror}; is the disk full?") from error
+
+
+def _write(
+    experiment: Experiment, folder: Path, steps: Iterable[Step], begin_s: float, on_step: Callable[[Step], None]
+) -> dict[str, Any]:
     config, registry = experiment.config, experiment.registry
     (folder / "config.yaml").write_text(configuration.render(config, registry), encoding="utf-8")
     write_json(folder / "machine.json", machine.describe())
@@ -111,7 +120,7 @@ def record(
         write_tum(experiment.ground_truth, folder / "ground_truth.tum")
     with Recorder(folder, _about(experiment), experiment.incidents, begin_s) as recorder:
         try:
-            for step in chain([first], steps):
+            for step in steps:
                 recorder.add(step)
                 on_step(step)
         except BaseException as error:

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 @runtime_checkable
 class Detector(Protocol):
-    """Finds keypoints in one image. It gets no mask: the front-end keeps the candidates that are away from live tracks."""
+    """Finds keypoints in one image. It gets no mask: the front-end keeps the candidates away from live tracks."""
 
     def detect(self, image: Image, max_points: int) -> Keypoints:
         """At most ``max_points`` keypoints of ``image`` (H, W) uint8, strongest first."""

@@ -6,7 +6,7 @@
     tracks.csv       every feature observation                     ground_truth.tum where there is one
     timings.csv      seconds, a column a stage                     map.ply          landmarks, written at the end
 
-Each frame is flushed as it comes, so an interrupted run leaves what it had; its ``summary.json`` says ``finished: false``.
+Each frame is flushed as it comes, so an interrupted run leaves what it had, with ``finished: false`` in its summary.
 All but the timings, the machine and the summary's clock-dependent figures are the same byte for byte in every run.
 """
 

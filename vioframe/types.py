@@ -1,8 +1,8 @@
 """The types that cross a stage border: vioframe's glossary.
 
 Conventions (``docs/conventions.md``): W world (z up), B body = IMU, C camera, F feature. ``p_A = R_AB @ p_B + p_AB``.
-A trailing letter names the frame of expression. Time is integer nanoseconds of the *camera* clock: synchronisation moves
-IMU stamps there (``t_imu = t_cam + time_offset``), so that nothing downstream knows of two clocks.
+A trailing letter names the frame of expression. Time is integer nanoseconds of the *camera* clock: synchronisation
+moves IMU stamps there (``t_imu = t_cam + time_offset``), so that nothing downstream knows of two clocks.
 """
 
 from __future__ import annotations
@@ -108,7 +108,7 @@ class Keypoints:
 
 @dataclass(frozen=True, slots=True)
 class FrameTracks:
-    """The features seen in one frame: ``ids`` (N,) unique, ``xy`` (N, 2) px, ``xy_normalised`` (N, 2) undistorted z = 1."""
+    """The features seen in one frame: ``ids`` (N,) unique, ``xy`` (N, 2) px, ``xy_normalised`` (N, 2) with z = 1."""
 
     t_ns: int
     ids: Int
@@ -120,8 +120,8 @@ class FrameTracks:
 class NavState:
     """Where the body is and how it moves: pose, velocity and biases at one instant.
 
-    ``R_WB`` (3, 3), ``p_WB`` (3,) m, ``v_WB`` (3,) m/s, ``bias_gyro_B`` (3,) rad/s, ``bias_accel_B`` (3,) m/s^2. ``cov``
-    (15, 15) covers [dtheta dp dv dbg dba] (right perturbation), or is None where the back-end does not know it.
+    ``R_WB`` (3, 3), ``p_WB`` (3,) m, ``v_WB`` (3,) m/s, ``bias_gyro_B`` (3,) rad/s, ``bias_accel_B`` (3,) m/s^2.
+    ``cov`` (15, 15) covers [dtheta dp dv dbg dba] (right perturbation), or is None where the back-end does not know it.
     """
 
     t_ns: int
