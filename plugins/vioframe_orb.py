@@ -1,6 +1,7 @@
-"""Detector ``orb``: oriented FAST over a scale pyramid, ranked by Harris (Rublee et al., ICCV 2011)."""
+"""Detector ``orb``: FAST over a scale pyramid, ranked by Harris' measure (Rublee et al., ICCV 2011)."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from typing import Annotated
 
 import numpy as np
 
@@ -10,10 +11,15 @@ from vioframe.types import Image, Keypoints
 
 
 class Orb:
-    """``descriptors``: also compute the 32-byte BRIEF descriptors, which tracking does not use."""
+    """Corners of all levels at full resolution: whole pixels of their own level."""
 
     def __init__(
-        self, *, fast_threshold: int = 20, levels: int = 8, scale_factor: float = 1.2, descriptors: bool = False
+        self,
+        *,
+        fast_threshold: Annotated[int, "contrast of a corner to the ring around it, grey levels"] = 20,
+        levels: Annotated[int, "pyramid levels"] = 8,
+        scale_factor: Annotated[float, "ratio of one level's size to the next"] = 1.2,
+        descriptors: Annotated[bool, "also compute the 32-byte descriptors, which tracking does not use"] = False,
     ) -> None:
         import cv2
 
@@ -21,16 +27,14 @@ class Orb:
         self._descriptors = descriptors
 
     def detect(self, image: Image, max_points: int) -> Keypoints:
-        """Corners of all levels at full resolution; those of coarser levels are off the pixel grid."""
+        """At most ``max_points`` corners of ``image``, strongest first."""
         import cv2
 
         self._orb.setMaxFeatures(max_points)
-        found = self._orb.detect(image)
-        # compute() may drop points at the border, but keeps the order of the others.
-        found = sorted(found, key=lambda k: -k.response)[:max_points]
+        found: Sequence[cv2.KeyPoint] = sorted(self._orb.detect(image), key=lambda k: -k.response)[:max_points]
         descriptors = None
         if self._descriptors:
-            found, descriptors = self._orb.compute(image, found)
+            found, descriptors = self._orb.compute(image, found)  # drops what it cannot describe
         xy = np.reshape(cv2.KeyPoint.convert(found), (-1, 2)).astype(np.float32)
         return Keypoints(xy, np.array([k.response for k in found], np.float32), descriptors)
 

@@ -1,6 +1,7 @@
 """Detector ``shi_tomasi``: corners by the smaller eigenvalue of the gradient matrix (Shi and Tomasi, CVPR 1994)."""
 
 from collections.abc import Mapping
+from typing import Annotated
 
 import numpy as np
 
@@ -10,15 +11,21 @@ from vioframe.types import Image, Keypoints
 
 
 class ShiTomasi:
-    """``quality_level``: weakest corner kept, relative to the strongest; ``block_size_px``: side of the window summed."""
+    """Whole-pixel corners, spread by a smallest distance."""
 
-    def __init__(self, *, quality_level: float = 0.005, min_distance_px: float = 10.0, block_size_px: int = 3) -> None:
+    def __init__(
+        self,
+        *,
+        quality_level: Annotated[float, "score of the weakest corner kept, relative to the strongest"] = 0.01,
+        min_distance_px: Annotated[float, "smallest distance between corners"] = 10.0,
+        block_size_px: Annotated[int, "side of the window that the gradients are summed over"] = 3,
+    ) -> None:
         self._quality_level = quality_level
         self._min_distance_px = min_distance_px
         self._block_size_px = block_size_px
 
     def detect(self, image: Image, max_points: int) -> Keypoints:
-        """Whole-pixel corners, at least ``min_distance_px`` apart."""
+        """At most ``max_points`` corners of ``image``, strongest first."""
         import cv2
 
         xy, score = cv2.goodFeaturesToTrackWithQuality(

@@ -59,14 +59,13 @@ def follow(
     """Pyramidal Lucas-Kanade from ``before`` to ``after``, checked by the way back.
 
     ``xy`` (N, 2) px in ``before``, ``guess`` (N, 2) px in ``after``. Returns (N, 2) px in ``after`` and (N,) whether
-    the point was found and returned to within ``tolerance_px``. The way back starts as far from the answer as the way forth
-    did, so that it is a test.
+    the point was found and returned to within ``tolerance_px``. The way back starts as far from its answer as the way
+    forth did, so that it is a test.
     """
     import cv2
 
-    def search(
-        image_1: Image, image_2: Image, start: NDArray[np.float32], first: NDArray[np.float32]
-    ) -> tuple[Float, Float]:
+    def search(image_1: Image, image_2: Image, start: Pixels, first: Pixels) -> tuple[Pixels, Mask]:
+        # The Python binding takes images, not pyramids built before; building one costs 0.2 ms.
         found, status, _ = cv2.calcOpticalFlowPyrLK(
             image_1,
             image_2,
@@ -78,10 +77,10 @@ def follow(
             flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
             minEigThreshold=_MIN_EIGENVALUE,
         )
-        return np.asarray(found, np.float32), status.ravel() == 1
+        return np.asarray(found, np.float32), np.ravel(status) == 1
 
     start, first = xy.astype(np.float32), guess.astype(np.float32)
     found, forth = search(before, after, start, first)
-    returned, back = search(after, before, found, found + (start - first))
-    ok = forth & back & (np.linalg.norm(returned - start, axis=1) < tolerance_px)
+    returned, back = search(after, before, found, np.asarray(found + (start - first), np.float32))
+    ok: Mask = forth & back & (np.linalg.norm(returned - start, axis=1) < tolerance_px)
     return found.astype(np.float64), ok

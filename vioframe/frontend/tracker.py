@@ -2,10 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
-from time import perf_counter
-
 import numpy as np
 
 from vioframe.errors import DatasetError
@@ -17,6 +13,7 @@ from vioframe.geometry import two_view
 from vioframe.geometry.cameras import Camera
 from vioframe.incidents import Incidents
 from vioframe.interfaces import Detector
+from vioframe.stopwatch import Stopwatch
 from vioframe.types import Float, Frame, FrameTracks, Image, ImuSegment, Int
 
 # Standard deviation, in grey levels, below which an image (black, saturated, lens covered) shows nothing but noise.
@@ -52,21 +49,22 @@ class Frontend:
         detector has never worked.
         """
         self._check(frame.image)
-        self.stage_seconds = {}
-        with self._timed("equalise"):
-            image = equalise(frame.image, self._options.equalisation)
+        watch = Stopwatch()
+        image = equalise(frame.image, self._options.equalisation)
+        watch.lap("equalise")
         if np.std(frame.image[::4, ::4]) < _FEATURELESS:
             self._incidents.add("featureless_image", frame.t_ns)
             self._keep(np.zeros(len(self._ids), bool))
         else:
             R_C2C1 = camera_rotation(imu, R_BC)
-            with self._timed("klt"):
-                xy_normalised_before = self._follow(image, R_C2C1)
-            with self._timed("reject"):
-                self._reject(xy_normalised_before, R_C2C1)
-            with self._timed("detect"):
-                self._refill(image, frame.t_ns)
+            xy_normalised_before = self._follow(image, R_C2C1)
+            watch.lap("klt")
+            self._reject(xy_normalised_before, R_C2C1)
+            watch.lap("reject")
+            self._refill(image, frame.t_ns)
+            watch.lap("detect")
         self._image = image
+        self.stage_seconds = watch.seconds
         return FrameTracks(frame.t_ns, self._ids.copy(), self._xy.copy(), self._xy_normalised.copy())
 
     def _check(self, image: Image) -> None:
@@ -144,9 +142,3 @@ class Frontend:
 
     def _keep(self, mask: two_view.Mask) -> None:
         self._ids, self._xy, self._xy_normalised = self._ids[mask], self._xy[mask], self._xy_normalised[mask]
-
-    @contextmanager
-    def _timed(self, stage: str) -> Iterator[None]:
-        begin = perf_counter()
-        yield
-        self.stage_seconds[stage] = perf_counter() - begin

@@ -2,8 +2,8 @@
 
 Points are ``xy_normalised``, (N, 2) on the z = 1 plane of an undistorted camera. View 1 is the earlier one:
 ``p_C2 = R_C2C1 @ p_C1 + p_C2C1`` and ``x_2^T E x_1 = 0`` with ``E = [p_C2C1]x R_C2C1``. Equation numbers are of
-Hartley and Zisserman, "Multiple View Geometry" (2nd edition, 2003). Every function is deterministic: the same points give
-the same answer, run after run.
+Hartley and Zisserman, "Multiple View Geometry" (2nd edition, 2003). Every function is deterministic: the same points
+give the same answer, run after run.
 """
 
 from __future__ import annotations
