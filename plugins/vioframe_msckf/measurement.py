@@ -1,0 +1,251 @@
+"""Residuals and Jacobians of the image measurements, in pixels, with distortion.
+
+A landmark seen from a cloned body pose: ``p_B = R_WB^T (p_WF - p_WB)``, ``p_C = R_BC^T (p_B - p_BC)``, pixel =
+distort(p_C). Residuals are evaluated at the estimate, Jacobians at the first estimates of pose and landmark. Derivation:
+``docs/derivations/msckf.md``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+from vioframe.geometry.kernels import distort, hat, intrinsics_jacobian, undistort
+from vioframe.types import Float, Int
+from vioframe_msckf.state import CALIBRATION, CLONES, FilterState
+from vioframe_msckf.triangulation import triangulate
+
+ACCEPTED, NOT_TRIANGULATED, GATED = 0, 1, 2
+
+
+@dataclass(frozen=True, slots=True)
+class Window:
+    """What the kernels need of the filter: clones, their first estimates, and the camera."""
+
+    R_WB: Float
+    p_WB: Float
+    R_WB_first: Float
+    p_WB_first: Float
+    R_BC: Float
+    p_BC: Float
+    camera_model: int
+    intrinsics: Float
+
+    @classmethod
+    def of(cls, state: FilterState, first_estimates: bool) -> Window:
+        c = state.clones
+        first = (c.R_WB_first, c.p_WB_first) if first_estimates else (c.R_WB, c.p_WB)
+        return cls(c.R_WB, c.p_WB, *first, state.R_BC, state.p_BC, state.camera_model, state.intrinsics)
+
+    def arrays(self) -> tuple[Float, Float, Float, Float, Float, Float, int, Float]:
+        """In the order in which every kernel takes them."""
+        return (
+            self.R_WB,
+            self.p_WB,
+            self.R_WB_first,
+            self.p_WB_first,
+            self.R_BC,
+            self.p_BC,
+            self.camera_model,
+            self.intrinsics,
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class FeatureUpdate:
+    """The stacked, landmark-free measurement of many tracks over [calibration, clones], and what became of each track."""
+
+    H: Float
+    residual: Float
+    p_WF: Float
+    verdict: Int
+
+
+def msckf_measurement(
+    state: FilterState,
+    window: Window,
+    xy: Float,
+    xy_normalised: Float,
+    seen: NDArray[np.bool_],
+    pixel_sigma: float,
+    gate: Float,
+) -> FeatureUpdate:
+    """Triangulate (F, C) tracks, linearise them, project out the landmarks, and gate each at ``gate[dof]``."""
+    P = np.ascontiguousarray(state.cov[CALIBRATION.start : state.landmarks_begin, CALIBRATION.start : state.landmarks_begin])
+    H, residual, p_WF, verdict = _msckf_rows(*window.arrays(), xy, xy_normalised, seen, P, pixel_sigma**2, gate)
+    return FeatureUpdate(H, residual, p_WF, verdict)
+
+
+def landmark_rows(
+    state: FilterState, window: Window, clone: int, xy: Float, rows: NDArray[np.intp], first_estimates: bool
+) -> tuple[Float, Float]:
+    """Measurements (M, 2) px of the landmarks ``rows`` of the state from one clone: H (2 M, n) and residuals (2 M,)."""
+    p_first = state.p_WF_first if first_estimates else state.p_WF
+    blocks, residual = _observations(
+        *window.arrays(), np.full(len(rows), clone), np.ascontiguousarray(state.p_WF[rows]), p_first[rows], xy
+    )
+    H = np.zeros((2 * len(rows), len(state.cov)))
+    pairs = np.arange(2 * len(rows)).reshape(-1, 2)
+    H[:, CALIBRATION] = blocks[:, :, :15].reshape(-1, 15)
+    H[:, CLONES + 6 * clone : CLONES + 6 * clone + 6] = blocks[:, :, 15:21].reshape(-1, 6)
+    columns = state.landmarks_begin + 3 * rows[:, None] + np.arange(3)
+    H[pairs[:, :, None], columns[:, None, :]] = blocks[:, :, 21:]
+    return H, residual.ravel()
+
+
+def track_rows(
+    window: Window, xy: Float, xy_normalised: Float, seen: NDArray[np.bool_]
+) -> tuple[Float, Float, Float, Float] | None:
+    """One track (C,) -> (p_WF, H over [calibration, clones], H over the landmark, residual), or None untriangulated."""
+    ok, p_WF, H, H_f, residual = _track_rows(*window.arrays(), xy, xy_normalised, seen)
+    return (p_WF, H, H_f, residual) if ok else None
+
+
+@njit(cache=True)
+def _observe(R, p, R_first, p_first, R_BC, p_BC, model, k, p_WF, p_WF_first, xy, block, residual):
+    """One observation: ``block`` (2, 24) over [calibration 15, clone 6, landmark 3] and ``residual`` (2,)."""
+    p_C = R_BC.T @ (R.T @ (p_WF - p) - p_BC)
+    drawn, _ = distort(model, k, p_C[0] / p_C[2], p_C[1] / p_C[2])
+    residual[0], residual[1] = xy[0] - drawn[0], xy[1] - drawn[1]
+
+    p_B = R_first.T @ (p_WF_first - p_first)
+    p_C = R_BC.T @ (p_B - p_BC)
+    x, y = p_C[0] / p_C[2], p_C[1] / p_C[2]
+    _, D = distort(model, k, x, y)
+    J = np.empty((2, 3))
+    for i in range(2):
+        J[i, 0], J[i, 1] = D[i, 0] / p_C[2], D[i, 1] / p_C[2]
+        J[i, 2] = -(D[i, 0] * x + D[i, 1] * y) / p_C[2]
+    J_B = J @ R_BC.T
+    J_W = J_B @ R_first.T
+    block[:, 0:3] = J @ hat(p_C)
+    block[:, 3:6] = -J_B
+    block[:, 6] = 0.0  # the time offset acts through the clone
+    block[:, 7:15] = intrinsics_jacobian(model, k, x, y)
+    block[:, 15:18] = J_B @ hat(p_B)
+    block[:, 18:21] = -J_W
+    block[:, 21:24] = J_W
+
+
+@njit(cache=True)
+def _observations(R, p, R_first, p_first, R_BC, p_BC, model, k, clone, p_WF, p_WF_first, xy):
+    m = len(clone)
+    blocks = np.empty((m, 2, 24))
+    residual = np.empty((m, 2))
+    for i in range(m):
+        c = clone[i]
+        _observe(
+            R[c], p[c], R_first[c], p_first[c], R_BC, p_BC, model, k, p_WF[i], p_WF_first[i], xy[i], blocks[i], residual[i]
+        )
+    return blocks, residual
+
+
+@njit(cache=True)
+def _track_rows(R, p, R_first, p_first, R_BC, p_BC, model, k, xy, xy_normalised, seen):
+    C = len(seen)
+    clones = np.flatnonzero(seen)
+    m = len(clones)
+    R_WC = np.empty((m, 3, 3))
+    p_WC = np.empty((m, 3))
+    points = np.empty((m, 2))
+    for i in range(m):
+        c = clones[i]
+        R_WC[i] = R[c] @ R_BC
+        p_WC[i] = R[c] @ p_BC + p[c]
+        points[i, 0], points[i, 1] = undistort(
+            model, k, xy[c, 0], xy[c, 1], xy_normalised[c, 0], xy_normalised[c, 1]
+        )
+    ok, p_WF = triangulate(R_WC, p_WC, points)
+    H = np.zeros((2 * m, 15 + 6 * C))
+    H_f = np.empty((2 * m, 3))
+    residual = np.empty(2 * m)
+    if ok:
+        block = np.empty((2, 24))
+        for i in range(m):
+            c = clones[i]
+            _observe(
+                R[c], p[c], R_first[c], p_first[c], R_BC, p_BC, model, k, p_WF, p_WF, xy[c], block,
+                residual[2 * i : 2 * i + 2],
+            )  # fmt: skip
+            H[2 * i : 2 * i + 2, 0:15] = block[:, 0:15]
+            H[2 * i : 2 * i + 2, 15 + 6 * c : 21 + 6 * c] = block[:, 15:21]
+            H_f[2 * i : 2 * i + 2] = block[:, 21:24]
+    return ok, p_WF, H, H_f, residual
+
+
+@njit(cache=True)
+def reduce_landmark(H, H_f, residual):
+    """Rotate the rows by the orthogonal Q with Q H_f = [T; 0], T (3, 3) upper triangular, in place.
+
+    Householder reflections. The rows below the third are free of the landmark: eq. (22)-(24) of Mourikis and Roumeliotis.
+    """
+    m, n = H.shape
+    v = np.empty(m)
+    for j in range(3):
+        norm = 0.0
+        for i in range(j, m):
+            norm += H_f[i, j] * H_f[i, j]
+        norm = np.sqrt(norm)
+        if norm == 0.0:
+            continue
+        alpha = -norm if H_f[j, j] > 0.0 else norm
+        scale = 0.0
+        for i in range(j, m):
+            v[i] = H_f[i, j] - (alpha if i == j else 0.0)
+            scale += v[i] * v[i]
+        scale = 2.0 / scale
+        for c in range(j, 3):
+            dot = 0.0
+            for i in range(j, m):
+                dot += v[i] * H_f[i, c]
+            for i in range(j, m):
+                H_f[i, c] -= scale * dot * v[i]
+        dots = v[j:m] @ H[j:m]
+        for i in range(j, m):
+            weight = scale * v[i]
+            for c in range(n):
+                H[i, c] -= weight * dots[c]
+        dot = 0.0
+        for i in range(j, m):
+            dot += v[i] * residual[i]
+        for i in range(j, m):
+            residual[i] -= scale * dot * v[i]
+
+
+@njit(cache=True)
+def mahalanobis(H, residual, P, variance):
+    """residual^T (H P H^T + variance I)^-1 residual."""
+    S = H @ P @ H.T
+    for i in range(len(S)):
+        S[i, i] += variance
+    return residual @ np.linalg.solve(S, residual)
+
+
+@njit(cache=True)
+def _msckf_rows(R, p, R_first, p_first, R_BC, p_BC, model, k, xy, xy_normalised, seen, P, variance, gate):
+    F, C = seen.shape
+    n = 15 + 6 * C
+    H_all = np.empty((2 * seen.sum(), n))
+    r_all = np.empty(2 * seen.sum())
+    p_WF = np.empty((F, 3))
+    verdict = np.empty(F, dtype=np.int64)
+    rows = 0
+    for f in range(F):
+        ok, p_WF[f], H, H_f, residual = _track_rows(
+            R, p, R_first, p_first, R_BC, p_BC, model, k, xy[f], xy_normalised[f], seen[f]
+        )
+        if not ok:
+            verdict[f] = NOT_TRIANGULATED
+            continue
+        reduce_landmark(H, H_f, residual)
+        H, residual = H[3:], residual[3:]
+        if mahalanobis(H, residual, P, variance) > gate[len(residual)]:
+            verdict[f] = GATED
+            continue
+        verdict[f] = ACCEPTED
+        H_all[rows : rows + len(residual)] = H
+        r_all[rows : rows + len(residual)] = residual
+        rows += len(residual)
+    return H_all[:rows], r_all[:rows], p_WF, verdict

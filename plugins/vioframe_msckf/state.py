@@ -1,0 +1,229 @@
+"""The filter's mean and covariance. This module alone edits the covariance.
+
+Error state: [imu 15 | calibration 15 | clones 6 each | landmarks 3 each] with
+imu [dtheta dp dv dbg dba], calibration [dtheta_BC dp_BC d_offset d_intrinsics(8)], clone [dtheta dp], landmark dp_WF.
+Parts of the calibration that are not estimated have zero covariance and so are never corrected.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg.lapack import dgeqrf, dpotrf, dtrtrs
+from vioframe.geometry import kernels, so3
+from vioframe.inertial.propagation import propagate, yaw_consistent_transition
+from vioframe.types import DBA, DBG, DP, DTHETA, DV, Calibration, Float, ImuNoise, ImuSegment, NavState
+
+IMU = 15
+CALIBRATION = slice(15, 30)
+EXTRINSICS, OFFSET, INTRINSICS = slice(15, 21), slice(21, 22), slice(22, 30)
+CLONES = 30  # where the clones begin
+
+# Prior standard deviations of the calibration (rad, m, s, px, distortion), as published for OpenVINS on EuRoC.
+_SIGMA_ROTATION, _SIGMA_TRANSLATION, _SIGMA_OFFSET, _SIGMA_PIXELS, _SIGMA_DISTORTION = 0.005, 0.015, 0.01, 1.0, 0.005
+
+
+class FilterDivergedError(ArithmeticError):
+    """The covariance lost its positive definiteness or the state became non-finite."""
+
+
+@dataclass(frozen=True, slots=True)
+class Poses:
+    """The cloned body poses, oldest first, as estimated and as first estimated: (C, 3, 3) and (C, 3)."""
+
+    R_WB: Float
+    p_WB: Float
+    R_WB_first: Float
+    p_WB_first: Float
+
+    def append(self, R_WB: Float, p_WB: Float) -> Poses:
+        """With one more pose, which is its own first estimate."""
+        return Poses(
+            np.concatenate([self.R_WB, R_WB[None]]),
+            np.concatenate([self.p_WB, p_WB[None]]),
+            np.concatenate([self.R_WB_first, R_WB[None]]),
+            np.concatenate([self.p_WB_first, p_WB[None]]),
+        )
+
+    def without_oldest(self) -> Poses:
+        return Poses(self.R_WB[1:], self.p_WB[1:], self.R_WB_first[1:], self.p_WB_first[1:])
+
+    def corrected(self, dx: Float) -> Poses:
+        """Moved by the error ``dx`` (6 C,)."""
+        d = dx.reshape(-1, 6)
+        return Poses(self.R_WB @ so3.exp(d[:, :3]), self.p_WB + d[:, 3:], self.R_WB_first, self.p_WB_first)
+
+    def __len__(self) -> int:
+        return len(self.p_WB)
+
+
+class FilterState:
+    """Mean, first estimates and covariance of the error-state filter."""
+
+    def __init__(self, initial: NavState, calibration: Calibration, *, extrinsics: bool, offset: bool, intrinsics: bool):
+        assert initial.cov is not None
+        self.R_WB, self.p_WB, self.v_WB = initial.R_WB.copy(), initial.p_WB.copy(), initial.v_WB.copy()
+        self.bias_gyro_B, self.bias_accel_B = initial.bias_gyro_B.copy(), initial.bias_accel_B.copy()
+        self.first = (self.R_WB, self.p_WB, self.v_WB)
+        """Orientation, position and velocity as propagated to the newest frame, before its updates."""
+
+        self.R_BC, self.p_BC = calibration.R_BC.copy(), calibration.p_BC.copy()
+        self.offset_s = 0.0
+        self.camera_model, self.intrinsics = kernels.intrinsics_of(calibration.camera)
+        self.clones = Poses(np.empty((0, 3, 3)), np.empty((0, 3)), np.empty((0, 3, 3)), np.empty((0, 3)))
+        self.landmark_ids: NDArray[np.int64] = np.empty(0, np.int64)
+        self.p_WF: Float = np.empty((0, 3))
+        self.p_WF_first: Float = np.empty((0, 3))
+
+        sigma = np.zeros(CLONES)
+        if extrinsics:
+            sigma[EXTRINSICS] = np.repeat([_SIGMA_ROTATION, _SIGMA_TRANSLATION], 3)
+        if offset:
+            sigma[OFFSET] = _SIGMA_OFFSET
+        if intrinsics:
+            sigma[INTRINSICS] = np.repeat([_SIGMA_PIXELS, _SIGMA_DISTORTION], 4)
+        self.cov: Float = np.diag(sigma**2)
+        self.cov[:IMU, :IMU] = initial.cov
+
+    @property
+    def landmarks_begin(self) -> int:
+        """Column at which the landmarks begin."""
+        return CLONES + 6 * len(self.clones)
+
+    def nav_state(self, t_ns: int) -> NavState:
+        """The body's state as a copy of its own."""
+        return NavState(
+            t_ns,
+            self.R_WB.copy(),
+            self.p_WB.copy(),
+            self.v_WB.copy(),
+            self.bias_gyro_B.copy(),
+            self.bias_accel_B.copy(),
+            self.cov[:IMU, :IMU].copy(),
+        )
+
+    def propagate(self, imu: ImuSegment, noise: ImuNoise, first_estimates: bool) -> None:
+        """Move the body's state along ``imu``; eq. (10)-(11) of Mourikis and Roumeliotis (2007), block by block."""
+        step = propagate(imu, self.R_WB, self.p_WB, self.v_WB, self.bias_gyro_B, self.bias_accel_B, noise)
+        Phi = step.transition
+        end = (step.R_WB, step.p_WB, step.v_WB)
+        if first_estimates:
+            Phi = yaw_consistent_transition(Phi, self.first, end, imu.duration_s)
+        self.R_WB, self.p_WB, self.v_WB = self.first = end
+        P = self.cov
+        P[:IMU, IMU:] = Phi @ P[:IMU, IMU:]
+        P[IMU:, :IMU] = P[:IMU, IMU:].T
+        body = Phi @ P[:IMU, :IMU] @ Phi.T + step.noise
+        P[:IMU, :IMU] = 0.5 * (body + body.T)
+
+    def drift_biases(self, duration_s: float, noise: ImuNoise) -> None:
+        """Let time pass at standstill: pose and velocity stay, the biases walk on."""
+        for part, density in ((DBG, noise.gyro_walk), (DBA, noise.accel_walk)):
+            index = np.arange(part.start, part.stop)
+            self.cov[index, index] += density**2 * duration_s
+
+    def augment_clone(self, gyro_B: Float) -> None:
+        """Clone the body's pose at the moment the image was taken, ``offset_s`` after its stamp.
+
+        ``gyro_B`` (3,) is the rate there, free of bias. The clone depends on the offset through the body's motion, as in
+        Li and Mourikis (2014), so the offset is estimated with no term of its own in the measurement.
+        """
+        R = self.R_WB @ so3.exp(gyro_B * self.offset_s)
+        p = self.p_WB + self.v_WB * self.offset_s
+        n = len(self.cov)
+        J = np.zeros((6, n))
+        J[0:3, DTHETA], J[0:3, DBG], J[0:3, OFFSET] = np.eye(3), -self.offset_s * np.eye(3), gyro_B[:, None]
+        J[3:6, DP], J[3:6, DV], J[3:6, OFFSET] = np.eye(3), self.offset_s * np.eye(3), self.v_WB[:, None]
+        JP = J @ self.cov
+        at = self.landmarks_begin
+        self.cov = _insert(self.cov, at, JP, JP @ J.T)
+        self.clones = self.clones.append(R, p)
+
+    def drop_oldest_clone(self) -> None:
+        """Marginalise the oldest clone."""
+        self._delete(np.arange(CLONES, CLONES + 6))
+        self.clones = self.clones.without_oldest()
+
+    def add_landmark(self, landmark_id: int, p_WF: Float, cross: Float, cov: Float) -> None:
+        """Append a landmark (3,) with its cross-covariance (3, n) to the state and its covariance (3, 3)."""
+        self.cov = _insert(self.cov, len(self.cov), cross, cov)
+        self.landmark_ids = np.append(self.landmark_ids, landmark_id)
+        self.p_WF = np.concatenate([self.p_WF, p_WF[None]])
+        self.p_WF_first = np.concatenate([self.p_WF_first, p_WF[None]])
+
+    def keep_landmarks(self, keep: NDArray[np.bool_]) -> None:
+        """Marginalise the landmarks for which ``keep`` (M,) is False."""
+        if keep.all():
+            return
+        gone = np.flatnonzero(~keep)
+        self._delete((self.landmarks_begin + 3 * gone[:, None] + np.arange(3)).ravel())
+        self.landmark_ids, self.p_WF, self.p_WF_first = self.landmark_ids[keep], self.p_WF[keep], self.p_WF_first[keep]
+
+    def update(self, H: Float, residual: Float, columns: slice, R: float | Float) -> None:
+        """Kalman update with ``residual`` (m,) = ``H`` (m, k) @ error[columns] + noise of variance ``R``.
+
+        ``R`` is one variance for all rows or (m,) variances. In square-root form, P -= W^T W with W = L^-1 H P and
+        S = L L^T, which keeps the covariance symmetric; raises :class:`FilterDivergedError` where S is not positive.
+        """
+        HP = H @ self.cov[columns]
+        S = HP[:, columns] @ H.T
+        S[np.diag_indices(len(S))] += R
+        L, bad = dpotrf(S, lower=1, clean=1)
+        if bad or not np.isfinite(residual).all():
+            raise FilterDivergedError("the innovation covariance is not positive definite")
+        W, _ = dtrtrs(L, np.column_stack([HP, residual]), lower=1)
+        dx = W[:, :-1].T @ W[:, -1]
+        W = W[:, :-1]
+        self.cov -= W.T @ W
+        self.cov += self.cov.T
+        self.cov *= 0.5
+        self._correct(dx)
+
+    def _correct(self, dx: Float) -> None:
+        self.R_WB = self.R_WB @ so3.exp(dx[DTHETA])
+        self.p_WB = self.p_WB + dx[DP]
+        self.v_WB = self.v_WB + dx[DV]
+        self.bias_gyro_B = self.bias_gyro_B + dx[DBG]
+        self.bias_accel_B = self.bias_accel_B + dx[DBA]
+        self.R_BC = self.R_BC @ so3.exp(dx[15:18])
+        self.p_BC = self.p_BC + dx[18:21]
+        self.offset_s += float(dx[21])
+        self.intrinsics = self.intrinsics + dx[INTRINSICS]
+        at = self.landmarks_begin
+        self.clones = self.clones.corrected(dx[CLONES:at])
+        self.p_WF = self.p_WF + dx[at:].reshape(-1, 3)
+        if not (np.isfinite(dx).all() and (np.diag(self.cov)[:IMU] > 0.0).all()):
+            raise FilterDivergedError("the state is not finite or its variances are not positive")
+
+    def _delete(self, index: NDArray[np.intp]) -> None:
+        keep = np.ones(len(self.cov), dtype=bool)
+        keep[index] = False
+        self.cov = self.cov[np.ix_(keep, keep)]
+
+
+def compress(H: Float, residual: Float) -> tuple[Float, Float]:
+    """An equivalent measurement of at most as many rows as columns, by QR; Mourikis and Roumeliotis (2007), eq. (28).
+
+    The noise of ``residual`` must be white, and stays so.
+    """
+    rows, columns = H.shape
+    if rows <= columns:
+        return H, residual
+    packed, *_ = dgeqrf(np.asfortranarray(np.column_stack([H, residual])), overwrite_a=1)
+    R = np.triu(packed[:columns])
+    return R[:, :columns], R[:, columns]
+
+
+def _insert(P: Float, at: int, cross: Float, block: Float) -> Float:
+    """``P`` (n, n) with rows and columns ``cross`` (k, n) and ``block`` (k, k) inserted before index ``at``."""
+    n, k = len(P), len(block)
+    old = np.r_[0:at, at + k : n + k]
+    new = np.arange(at, at + k)
+    out = np.empty((n + k, n + k))
+    out[np.ix_(old, old)] = P
+    out[np.ix_(new, old)] = cross
+    out[np.ix_(old, new)] = cross.T
+    out[np.ix_(new, new)] = 0.5 * (block + block.T)
+    return out

@@ -1,0 +1,113 @@
+"""Where a landmark is, given the cameras that saw it: a linear solution, then Levenberg-Marquardt in inverse depth."""
+
+import math
+
+import numpy as np
+from numba import njit
+
+MIN_DEPTH_M, MAX_DEPTH_M = 0.1, 60.0
+_MAX_CONDITION = 1e6
+_MAX_BASELINE_RATIO = 300.0
+_ITERATIONS = 5
+
+
+@njit(cache=True)
+def triangulate(R_WC, p_WC, xy):
+    """(m, 3, 3), (m, 3) camera poses and (m, 2) points on their z = 1 planes -> (whether it can be trusted, (3,) p_WF).
+
+    It cannot where the rays are nearly parallel, the depth is outside 0.1-60 m in any camera, or the depth is far larger
+    than the widest baseline across the line of sight. Inverse depth in the first camera: Montiel, Civera, Davison (2006).
+    """
+    m = len(xy)
+    A = np.zeros((3, 3))
+    b = np.zeros(3)
+    rays = np.empty((m, 3))
+    for i in range(m):
+        ray = R_WC[i] @ np.array([xy[i, 0], xy[i, 1], 1.0])
+        ray /= math.sqrt(ray[0] * ray[0] + ray[1] * ray[1] + ray[2] * ray[2])
+        rays[i] = ray
+        along = ray[0] * p_WC[i, 0] + ray[1] * p_WC[i, 1] + ray[2] * p_WC[i, 2]
+        for r in range(3):
+            b[r] += p_WC[i, r] - ray[r] * along
+            for c in range(3):
+                A[r, c] -= ray[r] * ray[c]
+            A[r, r] += 1.0
+    p = np.zeros(3)
+    eigenvalues = np.linalg.eigvalsh(A)
+    if eigenvalues[0] <= 0.0 or eigenvalues[2] / eigenvalues[0] > _MAX_CONDITION:
+        return False, p
+    p = np.linalg.solve(A, b)
+
+    first = R_WC[0].T @ (p - p_WC[0])
+    if first[2] < MIN_DEPTH_M or first[2] > MAX_DEPTH_M:
+        return False, p
+    theta = np.array([first[0] / first[2], first[1] / first[2], 1.0 / first[2]])
+
+    # Poses relative to the first camera: p_Ci = R_i p_C0 + t_i.
+    R = np.empty((m, 3, 3))
+    t = np.empty((m, 3))
+    for i in range(m):
+        R[i] = R_WC[i].T @ R_WC[0]
+        t[i] = R_WC[i].T @ (p_WC[0] - p_WC[i])
+    damping = 1e-3
+    cost, N, g = _normal_equations(R, t, xy, theta)
+    for _ in range(_ITERATIONS):
+        damped = N.copy()
+        for k in range(3):
+            damped[k, k] *= 1.0 + damping
+        step = np.linalg.solve(damped, g)
+        trial = theta - step
+        trial_cost, trial_N, trial_g = _normal_equations(R, t, xy, trial)
+        if trial_cost < cost:
+            converged = cost - trial_cost < 1e-6 * cost
+            theta, cost, N, g = trial, trial_cost, trial_N, trial_g
+            damping *= 0.1
+            if converged:
+                break
+        else:
+            damping *= 10.0
+
+    if not (theta[2] > 1.0 / MAX_DEPTH_M and theta[2] < 1.0 / MIN_DEPTH_M):
+        return False, p
+    first = np.array([theta[0], theta[1], 1.0]) / theta[2]
+    distance = math.sqrt(first[0] ** 2 + first[1] ** 2 + first[2] ** 2)
+    baseline = 0.0
+    for i in range(1, m):
+        q = R[i] @ first + t[i]
+        if q[2] < MIN_DEPTH_M:
+            return False, p
+        c = -R[i].T @ t[i]  # this camera's centre in the first camera's frame
+        along = (c[0] * first[0] + c[1] * first[1] + c[2] * first[2]) / distance
+        across2 = c[0] * c[0] + c[1] * c[1] + c[2] * c[2] - along * along
+        baseline = max(baseline, math.sqrt(max(across2, 0.0)))
+    if distance > _MAX_BASELINE_RATIO * baseline:
+        return False, p
+    return True, R_WC[0] @ first + p_WC[0]
+
+
+@njit(cache=True)
+def _normal_equations(R, t, xy, theta):
+    """Squared reprojection error on the z = 1 planes, its Gauss-Newton matrix and gradient over [a b rho]."""
+    N = np.zeros((3, 3))
+    g = np.zeros(3)
+    cost = 0.0
+    J = np.empty((2, 3))
+    for i in range(len(xy)):
+        # rho * p_Ci, so that the projection needs no division by the inverse depth.
+        q = R[i] @ np.array([theta[0], theta[1], 1.0]) + theta[2] * t[i]
+        if q[2] < 1e-6:
+            return np.inf, N, g
+        x, y = q[0] / q[2], q[1] / q[2]
+        for k in range(3):
+            d0 = t[i, 0] if k == 2 else R[i, 0, k]
+            d1 = t[i, 1] if k == 2 else R[i, 1, k]
+            d2 = t[i, 2] if k == 2 else R[i, 2, k]
+            J[0, k] = (d0 - x * d2) / q[2]
+            J[1, k] = (d1 - y * d2) / q[2]
+        e0, e1 = x - xy[i, 0], y - xy[i, 1]
+        cost += e0 * e0 + e1 * e1
+        for r in range(3):
+            g[r] += J[0, r] * e0 + J[1, r] * e1
+            for c in range(3):
+                N[r, c] += J[0, r] * J[0, c] + J[1, r] * J[1, c]
+    return cost, N, g

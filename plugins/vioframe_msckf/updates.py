@@ -1,0 +1,132 @@
+"""The three visual updates: from finished tracks, from landmarks in the state, and by taking new landmarks in."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from vioframe.types import Float, FrameTracks, Int
+from vioframe_msckf.measurement import (
+    ACCEPTED,
+    NOT_TRIANGULATED,
+    Window,
+    landmark_rows,
+    mahalanobis,
+    msckf_measurement,
+    reduce_landmark,
+    track_rows,
+)
+from vioframe_msckf.options import MsckfOptions
+from vioframe_msckf.state import CALIBRATION, FilterState, compress
+from vioframe_msckf.tracks import ObservationTable
+
+
+@dataclass(frozen=True, slots=True)
+class Selection:
+    """Rows of the observation table: tracks to use and let go of now, and full ones that may become landmarks."""
+
+    finished: NDArray[np.intp]
+    promoted: NDArray[np.intp]
+
+
+def select_tracks(observations: ObservationTable, state: FilterState, options: MsckfOptions) -> Selection:
+    """Tracks that were lost or reach back to the oldest clone of a full window, the longest first.
+
+    Lost tracks too short to be used are dropped from the table. Full tracks fill the free landmark slots first.
+    """
+    lengths = observations.lengths()
+    lost = ~observations.seen[:, -1]
+    full = observations.seen[:, 0] & ~lost & (len(state.clones) >= options.max_clones)
+    too_short = lost & (lengths < options.min_track_length)
+    if too_short.any():
+        observations.drop(np.flatnonzero(too_short))
+        lengths, lost, full = lengths[~too_short], lost[~too_short], full[~too_short]
+    free = max(options.max_slam_features - len(state.landmark_ids), 0)
+    candidates = np.flatnonzero(full)
+    promoted = candidates[np.argsort(-lengths[candidates], kind="stable")][:free]
+    rest = np.setdiff1d(np.flatnonzero(lost | full), promoted)
+    # Lost tracks have no second chance, full ones come again with the next frame.
+    order = np.lexsort((-lengths[rest], ~lost[rest]))
+    return Selection(rest[order][: options.max_features], promoted)
+
+
+def update_from_tracks(
+    state: FilterState, observations: ObservationTable, rows: NDArray[np.intp], options: MsckfOptions, gate: Float
+) -> tuple[Int, Float]:
+    """The multi-state constraint update; returns ids and positions of the landmarks it accepted."""
+    window = Window.of(state, options.first_estimate_jacobians)
+    measured = msckf_measurement(
+        state,
+        window,
+        observations.xy[rows],
+        observations.xy_normalised[rows],
+        observations.seen[rows],
+        options.pixel_sigma,
+        gate,
+    )
+    if len(measured.residual):
+        H, residual = compress(measured.H, measured.residual)
+        columns = slice(CALIBRATION.start, state.landmarks_begin)
+        state.update(H, residual, columns, options.pixel_sigma**2)
+    accepted = measured.verdict == ACCEPTED
+    return observations.ids[rows[accepted]], measured.p_WF[accepted]
+
+
+def update_from_landmarks(state: FilterState, tracks: FrameTracks, options: MsckfOptions, gate: Float) -> int:
+    """Update with the landmarks of the state seen in the newest frame; unseen and implausible ones leave the state.
+
+    Returns how many were used.
+    """
+    state.keep_landmarks(np.isin(state.landmark_ids, tracks.ids))
+    if not len(state.landmark_ids):
+        return 0
+    window = Window.of(state, options.first_estimate_jacobians)
+    order = np.argsort(tracks.ids)
+    xy = tracks.xy[order[np.searchsorted(tracks.ids, state.landmark_ids, sorter=order)]]
+    every = np.arange(len(state.landmark_ids))
+    H, residual = landmark_rows(state, window, len(state.clones) - 1, xy, every, options.first_estimate_jacobians)
+
+    variance = options.pixel_sigma**2
+    pairs = H.reshape(-1, 2, H.shape[1])
+    S = pairs @ state.cov @ pairs.transpose(0, 2, 1) + variance * np.eye(2)
+    r = residual.reshape(-1, 2)
+    distance = np.einsum("ni,ni->n", r, np.linalg.solve(S, r[..., None])[..., 0])
+    accepted = distance < gate[2]
+    if accepted.any():
+        use = np.repeat(accepted, 2)
+        state.update(H[use], residual[use], slice(0, len(state.cov)), variance)
+    state.keep_landmarks(accepted)
+    return int(accepted.sum())
+
+
+def promote_tracks(
+    state: FilterState, observations: ObservationTable, rows: NDArray[np.intp], options: MsckfOptions, gate: Float
+) -> NDArray[np.intp]:
+    """Take the tracks ``rows`` into the state as landmarks; returns the rows that were used up, promoted or implausible.
+
+    Delayed initialisation (Li, "Visual-inertial odometry on resource-constrained systems", 2014): the three rows that an
+    orthogonal transformation leaves to the landmark initialise it, the others update the state.
+    """
+    used = []
+    variance = options.pixel_sigma**2
+    for row in rows:
+        # Every promotion updates the state, so each is linearised at the estimate the last one left.
+        window = Window.of(state, options.first_estimate_jacobians)
+        track = track_rows(window, observations.xy[row], observations.xy_normalised[row], observations.seen[row])
+        if track is None:
+            continue
+        used.append(row)
+        p_WF, H, H_f, residual = track
+        reduce_landmark(H, H_f, residual)
+        columns = slice(CALIBRATION.start, state.landmarks_begin)
+        P = np.ascontiguousarray(state.cov[columns, columns])
+        if mahalanobis(H[3:], residual[3:], P, variance) > gate[len(residual) - 3]:
+            continue
+        T_inverse = np.linalg.inv(H_f[:3])
+        gain = -T_inverse @ H[:3]
+        cross = gain @ state.cov[columns]
+        cov = gain @ P @ gain.T + variance * T_inverse @ T_inverse.T
+        state.add_landmark(int(observations.ids[row]), p_WF + T_inverse @ residual[:3], cross, cov)
+        state.update(H[3:], residual[3:], columns, variance)
+    return np.array(used, dtype=np.intp)

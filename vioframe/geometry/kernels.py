@@ -1,0 +1,134 @@
+"""Compiled scalar twins of :mod:`so3` and :mod:`cameras`, for the hot loops of the back-ends.
+
+Importing this module loads numba; only back-ends do. Tests hold every function equal to its readable twin.
+"""
+
+import math
+
+import numpy as np
+from numba import njit
+
+from vioframe.geometry.cameras import Camera
+from vioframe.types import Float
+
+RADTAN, EQUIDISTANT = 0, 1
+
+
+def intrinsics_of(camera: Camera) -> tuple[int, Float]:
+    """The camera as the kernels take it: model number and (8,) [fx fy cx cy d1 d2 d3 d4]."""
+    number = RADTAN if camera.model == "radtan" else EQUIDISTANT
+    return number, np.array([camera.fx, camera.fy, camera.cx, camera.cy, *camera.distortion])
+
+
+@njit(cache=True)
+def hat(v):
+    """(3,) -> (3, 3) skew matrix."""
+    return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
+
+
+@njit(cache=True)
+def cross(a, b):
+    """(3,) x (3,) -> (3,)."""
+    return np.array([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
+
+
+@njit(cache=True)
+def exp(phi):
+    """(3,) rad -> (3, 3) rotation."""
+    a2 = phi[0] * phi[0] + phi[1] * phi[1] + phi[2] * phi[2]
+    if a2 < 1e-8:
+        sinc, cosc = 1.0 - a2 / 6.0, 0.5 - a2 / 24.0
+    else:
+        a = math.sqrt(a2)
+        sinc, cosc = math.sin(a) / a, (1.0 - math.cos(a)) / a2
+    K = hat(phi)
+    return np.eye(3) + sinc * K + cosc * (K @ K)
+
+
+@njit(cache=True)
+def right_jacobian(phi):
+    """(3,) rad -> (3, 3), J_r with Exp(phi + d) ~ Exp(phi) Exp(J_r d)."""
+    a2 = phi[0] * phi[0] + phi[1] * phi[1] + phi[2] * phi[2]
+    if a2 < 1e-8:
+        cosc, sinc3 = 0.5 - a2 / 24.0, 1.0 / 6.0 - a2 / 120.0
+    else:
+        a = math.sqrt(a2)
+        cosc, sinc3 = (1.0 - math.cos(a)) / a2, (a - math.sin(a)) / (a2 * a)
+    K = hat(phi)
+    return np.eye(3) - cosc * K + sinc3 * (K @ K)
+
+
+@njit(cache=True)
+def distort(model, k, x, y):
+    """A point on the z = 1 plane -> pixel (2,) and its Jacobian d px / d (x, y) (2, 2)."""
+    r2 = x * x + y * y
+    xy = np.empty(2)
+    J = np.empty((2, 2))
+    if model == RADTAN:
+        radial = 1.0 + r2 * (k[4] + k[5] * r2)
+        slope = 2.0 * (k[4] + 2.0 * k[5] * r2)
+        u = x * radial + 2.0 * k[6] * x * y + k[7] * (r2 + 2.0 * x * x)
+        v = y * radial + k[6] * (r2 + 2.0 * y * y) + 2.0 * k[7] * x * y
+        J[0, 0] = radial + slope * x * x + 2.0 * k[6] * y + 6.0 * k[7] * x
+        J[1, 1] = radial + slope * y * y + 6.0 * k[6] * y + 2.0 * k[7] * x
+        J[0, 1] = J[1, 0] = slope * x * y + 2.0 * k[6] * x + 2.0 * k[7] * y
+    else:
+        r = math.sqrt(r2)
+        t = math.atan(r)
+        t2 = t * t
+        if r < 1e-6:
+            scale, slope = 1.0, 2.0 * (k[4] - 1.0 / 3.0)
+        else:
+            scale = t * (1.0 + t2 * (k[4] + t2 * (k[5] + t2 * (k[6] + t2 * k[7])))) / r
+            d_t = 1.0 + t2 * (3.0 * k[4] + t2 * (5.0 * k[5] + t2 * (7.0 * k[6] + t2 * 9.0 * k[7])))
+            slope = (d_t / (1.0 + r2) - scale) / r2
+        u, v = x * scale, y * scale
+        J[0, 0], J[1, 1] = scale + slope * x * x, scale + slope * y * y
+        J[0, 1] = J[1, 0] = slope * x * y
+    xy[0], xy[1] = k[0] * u + k[2], k[1] * v + k[3]
+    for j in range(2):
+        J[0, j] *= k[0]
+        J[1, j] *= k[1]
+    return xy, J
+
+
+@njit(cache=True)
+def intrinsics_jacobian(model, k, x, y):
+    """d px / d [fx fy cx cy d1 d2 d3 d4] at a point of the z = 1 plane, (2, 8)."""
+    J = np.zeros((2, 8))
+    r2 = x * x + y * y
+    if model == RADTAN:
+        radial = 1.0 + r2 * (k[4] + k[5] * r2)
+        J[0, 0] = x * radial + 2.0 * k[6] * x * y + k[7] * (r2 + 2.0 * x * x)
+        J[1, 1] = y * radial + k[6] * (r2 + 2.0 * y * y) + 2.0 * k[7] * x * y
+        J[0, 4], J[1, 4] = k[0] * x * r2, k[1] * y * r2
+        J[0, 5], J[1, 5] = k[0] * x * r2 * r2, k[1] * y * r2 * r2
+        J[0, 6], J[1, 6] = k[0] * 2.0 * x * y, k[1] * (r2 + 2.0 * y * y)
+        J[0, 7], J[1, 7] = k[0] * (r2 + 2.0 * x * x), k[1] * 2.0 * x * y
+    else:
+        r = math.sqrt(r2)
+        t = math.atan(r)
+        over_r = 1.0 if r < 1e-9 else 1.0 / r
+        t2 = t * t
+        scale = 1.0 if r < 1e-9 else t * (1.0 + t2 * (k[4] + t2 * (k[5] + t2 * (k[6] + t2 * k[7])))) / r
+        J[0, 0], J[1, 1] = x * scale, y * scale
+        power = t
+        for i in range(4):
+            power *= t2
+            J[0, 4 + i], J[1, 4 + i] = k[0] * x * power * over_r, k[1] * y * power * over_r
+    J[0, 2] = J[1, 3] = 1.0
+    return J
+
+
+@njit(cache=True)
+def undistort(model, k, px, py, x, y):
+    """The point of the z = 1 plane that is drawn at pixel (px, py), by Newton's method from the guess (x, y)."""
+    for _ in range(5):
+        xy, J = distort(model, k, x, y)
+        ex, ey = xy[0] - px, xy[1] - py
+        if abs(ex) + abs(ey) < 1e-6:
+            break
+        det = J[0, 0] * J[1, 1] - J[0, 1] * J[1, 0]
+        x -= (J[1, 1] * ex - J[0, 1] * ey) / det
+        y -= (J[0, 0] * ey - J[1, 0] * ex) / det
+    return x, y
