@@ -37,8 +37,9 @@ class BoardView:
 def april_sequence(folder: Path, calibration: Calibration | None = None) -> TrackSequence:
     """The recording in ``folder``, which holds ``cam0_corners.csv.gz`` and ``imu0.csv.gz``.
 
-    ``calibration`` is EuRoC's as published unless given; it fits, see ``benchmarks/april.py``. A corner that comes back into view gets a new id, as it would from any tracker: ``id % corner_count(views)`` is its
-    identity. Raises :class:`DatasetError` where a file is missing.
+    ``calibration`` is EuRoC's as published unless given; it fits the corners to 0.4 px. A corner that comes back into
+    view gets a new id, as it would from any tracker; ids of one corner differ by multiples of :func:`corner_count`.
+    Raises :class:`DatasetError` where a file is missing.
     """
     calibration = calibration or packaged_calibration("euroc")
     imu_ns, imu = _read(folder / "imu0.csv.gz", range(1, 7))

@@ -13,7 +13,9 @@ from vioframe.errors import TrajectoryError
 from vioframe.interfaces import Backend
 from vioframe.simulation.sequence import TrackSequence
 from vioframe.trajectory import Trajectory
-from vioframe.types import Estimate, Float, NavState, Status
+from vioframe.types import DP, Estimate, Float, NavState, Status
+
+_POSE = DP.stop  # [dtheta dp] come first in the error state
 
 
 @dataclass(frozen=True)
@@ -31,14 +33,16 @@ class BackendRun:
 
     @property
     def trajectory(self) -> Trajectory:
-        """Their poses; raises :class:`TrajectoryError` where there are none."""
+        """Their poses, with covariance where the back-end knows it at every one; raises :class:`TrajectoryError` where there are none."""
         states = self.states
         if not states:
             raise TrajectoryError("the back-end never got past initialisation; its events say why")
+        covs = [s.cov[:_POSE, :_POSE] for s in states if s.cov is not None]
         return Trajectory(
             np.array([s.t_ns for s in states], np.int64),
             np.array([s.R_WB for s in states]),
             np.array([s.p_WB for s in states]),
+            np.array(covs) if len(covs) == len(states) else None,
         )
 
     @property
@@ -46,6 +50,13 @@ class BackendRun:
         """Time from the first packet to the first state, or None."""
         states = self.states
         return (states[0].t_ns - self.t_ns[0]) * 1e-9 if states else None
+
+    @property
+    def completion(self) -> float:
+        """Part of the packets from the first state on at which the back-end was tracking."""
+        tracking = [e.status is Status.TRACKING for e in self.estimates]
+        first = tracking.index(True) if any(tracking) else 0
+        return sum(tracking) / (len(tracking) - first)
 
     @property
     def resets(self) -> int:

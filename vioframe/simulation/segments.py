@@ -1,31 +1,31 @@
-"""Complete inertial segments from a whole recording at once."""
+"""Inertial segments from a whole recording at once, through the synchronisation that every data set goes through."""
+
+from collections.abc import Iterable
+from heapq import merge
 
 import numpy as np
 
 from vioframe.errors import DatasetError
-from vioframe.types import Float, ImuSegment, Int
+from vioframe.incidents import Incidents
+from vioframe.synchronise import synchronise
+from vioframe.types import Float, Frame, ImuSample, ImuSegment, Int, Measurement
+
+_NO_IMAGE = np.empty((0, 0), np.uint8)
 
 
 def cut_segments(t_ns: Int, gyro_B: Float, accel_B: Float, frames_ns: Int) -> list[ImuSegment]:
-    """One segment a frame, both ends interpolated onto the frame stamps; the first holds a single reading.
+    """One segment a frame, as :func:`vioframe.synchronise.synchronise` cuts them.
 
     ``t_ns`` (N,) ascending, ``gyro_B`` (N, 3) rad/s, ``accel_B`` (N, 3) m/s^2, ``frames_ns`` (M,) ascending and within
-    the readings, or :class:`DatasetError` is raised.
+    the readings; raises :class:`DatasetError` where that is not so and a frame would be left without its segment.
     """
-    if frames_ns[0] < t_ns[0] or frames_ns[-1] > t_ns[-1]:
-        raise DatasetError("frames lie outside the inertial readings; limit them to the stamps those cover")
-    readings = np.hstack([gyro_B, accel_B])
-    # Relative seconds keep the interpolation exact to a nanosecond, which float stamps would not.
-    seconds = (t_ns - t_ns[0]) * 1e-9
-    at_frames = np.column_stack([np.interp((frames_ns - t_ns[0]) * 1e-9, seconds, column) for column in readings.T])
-    first_after = np.searchsorted(t_ns, frames_ns, side="right")
-    last_before = np.searchsorted(t_ns, frames_ns, side="left")
-    segments = [ImuSegment(frames_ns[:1].copy(), at_frames[:1, :3].copy(), at_frames[:1, 3:].copy())]
-    for k in range(1, len(frames_ns)):
-        inner = slice(first_after[k - 1], last_before[k])
-        t = np.concatenate([frames_ns[k - 1 : k], t_ns[inner], frames_ns[k : k + 1]])
-        x = np.concatenate([at_frames[k - 1 : k], readings[inner], at_frames[k : k + 1]])
-        recorded = t_ns[first_after[k - 1] - 1 : last_before[k] + 1]
-        gap_s = float(np.diff(recorded).max()) * 1e-9
-        segments.append(ImuSegment(t, x[:, :3].copy(), x[:, 3:].copy(), gap_s))
+    samples: Iterable[Measurement] = (
+        ImuSample(t, gyro, accel) for t, gyro, accel in zip(t_ns.tolist(), gyro_B, accel_B, strict=True)
+    )
+    frames: Iterable[Measurement] = (Frame(t, _NO_IMAGE) for t in frames_ns.tolist())
+    incidents = Incidents()
+    stream = merge(samples, frames, key=lambda measurement: measurement.t_ns)
+    segments = [segment for segment, _ in synchronise(stream, incidents=incidents)]
+    if len(segments) != len(frames_ns):
+        raise DatasetError(f"frames lie outside the inertial readings or repeat: {dict(incidents.counts)}")
     return segments
