@@ -54,7 +54,7 @@ class Config(_Section):
 
     @property
     def frontend_options(self) -> FrontendOptions:
-        return FrontendOptions(**validate_options("the front-end", options_of(FrontendOptions), self.frontend))
+        return FrontendOptions(**validate_options("the front-end", FrontendOptions, self.frontend))
 
 
 def read(path: str | Path) -> Config:
@@ -112,7 +112,7 @@ def complete(config: Config, registry: Registry) -> Config:
             name=config.backend.name,
             options=registry.find(BACKEND, config.backend.name).validate(config.backend.options),
         ),
-        "frontend": validate_options("the front-end", options_of(FrontendOptions), config.frontend),
+        "frontend": validate_options("the front-end", FrontendOptions, config.frontend),
     }
     FrontendOptions(**parts["frontend"])  # raises on a value out of range
     if config.dataset.path is not None:

@@ -62,12 +62,14 @@ def options_of(factory: Callable[..., Any], given: int = 0) -> list[Option]:
     return options
 
 
-def validate_options(owner: str, options: Iterable[Option], values: Mapping[str, Any]) -> dict[str, Any]:
-    """``values`` coerced to their types, the defaults filled in: everything ``owner`` will be built with.
+def validate_options(
+    owner: str, factory: Callable[..., Any], values: Mapping[str, Any], given: int = 0
+) -> dict[str, Any]:
+    """``values`` coerced to their types, the defaults filled in: everything that ``factory`` will be called with.
 
     Raises :class:`ConfigError`, showing the options there are, for an unknown, missing or unsuitable one.
     """
-    table = {option.name: option for option in options}
+    table = {option.name: option for option in options_of(factory, given)}
     shown = f"its options: {', '.join(map(str, table.values()))}" if table else "it has no options"
     for name in values:
         if name not in table:
@@ -84,6 +86,12 @@ def validate_options(owner: str, options: Iterable[Option], values: Mapping[str,
         except ValidationError as error:
             reason = error.errors()[0]["msg"]
             raise ConfigError(f"{owner}: {name}={values[name]!r}: {reason}; {shown}") from error
+    options_type = getattr(factory, "options_type", None)
+    if options_type is not None:
+        try:
+            options_type(**complete)  # what its __post_init__ has to say about the values together
+        except ValueError as error:
+            raise ConfigError(f"{owner}: {error}") from error
     return complete
 
 

@@ -78,7 +78,7 @@ class Part:
 
     def validate(self, options: Mapping[str, Any]) -> dict[str, Any]:
         """``options`` checked, coerced and completed with the defaults."""
-        return validate_options(f"{self.kind.name} {self.name!r}", self.options, options)
+        return validate_options(f"{self.kind.name} {self.name!r}", self.factory, options, self.kind.given)
 
     def create(self, *given: Any, options: Mapping[str, Any]) -> Any:
         """Build the part; raises :class:`PluginError` where its factory fails or makes something else."""
