@@ -62,7 +62,7 @@ class Dataset(Protocol):
 class DatasetFactory(Protocol):
     """Opens a recording. Usually the data set's class itself, with ``accepts`` as a static method."""
 
-    def __call__(self, path: Path, **options: Any) -> Dataset:
+    def __call__(self, path: Path, *args: Any, **options: Any) -> Dataset:
         """Open ``path``; raises :class:`vioframe.errors.DatasetError` where it cannot be read."""
         ...
 

@@ -12,7 +12,7 @@ from vioframe.calibration.parts import CameraPart, ImuPart, inverse
 from vioframe.errors import CalibrationError
 from vioframe.types import Calibration
 
-__all__ = ["load_calibration", "packaged_calibration", "write_calibration"]
+__all__ = ["as_paths", "load_calibration", "packaged_calibration", "sidecar_folder", "write_calibration"]
 
 _PACKAGED = Path(__file__).parent / "data"
 
@@ -45,9 +45,20 @@ def load_calibration(*paths: str | Path, camera: str | None = None) -> Calibrati
     return Calibration(part.camera, T_IC[:3, :3], T_IC[:3, 3], imus[0].noise, part.time_offset_ns)
 
 
+def as_paths(files: Path | Iterable[Path]) -> list[Path]:
+    """A reader's option that names one file or several, as a list."""
+    return [files] if isinstance(files, Path) else list(files)
+
+
 def packaged_calibration(name: str, camera: str | None = None) -> Calibration:
     """A calibration that ships with vioframe: ``euroc``, as published; it is the same in all eleven sequences."""
     return load_calibration(_PACKAGED / name, camera=camera)
+
+
+def sidecar_folder(recording: Path) -> Path:
+    """Where the calibration of a recording that cannot hold one is kept: ``flight.bag.calib`` beside ``flight.bag``."""
+    recording = recording.absolute()
+    return recording.with_name(f"{recording.name}.calib")
 
 
 def _documents(paths: Iterable[Path]) -> Iterator[tuple[Fields, Path]]:

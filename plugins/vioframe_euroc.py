@@ -1,0 +1,161 @@
+"""The ASL folder layout of EuRoC: ``mav0/cam0/data.csv`` and images, ``mav0/imu0/data.csv``, a ``sensor.yaml`` each."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from itertools import islice
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import numpy as np
+
+from vioframe.calibration import as_paths, load_calibration
+from vioframe.errors import DatasetError
+from vioframe.hookspecs import hookimpl
+from vioframe.images import check_bit_depth, check_size, decode_image, to_gray8
+from vioframe.interfaces import DatasetFactory
+from vioframe.types import Calibration, Frame, ImuSample, Measurement, Unreadable
+
+if TYPE_CHECKING:
+    from vioframe.trajectory import Trajectory
+
+# An IMU row counts as due when one of it and the next few rows is: a single wild stamp must not hold up all the rest.
+_ROWS_AHEAD = 5
+
+
+class EurocDataset:
+    """A sequence in ASL layout: one camera, one IMU, and the ground truth where there is one."""
+
+    def __init__(
+        self,
+        path: Path,
+        *,
+        camera: Annotated[str, "folder of the camera to use"] = "cam0",
+        imu: Annotated[str, "folder of the IMU to use"] = "imu0",
+        calibration: Annotated[list[Path] | Path | None, "calibration files or folder, instead of sensor.yaml"] = None,
+        bit_depth: Annotated[int | None, "bits in use in 16-bit images, 8 to 16"] = None,
+    ) -> None:
+        check_bit_depth(bit_depth)
+        self._mav0 = _mav0(path)
+        self._camera_folder = self._mav0 / camera
+        self._bit_depth = bit_depth
+        for folder in (self._camera_folder, self._mav0 / imu):
+            if not (folder / "data.csv").is_file():
+                there = ", ".join(sorted(file.parent.name for file in self._mav0.glob("*/data.csv"))) or "nothing"
+                raise DatasetError(f"{folder / 'data.csv'} is missing; choose camera and imu among: {there}")
+        files = calibration or [self._mav0 / name / "sensor.yaml" for name in (camera, imu)]
+        self.calibration: Calibration = load_calibration(*as_paths(files), camera=camera)
+        self._frames = list(_frame_rows(self._camera_folder / "data.csv"))
+        self._imu = list(_imu_rows(self._mav0 / imu / "data.csv"))
+        if not self._frames:
+            raise DatasetError(f"{self._camera_folder / 'data.csv'} lists no image; the recording has no camera data")
+        if not any(isinstance(row, ImuSample) for row in self._imu):
+            raise DatasetError(f"{self._mav0 / imu / 'data.csv'} holds no sample; the recording has no IMU data")
+
+    @staticmethod
+    def accepts(path: Path) -> bool:
+        """Whether ``path`` is a sequence with a ``mav0`` folder, or such a folder."""
+        return path.is_dir() and ((path / "mav0").is_dir() or path.absolute().name == "mav0")
+
+    @property
+    def name(self) -> str:
+        return self._mav0.parent.name
+
+    @property
+    def frame_count(self) -> int:
+        return len(self._frames)
+
+    @property
+    def ground_truth(self) -> Trajectory | None:
+        file = self._mav0 / "state_groundtruth_estimate0" / "data.csv"
+        if not file.is_file():
+            return None
+        from vioframe.trajectory import load_trajectory
+
+        return load_trajectory(file)
+
+    def measurements(self) -> Iterator[Measurement]:
+        """IMU samples and frames, each in the order of their file."""
+        imu = iter(self._imu)
+        taken = 0
+        due = _rows_due([sample.t_ns for sample in self._imu], [t_ns for t_ns, _ in self._frames])
+        for (t_ns, file), count in zip(self._frames, due, strict=True):
+            yield from islice(imu, max(0, count - taken))
+            taken = max(taken, count)
+            yield self._frame(t_ns, file)
+        yield from imu
+
+    def _frame(self, t_ns: int, file: str) -> Frame | Unreadable:
+        path = self._camera_folder / "data" / file
+        try:
+            image = decode_image(path.read_bytes())
+        except OSError as err:
+            return Unreadable(t_ns, "frame_unreadable", f"{path.name}: {err.strerror}")
+        if image is None:
+            return Unreadable(t_ns, "frame_unreadable", f"{path.name} is damaged")
+        gray = to_gray8(image, self._bit_depth, str(self._camera_folder))
+        check_size(gray, self.calibration.camera, str(self._camera_folder))
+        return Frame(t_ns, gray)
+
+
+def _mav0(path: Path) -> Path:
+    """The ``mav0`` folder of a sequence, or ``path`` itself if it is one."""
+    if not path.is_dir():
+        raise DatasetError(f"{path} is not a folder; an ASL data set is the folder that holds mav0/")
+    path = path.resolve()
+    if (path / "mav0").is_dir():
+        return path / "mav0"
+    if path.name == "mav0":
+        return path
+    raise DatasetError(f"{path} holds no mav0/; name the folder of one sequence in ASL layout")
+
+
+def _csv_rows(file: Path) -> Iterator[list[str]]:
+    """The rows of a csv file, without comments and a heading."""
+    try:
+        lines = file.read_text(encoding="utf-8-sig").splitlines()
+    except (OSError, UnicodeDecodeError) as err:
+        raise DatasetError(f"cannot read {file}: {' '.join(str(err).split())}") from None
+    for number, line in enumerate(lines):
+        is_heading = number == 0 and not line[:1].isdigit()
+        if line.strip() and not line.startswith("#") and not is_heading:
+            yield line.split(",")
+
+
+def _frame_rows(file: Path) -> Iterator[tuple[int, str]]:
+    """Stamp and image file of each frame."""
+    for row in _csv_rows(file):
+        try:
+            t_ns = int(row[0])
+        except ValueError:
+            raise DatasetError(
+                f"{file}: {','.join(row)!r} does not begin with a stamp in integer nanoseconds"
+            ) from None
+        yield t_ns, row[1].strip() if len(row) > 1 else f"{t_ns}.png"
+
+
+def _imu_rows(file: Path) -> Iterator[ImuSample | Unreadable]:
+    """The samples of the file; a row that is none takes the place, and the stamp, of its predecessor's."""
+    t_ns = 0
+    for row in _csv_rows(file):
+        try:
+            wx, wy, wz, ax, ay, az = map(float, row[1:7])
+            t_ns = int(row[0])
+        except ValueError:
+            yield Unreadable(t_ns, "imu_unreadable", f"{file.name}: {','.join(row)!r} is no stamp with six readings")
+        else:
+            yield ImuSample(t_ns, np.array([wx, wy, wz]), np.array([ax, ay, az]))
+
+
+def _rows_due(imu_t_ns: list[int], frame_t_ns: list[int]) -> list[int]:
+    """For each frame, how many IMU rows come before it in time, wild stamps overlooked."""
+    due_ns = np.array(imu_t_ns, dtype=np.int64)
+    for ahead in range(1, _ROWS_AHEAD + 1):
+        np.minimum(due_ns[:-ahead], imu_t_ns[ahead:], out=due_ns[:-ahead])
+    counts: list[int] = np.searchsorted(np.maximum.accumulate(due_ns), frame_t_ns, side="right").tolist()
+    return counts
+
+
+@hookimpl
+def vioframe_datasets() -> Mapping[str, DatasetFactory]:
+    return {"euroc": EurocDataset}

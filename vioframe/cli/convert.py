@@ -1,0 +1,83 @@
+"""``vioframe convert``: a recording in another format."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import click
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from vioframe import registry
+from vioframe.convert import FORMATS, convert, format_of
+from vioframe.errors import ConfigError
+from vioframe.interfaces import Dataset
+from vioframe.types import Frame, Measurement
+
+_FILE = click.Path(path_type=Path)
+_COMPRESSIONS = sorted({name for format in FORMATS.values() for name in format.compressions})
+
+
+@click.command("convert")
+@click.argument("source", metavar="SRC", type=_FILE)
+@click.argument("destination", metavar="DST", type=_FILE)
+@click.option("--format", type=click.Choice(list(FORMATS)), help="Format of DST.  [default: told by its name]")
+@click.option(
+    "--compression", type=click.Choice(_COMPRESSIONS), help="ros1: bz2, lz4; ros2, mcap: zstd.  [default: none]"
+)
+@click.option("-o", "--option", "options", metavar="KEY=VALUE", multiple=True, help="Set an option of the reader.")
+@click.option("--calibration", type=_FILE, multiple=True, help="Calibration file; repeat where it is in several.")
+@click.option("--reader", metavar="NAME", help="Data-set reader, where several accept SRC.")
+def command(
+    source: Path,
+    destination: Path,
+    format: str | None,
+    compression: str | None,
+    options: tuple[str, ...],
+    calibration: tuple[Path, ...],
+    reader: str | None,
+) -> None:
+    """Write the recording SRC, whatever a reader opens, to DST in another format.
+
+    \b
+    DST tells the format:  NAME.bag    ROS 1 bag
+                           NAME.ros2   ROS 2 bag (a folder; so is rosbag2...)
+                           NAME.mcap   MCAP file
+                           NAME        ASL folder, as EuRoC's
+
+    One camera and one IMU are written, as cam0 and imu0; their calibration goes to the folder DST.calib, or into the ASL
+    folder. Ground truth is not converted: name its file with `vioframe run --ground-truth`.
+    """
+    format = format or format_of(destination)
+    chosen = _parse(options) | ({"calibration": list(calibration)} if calibration else {})
+    dataset = registry.load().open_dataset(source, reader, chosen)
+    with _progress() as progress:
+        measurements = _watched(dataset, progress)
+        done = convert(measurements, dataset.calibration, destination, format=format, compression=compression)
+    click.echo(f"{destination}: {FORMATS[format].description}, {done.frames} frames, {done.imu_samples} IMU samples")
+    if done.unreadable:
+        click.echo(f"left out: {done.unreadable} frames or samples of {source} that could not be read")
+
+
+def _parse(options: tuple[str, ...]) -> dict[str, Any]:
+    pairs = [option.partition("=") for option in options]
+    for option, (_, equals, _) in zip(options, pairs, strict=True):
+        if not equals:
+            raise ConfigError(f"-o takes key=value, got {option!r}")
+    return {key: value for key, _, value in pairs}
+
+
+def _progress() -> Progress:
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    return Progress(*columns, console=Console(stderr=True))
+
+
+def _watched(dataset: Dataset, progress: Progress) -> Iterator[Measurement]:
+    """The measurements themselves, the progress bar moving with each frame."""
+    task = progress.add_task(dataset.name, total=dataset.frame_count)
+    for measurement in dataset.measurements():
+        yield measurement
+        if isinstance(measurement, Frame):
+            progress.advance(task)

@@ -1,0 +1,61 @@
+"""Images of any kind a recording may hold -> the (H, W) uint8 that a :class:`~vioframe.types.Frame` carries."""
+
+from __future__ import annotations
+
+from typing import Any, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vioframe.errors import DatasetError
+from vioframe.geometry.cameras import Camera
+from vioframe.types import Image
+
+
+def decode_image(data: bytes | NDArray[np.uint8]) -> NDArray[Any] | None:
+    """A PNG, JPEG or other image file as it is, channels in OpenCV's order; None where it is damaged."""
+    import cv2
+
+    buffer = np.frombuffer(data, np.uint8)
+    return cv2.imdecode(buffer, cv2.IMREAD_UNCHANGED) if buffer.size else None
+
+
+def to_gray8(image: NDArray[Any], bit_depth: int | None, where: str) -> Image:
+    """(H, W) or (H, W, 3 or 4) BGR, uint8 or uint16 -> (H, W) uint8, read-only; gray uint8 is not copied.
+
+    ``bit_depth`` is how many low bits of a 16-bit image carry the signal (12 for values up to 4095). Nothing in the
+    file says so, and a wrong guess turns images black: without it a 16-bit image is a
+    :class:`~vioframe.errors.DatasetError` that begins with ``where``.
+    """
+    import cv2
+
+    if image.dtype == np.uint16:
+        if bit_depth is None:
+            raise DatasetError(
+                f"{where} has 16-bit images; set the reader's option bit_depth to the bits in use (8-16)"
+            )
+        image = np.minimum(image >> (bit_depth - 8), 255).astype(np.uint8)
+    if image.dtype != np.uint8:
+        raise DatasetError(f"{where} has images of {image.dtype}; convert them to 8 or 16 bits")
+    if image.ndim == 3:
+        code = cv2.COLOR_BGRA2GRAY if image.shape[2] == 4 else cv2.COLOR_BGR2GRAY
+        image = cv2.cvtColor(image, code)
+    image.flags.writeable = False
+    return cast(Image, image)
+
+
+def check_bit_depth(bit_depth: int | None) -> None:
+    """Raise :class:`~vioframe.errors.DatasetError` unless the option is None or 8 to 16."""
+    if bit_depth is not None and not 8 <= bit_depth <= 16:
+        raise DatasetError(f"bit_depth must lie between 8 and 16, not {bit_depth}")
+
+
+def check_size(image: Image, camera: Camera, where: str) -> None:
+    """Raise :class:`~vioframe.errors.DatasetError` where ``image`` is not of the size ``camera`` was calibrated for."""
+    height, width = image.shape
+    if (width, height) != camera.resolution:
+        calibrated = "x".join(map(str, camera.resolution))
+        raise DatasetError(
+            f"{where} has images of {width}x{height}, but the calibration is for {calibrated}; "
+            "name the right one with the reader's option calibration"
+        )
