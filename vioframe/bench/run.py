@@ -33,7 +33,10 @@ class BackendRun:
 
     @property
     def trajectory(self) -> Trajectory:
-        """Their poses, with covariance where the back-end knows it at every one; raises :class:`TrajectoryError` where there are none."""
+        """Their poses, with covariance where the back-end knows it at every one.
+
+        Raises :class:`TrajectoryError` where there are none.
+        """
         states = self.states
         if not states:
             raise TrajectoryError("the back-end never got past initialisation; its events say why")

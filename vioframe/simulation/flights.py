@@ -121,7 +121,8 @@ def _stop_and_go(shape: Callable[[Float], Float]) -> Callable[[Float], Float]:
     """Rest for 4 s, fly along ``shape`` for 8 s, rest where that ended, and so on."""
 
     def paused(t_s: Float) -> Float:
-        cycle, phase = np.divmod(t_s, 12.0)
+        # Control points before time zero shape the beginning, which is at rest.
+        cycle, phase = np.divmod(np.maximum(t_s, 0.0), 12.0)
         return shape(8.0 * cycle + np.clip(phase - 4.0, 0.0, 8.0)) - shape(np.zeros(1))
 
     return paused
