@@ -6,6 +6,7 @@ second description. :func:`complete` fills in every default: the configuration k
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Iterable, Mapping
 from io import StringIO
 from pathlib import Path
@@ -204,7 +205,7 @@ def _options(title: str, values: Mapping[str, Any], options: list[Option], depth
 
 def _entry(name: str, value: Any, comment: str, depth: int) -> list[str]:
     indent = "  " * depth
-    comment_lines = [f"{indent}# {comment}"] if comment else []
+    comment_lines = textwrap.wrap(comment, 110, initial_indent=f"{indent}# ", subsequent_indent=f"{indent}# ")
     return [*comment_lines, f"{indent}{name}: {_scalar(value)}"]
 
 

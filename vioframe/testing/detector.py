@@ -96,7 +96,9 @@ def _textured(block: tuple[int, int, int, int]) -> Image:
     for _ in range(40):
         w, h = rng.integers(8, 28, 2)
         left, top = x + rng.integers(0, width - w), y + rng.integers(0, height - h)
-        image[top : top + h, left : left + w] = rng.choice([0, 30, 60, 190, 220, 250])
+        image[top : top + h, left : left + w] = rng.choice([10, 30, 60, 190, 220, 240])
+    # Neighbours of exactly the same score would suppress one another.
+    image[y : y + height, x : x + width] += rng.integers(0, 12, (height, width), dtype=np.uint8)
     return image
 
 
