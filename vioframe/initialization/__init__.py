@@ -1,0 +1,7 @@
+"""How an estimator begins: at rest, or in motion by visual-inertial alignment. Shared by all back-ends."""
+
+from vioframe.initialization.estimate import InitialEstimate
+from vioframe.initialization.initializer import Initializer
+from vioframe.initialization.options import InitializationOptions
+
+__all__ = ["InitialEstimate", "InitializationOptions", "Initializer"]

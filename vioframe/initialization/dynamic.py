@@ -1,0 +1,194 @@
+"""Initialisation in motion: from tracks and readings alone to states, gravity, scale and biases.
+
+    choose keyframes -> gyro bias -> closed-form alignment -> bundle adjustment -> look ahead -> add the newest -> judge
+
+Every step may refuse; nothing is believed that the data do not determine well.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from vioframe.inertial.imu_factors import ImuFactors, StateArrays
+from vioframe.inertial.preintegration import Preintegrated, preintegrate
+from vioframe.initialization import bundle_adjustment
+from vioframe.initialization import landmarks as lm
+from vioframe.initialization.alignment import Alignment, align
+from vioframe.initialization.attitude import level_rotation
+from vioframe.initialization.bundle_adjustment import Problem, Solution
+from vioframe.initialization.estimate import InitialEstimate, Refused
+from vioframe.initialization.gyro_bias import estimate_gyro_bias
+from vioframe.initialization.judgement import check_fit, check_lookahead, check_parallax, check_uncertainty
+from vioframe.initialization.landmarks import Observations
+from vioframe.initialization.options import InitializationOptions
+from vioframe.initialization.window import Bool, Packet, Window, build_window, spread_indices
+from vioframe.types import DP, DV, Calibration, Float, NavState
+
+_MIN_VIEWS = 4
+# Tracks farther off than this are not noise: standard deviations, typical over all views.
+_EPIPOLAR_LIMIT, _ALIGNMENT_LIMIT, _ADJUSTED_LIMIT = 3.0, 8.0, 3.0
+_FARTHEST_M = 200.0
+
+
+def initialise(packets: Sequence[Packet], calibration: Calibration, options: InitializationOptions) -> InitialEstimate:
+    """Estimate from consecutive ``packets``, the newest last; raises :class:`Refused`."""
+    t_ns = np.array([tracks.t_ns for _, tracks in packets])
+    held_out = int((t_ns > t_ns[-1] - options.lookahead_s * 1e9).sum())
+    chosen = spread_indices(t_ns[:-held_out], options.keyframes)
+    sigma = options.pixel_sigma / calibration.camera.focal_px
+
+    window = build_window(packets, [*chosen, len(packets) - 1], _MIN_VIEWS, options.max_landmarks)
+    _require(window, "tracks are long enough", options)
+    window, bias_gyro = _with_gyro_bias(window, calibration, sigma, options)
+    imu = _preintegrate(window, bias_gyro, np.zeros(3), calibration)
+    check_parallax(window, imu, calibration, options)
+
+    window, start = _aligned(window, imu, calibration, sigma, options)
+    states, landmarks = _start_of_adjustment(window.without_last(), start, bias_gyro)
+    problem = _problem(window.without_last(), states, calibration, sigma, options)
+    solution = bundle_adjustment.solve(problem, states, landmarks)
+    keep = _explained(problem, solution)
+    window = window.only(keep)
+    _require(window, "tracks fit the bundle adjustment", options)
+    problem = _problem(window.without_last(), solution.states, calibration, sigma, options)
+    solution = bundle_adjustment.solve(problem, solution.states, solution.landmarks[keep])
+    check_fit(problem, solution, options)
+
+    predicted = _predict(packets[-held_out:], solution.states.unstack(window.t_ns[:-1])[-1], calibration)
+    p_WF = lm.positions(solution.states, solution.landmarks, problem.observations, calibration)
+    check_lookahead(predicted, [tracks for _, tracks in packets[-held_out:]], window.ids, p_WF, calibration, options)
+
+    states = StateArrays.stack([*solution.states.unstack(window.t_ns[:-1]), predicted[-1]])
+    problem = _problem(window, states, calibration, sigma, options)
+    solution = bundle_adjustment.solve(problem, states, solution.landmarks)
+    check_fit(problem, solution, options)
+    cov = bundle_adjustment.covariance(problem, solution)
+    check_uncertainty(solution, cov, options)
+    p_WF = lm.positions(solution.states, solution.landmarks, problem.observations, calibration)
+    return _estimate(window, solution, cov, p_WF)
+
+
+def _require(window: Window, what: str, options: InitializationOptions) -> None:
+    if len(window.ids) < options.min_landmarks:
+        raise Refused(f"{len(window.ids)} {what}, {options.min_landmarks} are needed")
+
+
+def _preintegrate(
+    window: Window, bias_gyro_B: Float, bias_accel_B: Float, calibration: Calibration
+) -> list[Preintegrated]:
+    return [preintegrate(segment, bias_gyro_B, bias_accel_B, calibration.imu) for segment in window.segments]
+
+
+def _with_gyro_bias(
+    window: Window, calibration: Calibration, sigma: float, options: InitializationOptions
+) -> tuple[Window, Float]:
+    """The tracks that lie on their epipolar lines, and the gyroscope's bias (3,) that puts them there."""
+    imu = _preintegrate(window, np.zeros(3), np.zeros(3), calibration)
+    bias, distance = estimate_gyro_bias(window, imu, calibration.R_BC, sigma, options.bias_gyro_sigma)
+    if np.linalg.norm(bias) > 3.0 * options.bias_gyro_sigma:
+        raise Refused(f"gyroscope bias of {np.linalg.norm(bias):.2f} rad/s is not plausible")
+    window = window.only(distance < _EPIPOLAR_LIMIT)
+    _require(window, "tracks lie on their epipolar lines", options)
+    return window, bias
+
+
+def _aligned(
+    window: Window, imu: Sequence[Preintegrated], calibration: Calibration, sigma: float, options: InitializationOptions
+) -> tuple[Window, Alignment]:
+    """The closed form without the newest keyframe, and the tracks that fit it; solved again without the others."""
+    for _ in range(2):
+        inner = window.without_last()
+        alignment = align(inner, imu[:-1], calibration, sigma, options.bias_accel_sigma)
+        keep = _fit_alignment(inner, alignment, calibration, sigma)
+        window = window.only(keep)
+        _require(window, "tracks fit the closed form", options)
+        if keep.all():
+            break
+    return window, alignment.only(keep)
+
+
+def _fit_alignment(window: Window, alignment: Alignment, calibration: Calibration, sigma: float) -> Bool:
+    """(L,) whether a track's landmark lies in front of all its cameras and near its observations."""
+    R_B0C = alignment.R_B0B @ calibration.R_BC
+    p_B0C = alignment.p_B0B + alignment.R_B0B @ calibration.p_BC
+    p_C = (alignment.p_B0F - p_B0C[:, None]) @ R_B0C
+    in_front = p_C[..., 2] > 0.0
+    error = np.linalg.norm(p_C[..., :2] / np.where(in_front, p_C[..., 2], 1.0)[..., None] - window.xy, axis=-1)
+    typical = np.nanmedian(np.where(window.seen, error, np.nan), axis=0)
+    return (in_front | ~window.seen).all(axis=0) & (typical < _ALIGNMENT_LIMIT * sigma)
+
+
+def _start_of_adjustment(window: Window, alignment: Alignment, bias_gyro_B: Float) -> tuple[StateArrays, Float]:
+    """States in a world with z up, and landmarks (L, 3) [x y rho] in the first frame that sees them."""
+    R_WB0 = level_rotation(-alignment.g_B0)
+    count = len(window.t_ns)
+    states = StateArrays(
+        R_WB0 @ alignment.R_B0B,
+        alignment.p_B0B @ R_WB0.T,
+        alignment.v_B0B @ R_WB0.T,
+        np.tile(bias_gyro_B, (count, 1)),
+        np.tile(alignment.bias_accel_B, (count, 1)),
+    )
+    track = np.arange(len(window.ids))
+    host = window.seen.argmax(axis=0)
+    inverse_depth = 1.0 / np.clip(alignment.depth[host, track], 0.1, _FARTHEST_M)
+    return states, np.column_stack([window.xy[host, track], inverse_depth])
+
+
+def _problem(
+    window: Window, states: StateArrays, calibration: Calibration, sigma: float, options: InitializationOptions
+) -> Problem:
+    """The adjustment of ``window``, its readings integrated at the biases of ``states``."""
+    imu = [
+        preintegrate(segment, bias_gyro, bias_accel, calibration.imu)
+        for segment, bias_gyro, bias_accel in zip(
+            window.segments, states.bias_gyro_B[:-1], states.bias_accel_B[:-1], strict=True
+        )
+    ]
+    return Problem(
+        Observations.of(window),
+        ImuFactors.stack(imu),
+        calibration,
+        sigma,
+        options.bias_gyro_sigma,
+        options.bias_accel_sigma,
+    )
+
+
+def _explained(problem: Problem, solution: Solution) -> Bool:
+    """(L,) whether a track's landmark lies in front of its cameras, at a finite depth, and near its observations."""
+    obs = problem.observations
+    r, depth_ratio = lm.project(solution.states, solution.landmarks, obs, problem.calibration)
+    views = np.diff(np.append(obs.start, len(obs.frame)))
+    rms = np.sqrt(np.add.reduceat((r**2).sum(axis=1), obs.start) / (2 * views)) / problem.sigma
+    in_front = np.minimum.reduceat(depth_ratio, obs.start) > 0.0
+    return (rms < _ADJUSTED_LIMIT) & in_front & (solution.landmarks[:, 2] > 1.0 / _FARTHEST_M)
+
+
+def _predict(packets: Sequence[Packet], last: NavState, calibration: Calibration) -> list[NavState]:
+    """The state at each of ``packets``, of which the first follows ``last``, from readings alone."""
+    out = []
+    for imu, _ in packets:
+        last = preintegrate(imu, last.bias_gyro_B, last.bias_accel_B, calibration.imu).predict(last)
+        out.append(last)
+    return out
+
+
+def _estimate(window: Window, solution: Solution, cov: Float, p_WF: Float) -> InitialEstimate:
+    """Yaw and position zero at the first state, exactly; the error state is the body's, so the covariance only turns."""
+    R_0, p_0 = solution.states.R_WB[0], solution.states.p_WB[0]
+    R_new = level_rotation(R_0[2]) @ R_0.T  # R_0[2] is the vertical in the body
+    turn = np.eye(15)
+    turn[DP, DP] = turn[DV, DV] = R_new
+    states = StateArrays(
+        R_new @ solution.states.R_WB,
+        (solution.states.p_WB - p_0) @ R_new.T,
+        solution.states.v_WB @ R_new.T,
+        solution.states.bias_gyro_B,
+        solution.states.bias_accel_B,
+    ).unstack(window.t_ns)
+    states[-1] = replace(states[-1], cov=turn @ cov[-15:, -15:] @ turn.T)
+    return InitialEstimate("dynamic", tuple(states), window.ids, (p_WF - p_0) @ R_new.T)

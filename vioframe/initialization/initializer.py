@@ -1,0 +1,102 @@
+"""Finds where an estimator may begin, one frame at a time."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import replace
+
+import numpy as np
+
+from vioframe.initialization import dynamic, static
+from vioframe.initialization.estimate import InitialEstimate, Refused
+from vioframe.initialization.options import InitializationOptions
+from vioframe.initialization.window import Packet
+from vioframe.types import Calibration, FrameTracks, ImuNoise, ImuSegment
+
+_log = logging.getLogger("vioframe.initialization")
+
+
+class Initializer:
+    """Tries the static method at every frame, and the dynamic one every so often, until one is sure of itself.
+
+    ``refusal`` says in one line why the last attempt came to nothing ("" before the first and after a success); every
+    attempt is also logged to ``vioframe.initialization``.
+    """
+
+    def __init__(self, calibration: Calibration, options: InitializationOptions = InitializationOptions()) -> None:  # noqa: B008
+        self._calibration = calibration
+        self._in_flight = replace(calibration, imu=_inflated(calibration.imu, options.imu_noise_factor))
+        self._options = options
+        self.refusal = ""
+        self._packets: list[Packet] = []
+        self._last_attempt_ns: int | None = None
+
+    def reset(self) -> None:
+        """Forget everything seen."""
+        self._packets.clear()
+        self._last_attempt_ns = None
+        self.refusal = ""
+
+    def add(self, imu: ImuSegment, tracks: FrameTracks) -> InitialEstimate | None:
+        """Take one frame; an estimate whose newest state is at this frame, or None as long as none can be trusted."""
+        if imu.largest_gap_s > self._options.largest_imu_gap_s:
+            self.reset()
+            _log.info("no readings for %.2f s: begun anew", imu.largest_gap_s)
+        self._packets.append((imu, _finite(tracks)))
+        reasons = []
+        for method, attempt in (("static", self._static), ("dynamic", self._dynamic)):
+            try:
+                estimate = attempt()
+            except Refused as refused:
+                reasons.append(f"{method}: {refused}")
+                _log.debug("%d %s refused: %s", tracks.t_ns, method, refused)
+                continue
+            if estimate is not None:
+                _log.info("%d %s initialisation accepted", tracks.t_ns, method)
+                self.refusal = ""
+                return estimate
+        if reasons:
+            self.refusal = "; ".join(reasons)
+        return None
+
+    def _static(self) -> InitialEstimate | None:
+        packets = self._last(self._options.static_window_s)
+        if _duration_s(packets) < 0.95 * self._options.static_window_s:
+            return None
+        return static.initialise(packets, self._calibration, self._options)
+
+    def _dynamic(self) -> InitialEstimate | None:
+        self._packets = self._last(self._options.longest_window_s)
+        newest_ns = self._packets[-1][1].t_ns
+        due = (
+            self._last_attempt_ns is None or newest_ns - self._last_attempt_ns >= self._options.attempt_interval_s * 1e9
+        )
+        if not due or _duration_s(self._packets) < self._options.shortest_window_s:
+            return None
+        self._last_attempt_ns = newest_ns
+        return dynamic.initialise(self._packets, self._in_flight, self._options)
+
+    def _last(self, seconds: float) -> list[Packet]:
+        """The frames of the last ``seconds``."""
+        oldest_ns = self._packets[-1][1].t_ns - seconds * 1e9
+        return [packet for packet in self._packets if packet[1].t_ns >= oldest_ns]
+
+
+def _duration_s(packets: list[Packet]) -> float:
+    return (packets[-1][1].t_ns - packets[0][1].t_ns) * 1e-9
+
+
+def _inflated(noise: ImuNoise, factor: float) -> ImuNoise:
+    return ImuNoise(
+        noise.gyro_density * factor,
+        noise.accel_density * factor,
+        noise.gyro_walk * factor,
+        noise.accel_walk * factor,
+        noise.rate_hz,
+    )
+
+
+def _finite(tracks: FrameTracks) -> FrameTracks:
+    """Without the points that could not be undistorted."""
+    good = np.isfinite(tracks.xy_normalised).all(axis=1)
+    return FrameTracks(tracks.t_ns, tracks.ids[good], tracks.xy[good], tracks.xy_normalised[good])
