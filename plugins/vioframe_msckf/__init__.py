@@ -1,21 +1,21 @@
 """The MSCKF back-end: an error-state filter over a window of cloned poses (Mourikis and Roumeliotis, ICRA 2007)."""
 
 from collections.abc import Mapping
-from typing import Any
 
 from vioframe.hookspecs import hookimpl
 from vioframe.interfaces import Backend, BackendFactory
+from vioframe.options import plugin_factory
 from vioframe.types import Calibration
 from vioframe_msckf.options import MsckfOptions
 
 
-def msckf(calibration: Calibration, **options: Any) -> Backend:
+def msckf(calibration: Calibration, options: MsckfOptions) -> Backend:
     """Multi-state constraint Kalman filter with first-estimate Jacobians and in-state landmarks."""
     from vioframe_msckf.backend import Msckf
 
-    return Msckf(calibration, MsckfOptions(**options))
+    return Msckf(calibration, options)
 
 
 @hookimpl
 def vioframe_backends() -> Mapping[str, BackendFactory]:
-    return {"msckf": msckf}
+    return {"msckf": plugin_factory(msckf, MsckfOptions)}

@@ -14,16 +14,15 @@ from vioframe.types import NS_PER_S, Step
 class RunProgress:
     """Fed with each :class:`Step`; a context manager. ``frames`` is their expected number, None where unknown."""
 
-    def __init__(self, name: str, frames: int | None) -> None:
+    def __init__(self, frames: int | None) -> None:
         self._progress = Progress(
-            TextColumn("{task.description}"),
-            BarColumn(),
+            BarColumn(bar_width=12),
             MofNCompleteColumn(),
             TextColumn("{task.fields[figures]}"),
-            TimeRemainingColumn(),
+            TimeRemainingColumn(compact=True),
             console=Console(stderr=True),
         )
-        self._task = self._progress.add_task(name, total=frames, figures="")
+        self._task = self._progress.add_task("", total=frames, figures="")
         self._first_t_ns: int | None = None
 
     def __enter__(self) -> Self:
@@ -42,7 +41,7 @@ class RunProgress:
         wall_s = max(task.elapsed or 0.0, 1e-3)
         data_s = (step.frame.t_ns - self._first_t_ns) / NS_PER_S
         figures = (
-            f"{(task.completed + 1) / wall_s:5.1f} frames/s  {data_s / wall_s:5.2f} x real time  "
-            f"{len(step.tracks.ids):4d} points  {step.estimate.status}"
+            f"{(task.completed + 1) / wall_s:.1f} frames/s, {data_s / wall_s:.2f}x real time, "
+            f"{len(step.tracks.ids)} points, {step.estimate.status}"
         )
         self._progress.update(self._task, advance=1, figures=figures)

@@ -93,7 +93,7 @@ def _watch(experiment: Experiment, quiet: bool) -> AbstractContextManager[Callab
         return nullcontext(lambda step: None)
     config = experiment.config
     whole = config.start_s == 0.0 and config.duration_s is None
-    return RunProgress(experiment.name, experiment.dataset.frame_count if whole else None)
+    return RunProgress(experiment.dataset.frame_count if whole else None)
 
 
 def _report(folder: Path, summary: dict[str, Any]) -> None:
