@@ -155,7 +155,7 @@ def _damaged(path: Path, err: Exception) -> DatasetError:
     command = {".bag": "rosbag reindex", ".mcap": "mcap recover"}.get(path.suffix, "ros2 bag reindex")
     reason = " ".join(str(err).split()).rstrip(".") or type(err).__name__
     return DatasetError(
-        f"cannot read {path}: {reason}; if it is truncated or was not closed, repair it with `{command}` or copy it anew"
+        f"cannot read {path}: {reason}; if it is truncated or was not closed, run `{command}` on it or copy it again"
     )
 
 

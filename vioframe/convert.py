@@ -1,7 +1,7 @@
 """One recording format into another: ASL folder, ROS 1 bag, ROS 2 bag, MCAP; stamps, pixels and readings stay exact.
 
 A converted recording holds one camera and one IMU under EuRoC's names (``cam0``, ``imu0``; ``/cam0/image_raw``,
-``/imu0``) and its calibration: as ``sensor.yaml`` in an ASL folder, in the folder ``<recording>.calib`` beside any other.
+``/imu0``) and its calibration: as ``sensor.yaml`` in an ASL folder, beside any other in the folder ``<name>.calib``.
 """
 
 from __future__ import annotations
@@ -68,8 +68,8 @@ def convert(
 ) -> Conversion:
     """Write a data set's measurements and calibration to ``destination``, which appears only once it is complete.
 
-    ``format`` is a key of :data:`FORMATS`, by default told by the name (:func:`format_of`); ``compression`` one that the
-    format offers. Raises :class:`~vioframe.errors.DatasetError`, also where the destination exists.
+    ``format`` is a key of :data:`FORMATS`, by default told by the name (:func:`format_of`); ``compression`` is one that
+    the format offers. Raises :class:`~vioframe.errors.DatasetError`, also where the destination exists.
     """
     format = format or format_of(destination)
     if format not in FORMATS:

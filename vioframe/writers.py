@@ -130,9 +130,7 @@ class _RosWriter:
 
     def _header(self, t_ns: int, frame_id: str) -> Any:
         if not 0 <= t_ns < _ROS_STAMP_LIMIT_NS:
-            raise DatasetError(
-                f"the stamp {t_ns} ns does not fit a ROS message; remove it from the source, or write ASL"
-            )
+            raise DatasetError(f"the stamp {t_ns} ns does not fit a ROS message; write an ASL folder instead")
         stamp = self._types["builtin_interfaces/msg/Time"](sec=t_ns // NS_PER_S, nanosec=t_ns % NS_PER_S)
         return self._types["std_msgs/msg/Header"](stamp=stamp, frame_id=frame_id, **self._header_extra)
 

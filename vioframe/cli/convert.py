@@ -25,7 +25,7 @@ _COMPRESSIONS = sorted({name for format in FORMATS.values() for name in format.c
 @click.argument("destination", metavar="DST", type=_FILE)
 @click.option("--format", type=click.Choice(list(FORMATS)), help="Format of DST.  [default: told by its name]")
 @click.option(
-    "--compression", type=click.Choice(_COMPRESSIONS), help="ros1: bz2, lz4; ros2, mcap: zstd.  [default: none]"
+    "--compression", type=click.Choice(_COMPRESSIONS), help="bz2, lz4 (ros1) or zstd (ros2, mcap).  [default: none]"
 )
 @click.option("-o", "--option", "options", metavar="KEY=VALUE", multiple=True, help="Set an option of the reader.")
 @click.option("--calibration", type=_FILE, multiple=True, help="Calibration file; repeat where it is in several.")
@@ -47,8 +47,8 @@ def command(
                            NAME.mcap   MCAP file
                            NAME        ASL folder, as EuRoC's
 
-    One camera and one IMU are written, as cam0 and imu0; their calibration goes to the folder DST.calib, or into the ASL
-    folder. Ground truth is not converted: name its file with `vioframe run --ground-truth`.
+    One camera and one IMU are written, as cam0 and imu0; their calibration goes to the folder DST.calib, or into the
+    ASL folder. Ground truth is not converted: name its file with `vioframe run --ground-truth`.
     """
     format = format or format_of(destination)
     chosen = _parse(options) | ({"calibration": list(calibration)} if calibration else {})

@@ -1,0 +1,315 @@
+"""Calibration files: one camera and IMU written in every format read back as the same calibration."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from vioframe.calibration import load_calibration, packaged_calibration, sidecar_folder, write_calibration
+from vioframe.errors import CalibrationError
+from vioframe.geometry import so3
+from vioframe.geometry.cameras import Camera
+from vioframe.types import Calibration, ImuNoise
+
+CAMERA = Camera(458.5, 457.25, 367.0, 248.5, (-0.28, 0.07, 0.0002, 1.76e-05), (752, 480))
+R_BC = so3.exp([0.1, -0.2, 1.5])
+P_BC = np.array([-0.0216, -0.0647, 0.0098])
+T_BC = np.block([[R_BC, P_BC[:, None]], [np.zeros((1, 3)), np.ones((1, 1))]])
+NOISE = ImuNoise(1.7e-4, 2e-3, 1.9e-5, 3e-3, 200.0)
+OFFSET_NS = 5_250_000
+
+HEADERS = pytest.mark.parametrize(
+    "header", ["", "%YAML:1.0\n", "%YAML:1.0\n---\n"], ids=["plain", "opencv", "opencv---"]
+)
+
+
+def rows(matrix: np.ndarray) -> str:
+    return "".join(f"\n    - {row.tolist()}" for row in matrix)
+
+
+def opencv_matrix(matrix: np.ndarray) -> str:
+    height, width = matrix.shape
+    return f"!!opencv-matrix\n   rows: {height}\n   cols: {width}\n   dt: d\n   data: {matrix.ravel().tolist()}"
+
+
+def kalibr_camera(transform: str, camera: Camera = CAMERA, model: str = "radtan") -> str:
+    return f"""
+  {transform}
+  camera_model: pinhole
+  distortion_coeffs: {list(camera.distortion)}
+  distortion_model: {model}
+  intrinsics: {[camera.fx, camera.fy, camera.cx, camera.cy]}
+  resolution: {list(camera.resolution)}
+  rostopic: /left/image
+  timeshift_cam_imu: 0.00525
+"""
+
+
+KALIBR_IMU = """
+accelerometer_noise_density: 2e-3
+accelerometer_random_walk: 3.0e-3
+gyroscope_noise_density: 1.7e-04
+gyroscope_random_walk: 1.9e-5
+rostopic: /imu0
+update_rate: 200.0
+"""
+
+VINS_MONO = f"""
+imu_topic: "/imu0"
+image_topic: "/left/image"
+model_type: PINHOLE
+camera_name: camera
+image_width: 752
+image_height: 480
+distortion_parameters:
+   k1: -0.28
+   k2: 0.07
+   p1: 0.0002
+   p2: 1.76e-05
+projection_parameters:
+   fx: 458.5
+   fy: 457.25
+   cx: 367.
+   cy: 248.5
+estimate_extrinsic: 0
+extrinsicRotation: {opencv_matrix(R_BC)}
+extrinsicTranslation: {opencv_matrix(P_BC[:, None])}
+acc_n: 0.08
+gyr_n: 0.004
+acc_w: 4.0e-05
+gyr_w: 2.0e-6
+td: 0.00525
+"""
+
+
+def assert_equal(calibration: Calibration, camera: Camera = CAMERA, noise: ImuNoise = NOISE) -> None:
+    assert calibration.camera == camera
+    np.testing.assert_allclose(calibration.R_BC, R_BC, rtol=0.0, atol=1e-14)
+    np.testing.assert_allclose(calibration.p_BC, P_BC, rtol=0.0, atol=1e-14)
+    assert calibration.imu == noise
+    assert calibration.time_offset_ns == OFFSET_NS
+
+
+@HEADERS
+def test_kalibr(tmp_path: Path, header: str) -> None:
+    camchain, imu = tmp_path / "camchain-imucam.yaml", tmp_path / "imu.yaml"
+    camchain.write_text(header + "cam0:" + kalibr_camera(f"T_cam_imu: {rows(np.linalg.inv(T_BC))}"))
+    imu.write_text(header + KALIBR_IMU)
+    assert_equal(load_calibration(camchain, imu))
+    assert_equal(load_calibration(imu, camchain))
+    assert_equal(load_calibration(tmp_path))
+    # Kalibr's own result nests the IMU.
+    imu.write_text(header + "imu0:" + KALIBR_IMU.replace("\n", "\n  "))
+    assert_equal(load_calibration(camchain, imu))
+
+
+@HEADERS
+def test_openvins(tmp_path: Path, header: str) -> None:
+    (tmp_path / "kalibr_imucam_chain.yaml").write_text(header + "cam0:" + kalibr_camera(f"T_imu_cam: {rows(T_BC)}"))
+    (tmp_path / "kalibr_imu_chain.yaml").write_text(header + "imu0:" + KALIBR_IMU.replace("\n", "\n  "))
+    estimator = tmp_path / "estimator_config.yaml"
+    estimator.write_text(
+        header
+        + 'verbosity: "INFO" # ALL, DEBUG\nuse_fej: true\n'
+        + 'relative_config_imu: "kalibr_imu_chain.yaml"\nrelative_config_imucam: "kalibr_imucam_chain.yaml"\n'
+    )
+    assert_equal(load_calibration(estimator))
+    assert_equal(load_calibration(tmp_path))
+    assert_equal(load_calibration(str(tmp_path / "kalibr_imucam_chain.yaml"), str(tmp_path / "kalibr_imu_chain.yaml")))
+
+
+def test_openvins_imu_intrinsics_that_are_not_applied_are_announced(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    (tmp_path / "imucam.yaml").write_text("cam0:" + kalibr_camera(f"T_imu_cam: {rows(T_BC)}"))
+    imu = (
+        KALIBR_IMU + "Ta:\n- [1.0, 0.0, 0.0]\n- [0.0, 1.0, 0.0]\n- [0.0, 0.0, 1.0]\nTw:\n" + "- [1.01, 0.0, 0.0]\n" * 3
+    )
+    (tmp_path / "imu.yaml").write_text("imu0:" + imu.replace("\n", "\n  "))
+    load_calibration(tmp_path)
+    assert [record.args[1] for record in caplog.records] == ["Tw"]
+
+
+@HEADERS
+def test_vins_mono(tmp_path: Path, header: str) -> None:
+    file = tmp_path / "euroc_config.yaml"
+    file.write_text(header + VINS_MONO)
+    scale = 200.0**-0.5  # per-sample noise -> density
+    noise = ImuNoise(0.004 * scale, 0.08 * scale, 2e-6 * scale, 4e-5 * scale, 200.0)
+    assert_equal(load_calibration(file), noise=noise)
+    assert_equal(load_calibration(file, camera="cam0"), noise=noise)
+
+
+def test_vins_mono_kannala_brandt(tmp_path: Path) -> None:
+    file = tmp_path / "fisheye.yaml"
+    before, _, after = VINS_MONO.partition("distortion_parameters:")
+    _, _, after = after.partition("estimate_extrinsic: 0")
+    fisheye = {"k2": -0.28, "k3": 0.07, "k4": 0.0002, "k5": 1.76e-05, "mu": 458.5, "mv": 457.25, "u0": 367, "v0": 248.5}
+    lines = "".join(f"   {key}: {value}\n" for key, value in fisheye.items())
+    file.write_text(before.replace("PINHOLE", "KANNALA_BRANDT") + "projection_parameters:\n" + lines + after)
+    camera = load_calibration(file).camera
+    assert camera == Camera(458.5, 457.25, 367.0, 248.5, CAMERA.distortion, (752, 480), "equidistant")
+
+
+@HEADERS
+def test_euroc(tmp_path: Path, header: str) -> None:
+    write_calibration(Calibration(CAMERA, R_BC, P_BC, NOISE, OFFSET_NS), tmp_path / "mav0")
+    for file in tmp_path.rglob("sensor.yaml"):
+        file.write_text(header + file.read_text())
+    cam, imu = tmp_path / "mav0" / "cam0", tmp_path / "mav0" / "imu0"
+    assert_equal(load_calibration(cam / "sensor.yaml", imu / "sensor.yaml"))
+    assert_equal(load_calibration(tmp_path))
+    assert_equal(load_calibration(tmp_path / "mav0", camera="cam0"))
+    # Flat copies are named by their files.
+    (tmp_path / "cam7.yaml").write_text((cam / "sensor.yaml").read_text())
+    assert_equal(load_calibration(tmp_path / "cam7.yaml", imu / "sensor.yaml", camera="cam7"))
+
+
+def test_euroc_imu_away_from_the_body_frame(tmp_path: Path) -> None:
+    """B is the IMU: with the IMU at T_BI in EuRoC's body frame, the camera is at inv(T_BI) T_BC."""
+    write_calibration(Calibration(CAMERA, R_BC, P_BC, NOISE, OFFSET_NS), tmp_path)
+    sensor = tmp_path / "imu0" / "sensor.yaml"
+    identity = ",\n         ".join(str(row)[1:-1] for row in np.eye(4).tolist())
+    T_BI = np.eye(4)
+    T_BI[:3, :3], T_BI[:3, 3] = so3.exp([0.3, 0.2, -0.1]), [0.1, 0.2, 0.3]
+    assert identity in sensor.read_text()
+    sensor.write_text(sensor.read_text().replace(identity, str(T_BI.ravel().tolist())[1:-1]))
+    calibration = load_calibration(tmp_path)
+    expected = np.linalg.inv(T_BI) @ T_BC
+    np.testing.assert_allclose(calibration.R_BC, expected[:3, :3], rtol=0.0, atol=1e-14)
+    np.testing.assert_allclose(calibration.p_BC, expected[:3, 3], rtol=0.0, atol=1e-14)
+
+
+@pytest.mark.parametrize("model", ["radtan", "equidistant"])
+def test_written_calibrations_read_back_to_the_last_bit(tmp_path: Path, model: str) -> None:
+    camera = Camera(1 / 3, 2 / 3, 1e-17, 1e17, (0.1 + 0.2, -1e-300, 0.0, 1.0), (752, 480), model)
+    calibration = Calibration(camera, np.eye(3), np.array([1 / 3, -1e-20, 7.0]), NOISE, -123_456_789_012)
+    write_calibration(calibration, tmp_path)
+    back = load_calibration(tmp_path)
+    assert back.camera == camera
+    assert back.p_BC.tolist() == calibration.p_BC.tolist()
+    assert (back.imu, back.time_offset_ns) == (calibration.imu, calibration.time_offset_ns)
+
+
+@pytest.mark.parametrize(
+    ("wanted", "cx"), [(None, 367.0), ("cam1", 400.0), ("/right/image", 400.0), ("/cam1/image_raw", 400.0)]
+)
+def test_a_camera_is_chosen_by_name_or_topic(tmp_path: Path, wanted: str | None, cx: float) -> None:
+    transform = f"T_imu_cam: {rows(T_BC)}"
+    right = kalibr_camera(transform).replace("367.0", "400.0").replace("/left", "/right")
+    (tmp_path / "chain.yaml").write_text("cam0:" + kalibr_camera(transform) + "cam1:" + right)
+    (tmp_path / "imu.yaml").write_text(KALIBR_IMU)
+    assert load_calibration(tmp_path, camera=wanted).camera.cx == cx
+
+
+def test_an_unknown_camera_is_an_error_unless_there_is_no_choice(tmp_path: Path) -> None:
+    (tmp_path / "imu.yaml").write_text(KALIBR_IMU)
+    chain = tmp_path / "chain.yaml"
+    one = kalibr_camera(f"T_imu_cam: {rows(T_BC)}")
+    chain.write_text("cam0:" + one)
+    assert load_calibration(tmp_path, camera="/some/other/topic").camera == CAMERA
+    with pytest.raises(CalibrationError, match=r"no camera 'cam1'; choose one of: cam0"):
+        load_calibration(tmp_path, camera="cam1")
+    chain.write_text("cam0:" + one + "cam1:" + one.replace("left", "right"))
+    with pytest.raises(CalibrationError, match=r"no camera '/some/other/topic'; choose one of: cam0, cam1"):
+        load_calibration(tmp_path, camera="/some/other/topic")
+
+
+def test_distortion_models(tmp_path: Path) -> None:
+    (tmp_path / "imu.yaml").write_text(KALIBR_IMU)
+    chain = tmp_path / "chain.yaml"
+    transform = f"T_imu_cam: {rows(T_BC)}"
+    chain.write_text("cam0:" + kalibr_camera(transform, model="equidistant"))
+    assert load_calibration(tmp_path).camera.model == "equidistant"
+    chain.write_text("cam0:" + kalibr_camera(transform, model="none").replace("-0.28, 0.07, 0.0002, 1.76e-05", ""))
+    assert load_calibration(tmp_path).camera.distortion == (0.0, 0.0, 0.0, 0.0)
+    # A third radial coefficient is harmless only where it is zero.
+    chain.write_text("cam0:" + kalibr_camera(transform).replace("1.76e-05]", "1.76e-05, 0.0]"))
+    assert load_calibration(tmp_path).camera == CAMERA
+    chain.write_text("cam0:" + kalibr_camera(transform).replace("1.76e-05]", "1.76e-05, 0.1]"))
+    with pytest.raises(CalibrationError, match="k3"):
+        load_calibration(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("camera_model: pinhole", "camera_model: omni", "camera model 'omni' is not supported"),
+        ("distortion_model: radtan", "distortion_model: fov", "distortion model 'fov' is not supported"),
+        ("intrinsics: [458.5, ", "intrinsics: [", "'intrinsics' should be 4 finite numbers"),
+        ("intrinsics: [458.5, ", "intrinsics: [.nan, ", "'intrinsics' should be 4 finite numbers"),
+        ("intrinsics: [458.5, ", "intrinsics: [-458.5, ", "fx, fy > 0"),
+        ("resolution: [752, 480]", "resolution: wide", "'resolution' should be 2 numbers, not 'wide'"),
+        ("resolution: [752, 480]", "", "'resolution' is missing"),
+        ("T_imu_cam", "T_cn_cnm1", "use the result of kalibr_calibrate_imu_camera"),
+        ("[0.0, 0.0, 0.0, 1.0]", "[0.0, 0.0, 0.1, 1.0]", "last row of 'T_imu_cam'"),
+        ("    - [", "    - [9.0, ", "'T_imu_cam' should be 16 finite numbers"),
+        ("cam0:", "cam0: [", "not valid YAML"),
+        ("cam0:\n", "camera:\n", "not a calibration of a known format"),
+    ],
+)
+def test_mistakes_are_named_with_their_file_in_one_line(tmp_path: Path, old: str, new: str, message: str) -> None:
+    text = "cam0:" + kalibr_camera(f"T_imu_cam: {rows(T_BC)}")
+    assert old in text
+    chain, imu = tmp_path / "chain.yaml", tmp_path / "imu.yaml"
+    chain.write_text(text.replace(old, new))
+    imu.write_text(KALIBR_IMU)
+    with pytest.raises(CalibrationError) as caught:
+        load_calibration(chain, imu)
+    assert message in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_matrix_that_is_no_rotation_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "imu.yaml").write_text(KALIBR_IMU)
+    for wrong in (np.diag([1.0, 1.0, -1.0, 1.0]), np.diag([1.1, 1.0, 1.0, 1.0])):
+        (tmp_path / "chain.yaml").write_text("cam0:" + kalibr_camera(f"T_imu_cam: {rows(wrong)}"))
+        with pytest.raises(CalibrationError, match="'T_imu_cam' holds no rotation"):
+            load_calibration(tmp_path)
+
+
+def test_what_is_missing_is_said(tmp_path: Path) -> None:
+    chain, imu = tmp_path / "chain.yaml", tmp_path / "imu.yaml"
+    with pytest.raises(CalibrationError, match=r"no calibration file .* in the folder"):
+        load_calibration(tmp_path)
+    with pytest.raises(CalibrationError, match=r"cannot read the calibration .*chain.yaml: No such file"):
+        load_calibration(chain)
+    chain.write_text("cam0:" + kalibr_camera(f"T_imu_cam: {rows(T_BC)}"))
+    with pytest.raises(CalibrationError, match=r"no IMU noise is given .*; name the IMU's YAML file too"):
+        load_calibration(chain)
+    imu.write_text(KALIBR_IMU)
+    with pytest.raises(CalibrationError, match=r"no camera is described .*; name the camera's YAML file too"):
+        load_calibration(imu)
+    imu.write_text(KALIBR_IMU.replace("3.0e-3", "0.0"))
+    with pytest.raises(CalibrationError, match="must all be positive"):
+        load_calibration(chain, imu)
+    imu.write_text(KALIBR_IMU)
+    (tmp_path / "chain2.yaml").write_text(chain.read_text())
+    with pytest.raises(CalibrationError, match="more than once; name the files to use"):
+        load_calibration(tmp_path)
+
+
+def test_sidecar_folder_lies_beside_the_recording(tmp_path: Path) -> None:
+    assert sidecar_folder(tmp_path / "flight.bag") == tmp_path / "flight.bag.calib"
+
+
+@pytest.mark.parametrize("camera", ["cam0", "cam1"])
+@pytest.mark.parametrize("place", ["calib_MH", "calib_V1"])
+def test_the_packaged_calibration_is_that_of_the_data_set(shared_data: Path, place: str, camera: str) -> None:
+    published = load_calibration(shared_data / "euroc_imu_gt" / place, camera=camera)
+    packaged = packaged_calibration("euroc", camera)
+    assert packaged.camera == published.camera
+    assert packaged.imu == published.imu
+    np.testing.assert_array_equal(packaged.R_BC, published.R_BC)
+    np.testing.assert_array_equal(packaged.p_BC, published.p_BC)
+
+
+def test_the_packaged_calibration() -> None:
+    calibration = packaged_calibration("euroc")
+    assert calibration.camera == Camera(
+        458.654, 457.296, 367.215, 248.375, (-0.28340811, 0.07395907, 0.00019359, 1.76187114e-05), (752, 480)
+    )
+    assert calibration.imu == ImuNoise(1.6968e-04, 2.0e-3, 1.9393e-05, 3.0e-3, 200.0)
+    np.testing.assert_allclose(calibration.R_BC[0], [0.0148655429818, -0.999880929698, 0.00414029679422], atol=1e-9)
+    np.testing.assert_array_equal(calibration.p_BC, [-0.0216401454975, -0.064676986768, 0.00981073058949])
+    assert calibration.time_offset_ns == 0
