@@ -39,8 +39,8 @@ class TrajectoryErrors:
 
     ``position_m`` (N, 3) estimate minus truth, ``rotation_rpy_deg`` (N, 3) about the world's axes. ``ate_se3_m`` and
     ``scale``, the factor the estimate would have to be multiplied by, come from alignments of their own and are None
-    where the body did not move enough to tell. NEES is taken in the gauge of the first pose, whatever ``alignment_name``
-    says. ``coverage`` is the part of the ground truth's time between the first and the last associated pose.
+    where the body did not move enough to tell. NEES is taken in the gauge of the first pose in any case. ``coverage`` is
+    the part of the ground truth's time between the first and the last associated pose.
     """
 
     alignment_name: str
@@ -59,11 +59,6 @@ class TrajectoryErrors:
     nees: tuple[Nees, ...]
     coverage: float
     notes: tuple[str, ...]
-
-    @property
-    def time_s(self) -> Float:
-        """(N,) seconds since the first associated pose."""
-        return np.asarray((self.estimate.t_ns - self.estimate.t_ns[0]) * 1e-9)
 
     @property
     def max_position_m(self) -> Float:

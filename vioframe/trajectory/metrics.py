@@ -43,8 +43,8 @@ def position_error_W(aligned: Trajectory, truth: Trajectory) -> Float:
 def rotation_error_rpy_deg(aligned: Trajectory, truth: Trajectory) -> Float:
     """(N, 3) deg, roll, pitch and yaw of E = R_est R_true^T about the world's axes.
 
-    E = R_z(yaw) Exp([roll, pitch, 0]) is unique short of a tilt of 180 deg: yaw is the twist of E about gravity, which a
-    visual-inertial system cannot observe, and roll and pitch are the tilt, which it can.
+    E = R_z(yaw) Exp([roll, pitch, 0]) is unique short of a tilt of 180 deg: yaw is the twist of E about gravity, which
+    a visual-inertial system cannot observe, and roll and pitch are the tilt, which it can.
     """
     E = aligned.R_WB @ truth.R_WB.transpose(0, 2, 1)
     yaw = yaw_of(E)
@@ -83,8 +83,8 @@ class RelativeErrors:
 def relative_errors(estimate: Trajectory, truth: Trajectory, lengths_m: Sequence[float]) -> tuple[RelativeErrors, ...]:
     """Relative errors over each of ``lengths_m`` that fits into the true path; the others are left out.
 
-    With A = T_i^-1 T_j of the truth and B of the estimate, the error is A^-1 B (Zhang and Scaramuzza, IROS 2018); R_j of
-    the truth turns its rotation into the world's axes, to tell yaw from tilt. No rigid alignment changes it.
+    With A = T_i^-1 T_j of the truth and B of the estimate, the error is A^-1 B (Zhang and Scaramuzza, IROS 2018); R_j
+    of the truth turns its rotation into the world's axes, to tell yaw from tilt. No rigid alignment changes it.
     """
     travelled = truth.travelled_m
     found = (_over_length(estimate, truth, travelled, length) for length in lengths_m)

@@ -21,8 +21,8 @@ class Nees:
     """e^T P^-1 e over time for one part of the state; its mean is ``dof`` where the covariance is honest.
 
     ``values`` (N,) at ``t_ns`` (N,). ``band`` is the two-sided 95 % interval of the chi-squared distribution with
-    ``dof`` degrees of freedom, for a single instant; ``inside`` is the fraction of instants within it. Successive errors
-    of one run are correlated, so the mean of one run is no test at a level: that takes a Monte Carlo over runs.
+    ``dof`` degrees of freedom, for a single instant; ``inside`` is the fraction of instants within it. Successive
+    errors of one run are correlated, so the mean of one run is no test at a level: that takes a Monte Carlo over runs.
     """
 
     part: str

@@ -1,0 +1,1 @@
+"""Files in, tables and plots out. Nothing here runs an estimator."""
