@@ -23,26 +23,28 @@ class FrontendOptions:
     """Rows and columns of the grid whose emptiest cells are refilled first."""
     border_px: float = 5.0
     """Points closer than this to the edge of the image are dropped."""
-    equalisation: Equalisation = "none"
+    equalisation: Equalisation = "clahe"
     """Contrast equalisation before tracking and detection: none, clahe (local) or histogram (global)."""
-    klt_window_px: int = 21
+    klt_window_px: int = 15
     """Side of the square patch that is followed; odd."""
-    klt_levels: int = 3
+    klt_levels: int = 4
     """Pyramid levels above the full image."""
     predict_with_gyro: bool = True
     """Start each search where the gyroscope says that the point went."""
-    forward_backward_px: float = 0.5
+    forward_backward_px: float = 1.0
     """A point tracked forth and back must return to within this of where it was."""
-    rejection: Rejection = "essential"
-    """Epipolar outlier rejection: essential, fundamental, magsac, two_point (rotation from the gyroscope) or none."""
-    rejection_px: float = 1.0
+    rejection: Rejection = "magsac"
+    """Epipolar outlier rejection: essential or fundamental matrix by RANSAC, magsac (essential matrix by MAGSAC++),
+    two_point (rotation from the gyroscope) or none."""
+    rejection_px: float = 0.7
     """Largest distance of an inlier from the epipolar geometry, scaled by the focal length."""
     refill_below: float = 0.9
     """The detector is asked for new points once fewer than this share of ``max_points`` is alive."""
-    candidates_per_point: int = 4
+    candidates_per_point: int = 3
     """Candidates asked of the detector, as a multiple of ``max_points``; most fall near live tracks."""
-    subpixel_window_px: int = 5
-    """Half window for moving whole-pixel corners to their sub-pixel place; 0 leaves all as detected."""
+    subpixel_window_px: int = 0
+    """Half window for moving whole-pixel corners to their sub-pixel place; 0 leaves all as detected, which tracks a
+    little better: what is followed is the patch, wherever its corner lies."""
 
     def __post_init__(self) -> None:
         for name, valid, remedy in (

@@ -1,0 +1,424 @@
+"""The front-end on a rendered plane with known motion, on real images, and against detectors that misbehave."""
+
+from collections import Counter
+from itertools import pairwise
+
+import cv2
+import numpy as np
+import pytest
+
+from vioframe.errors import ConfigError, DatasetError, PluginError
+from vioframe.frontend import Frontend, FrontendOptions
+from vioframe.frontend.flow import camera_rotation, predict
+from vioframe.frontend.refill import refine_whole_pixels, spread, thin
+from vioframe.geometry import so3, two_view
+from vioframe.geometry.cameras import Camera
+from vioframe.incidents import Incidents
+from vioframe.synchronise import synchronise
+from vioframe.types import Frame, ImuSegment, Keypoints
+from vioframe_euroc import EurocDataset
+from vioframe_shi_tomasi import ShiTomasi
+
+CAMERA = Camera(300.0, 300.0, 159.5, 119.5, (0.0, 0.0, 0.0, 0.0), (320, 240))
+R_BC = so3.exp([0.3, -1.2, 0.8])
+PERIOD_NS = 50_000_000
+
+
+def texture(shape, seed=0, sigma=2.5):
+    noise = cv2.GaussianBlur(np.random.default_rng(seed).normal(size=shape), (0, 0), sigma)
+    return np.clip(128 + 45 * noise / noise.std(), 0, 255).astype(np.uint8)
+
+
+SKY = texture((1000, 1400))
+SKY_TO_RAY = np.linalg.inv(np.array([[300.0, 0.0, 699.5], [0.0, 300.0, 499.5], [0.0, 0.0, 1.0]]))
+
+
+def view(R_CS):
+    """What a camera turned by ``R_CS`` sees of the infinitely far texture."""
+    return cv2.warpPerspective(SKY, CAMERA.K @ R_CS @ SKY_TO_RAY, CAMERA.resolution)
+
+
+def segment(rate_C, k=1, R_BC=R_BC):
+    """The gyroscope's readings up to frame ``k`` while the camera turns at ``rate_C`` rad/s (its own frame)."""
+    t_ns = k * PERIOD_NS + np.linspace(-PERIOD_NS, 0, 11).astype(np.int64)
+    return ImuSegment(t_ns, np.tile(R_BC @ rate_C, (11, 1)), np.zeros((11, 3)))
+
+
+STILL = np.zeros(3)
+
+
+def play(frontend, images, rate_C=STILL):
+    return [
+        frontend.track(segment(rate_C, k), Frame(k * PERIOD_NS, image), R_BC) for k, image in enumerate(images, start=1)
+    ]
+
+
+def frontend(detector=None, incidents=None, **options):
+    return Frontend(
+        detector or ShiTomasi(), CAMERA, FrontendOptions(**options), Incidents() if incidents is None else incidents
+    )
+
+
+def turning(rate_C, count):
+    step = so3.exp(-rate_C * PERIOD_NS * 1e-9)  # R_C2C1
+    R_CS, images = np.eye(3), []
+    for _ in range(count):
+        images.append(view(R_CS))
+        R_CS = step @ R_CS
+    return images, step
+
+
+def test_tracks_follow_the_known_motion_to_a_tenth_of_a_pixel():
+    rate_C = np.array([0.2, -0.4, 0.3])
+    images, R_C2C1 = turning(rate_C, 8)
+    steps = play(frontend(equalisation="none"), images, rate_C)
+    for before, after in pairwise(steps):
+        _, i, j = np.intersect1d(before.ids, after.ids, return_indices=True)
+        expected = CAMERA.project(two_view.rays(before.xy_normalised[i]) @ R_C2C1.T)
+        error = np.linalg.norm(after.xy[j] - expected, axis=1)
+        assert len(error) > 80
+        assert np.quantile(error, 0.95) < 0.1
+
+
+def test_points_are_undistorted():
+    camera = Camera(300.0, 300.0, 159.5, 119.5, (-0.28, 0.07, 2e-4, 2e-5), (320, 240))
+    tracks = Frontend(ShiTomasi(), camera, FrontendOptions(), Incidents()).track(
+        segment(STILL), Frame(PERIOD_NS, view(np.eye(3))), R_BC
+    )
+    np.testing.assert_allclose(camera.distort(tracks.xy_normalised), tracks.xy, atol=1e-6)
+    assert np.abs(tracks.xy_normalised - (tracks.xy - [159.5, 119.5]) / 300.0).max() > 1e-3
+
+
+def test_camera_rotation_integrates_a_changing_rate():
+    """R_C2C1 for a rate that changes its axis, against the product over 2000 tiny steps."""
+    t = np.linspace(0.0, 0.05, 2001)
+
+    def rate_B(t):
+        return np.stack([3.0 * np.cos(30.0 * t), 2.0 * np.sin(40.0 * t), 1.0 + 0.0 * t], axis=-1)
+
+    R_B1B2 = np.eye(3)
+    for step in so3.exp(rate_B(0.5 * (t[1:] + t[:-1])) * np.diff(t)[:, None]):
+        R_B1B2 = R_B1B2 @ step
+    t_ns = np.linspace(0, PERIOD_NS, 11).astype(np.int64)
+    imu = ImuSegment(t_ns, rate_B(t_ns * 1e-9), np.zeros((11, 3)))
+    difference = so3.log(camera_rotation(imu, R_BC) @ (R_BC.T @ R_B1B2 @ R_BC))
+    assert np.linalg.norm(difference) < 1e-3
+
+
+def test_prediction_leaves_points_that_turn_out_of_view():
+    xy = np.array([[10.0, 120.0], [160.0, 120.0]])
+    guess = predict(CAMERA, xy, CAMERA.undistort(xy), so3.exp([0.0, -0.2, 0.0]))
+    np.testing.assert_array_equal(guess[0], xy[0])
+    assert guess[1, 0] < 110.0
+
+
+@pytest.mark.parametrize("rate_C", [[0.0, 4.0, 0.0], [3.0, 0.0, 3.0]], ids=["yaw", "pitch and roll"])
+def test_the_gyroscope_carries_tracks_through_fast_turns(rate_C):
+    """12 degrees a frame, 60 px: beyond the reach of the pyramid alone, here without its upper levels."""
+    rate_C = np.array(rate_C)
+    images, _ = turning(rate_C, 2)
+    kept = {}
+    for predicting in (True, False):
+        first, second = play(frontend(predict_with_gyro=predicting, klt_levels=1), images, rate_C)
+        kept[predicting] = np.isin(first.ids, second.ids).mean()
+    assert kept[True] > 0.6
+    assert kept[False] < 0.2
+
+
+@pytest.mark.parametrize("rejection", ["none", "essential", "fundamental", "magsac", "two_point"])
+def test_standstill_keeps_every_track_where_it_is(rejection):
+    steps = play(frontend(rejection=rejection), [view(np.eye(3))] * 20)
+    np.testing.assert_array_equal(steps[0].ids, steps[-1].ids)
+    assert np.abs(steps[0].xy - steps[-1].xy).max() < 0.01
+
+
+@pytest.mark.parametrize("rejection", ["essential", "fundamental", "magsac", "two_point"])
+def test_what_moves_by_itself_is_rejected(rejection):
+    """The camera moves sideways before strips that are near and far by turns; a patch before all slides down."""
+    walls, patch = [texture((240, 60), seed) for seed in range(8)], texture((80, 80), 9)
+    images = []
+    for k in range(4):
+        # Nearer strips shift by 4 px a frame, farther ones by 2.
+        image = np.hstack([wall[:, shift : shift + 40] for wall, shift in zip(walls, [2 * k, 4 * k] * 4, strict=True)])
+        image[60 + 3 * k : 140 + 3 * k, 120:200] = patch
+        images.append(image)
+    first, *_, last = play(
+        frontend(rejection=rejection, max_points=300, min_distance_px=8.0, refill_below=0.01), images
+    )
+    x, y = first.xy.T
+    on_patch = (np.abs(x - 160) < 30) & (np.abs(y - 100) < 30)
+    on_walls = (x % 40 > 20) & (x % 40 < 33) & (np.abs(y - 119.5) < 105) & (np.abs(x - 160) > 50)
+    survives = np.isin(first.ids, last.ids)
+    assert on_patch.sum() >= 10
+    assert survives[on_patch].mean() < 0.1
+    assert survives[on_walls].mean() > 0.8
+
+
+def test_ids_grow_and_never_come_back():
+    rate_C = np.array([0.0, 1.5, 0.5])
+    images, _ = turning(rate_C, 12)
+    images[6] = np.zeros_like(images[6])
+    steps = play(frontend(), images, rate_C)
+    newest, gone, alive = -1, set(), set()
+    for tracks in steps:
+        ids = tracks.ids.tolist()
+        assert len(set(ids)) == len(ids)
+        assert not gone.intersection(ids)
+        new = [i for i in ids if i not in alive]
+        assert new == sorted(new)
+        assert all(i > newest for i in new)
+        newest = max([newest, *new])
+        gone |= alive.difference(ids)
+        alive = set(ids)
+    assert newest > 200
+
+
+@pytest.mark.parametrize("level", [0, 255], ids=["black", "saturated"])
+def test_an_image_that_shows_nothing_ends_the_tracks_and_is_counted(level):
+    incidents = Incidents()
+    seen = view(np.eye(3))
+    empty = np.full_like(seen, level)
+    steps = play(frontend(incidents=incidents), [seen, empty, seen])
+    assert [len(s.ids) > 50 for s in steps] == [True, False, True]
+    assert len(steps[1].ids) == 0
+    assert steps[2].ids.min() > steps[0].ids.max()
+    assert incidents.counts["featureless_image"] == 1
+
+
+@pytest.mark.parametrize(
+    "image", [np.zeros((480, 752), np.uint8), np.zeros((240, 320, 3), np.uint8), np.zeros((240, 320), np.uint16)]
+)
+def test_an_image_that_does_not_fit_the_calibration_is_refused(image):
+    with pytest.raises(DatasetError, match="320x240"):
+        play(frontend(), [image])
+
+
+class Scripted:
+    """A detector that answers as it is told, then keeps to the last answer."""
+
+    def __init__(self, *answers):
+        self._answers = list(answers)
+
+    def detect(self, image, max_points):
+        answer = self._answers.pop(0) if len(self._answers) > 1 else self._answers[0]
+        if isinstance(answer, Exception):
+            raise answer
+        return answer(image, max_points) if callable(answer) else answer
+
+
+def keypoints(*xy):
+    return Keypoints(np.array(xy, np.float32).reshape(-1, 2), np.ones(len(xy), np.float32))
+
+
+GOOD = ShiTomasi().detect
+MISBEHAVIOURS = {
+    "nothing": (keypoints(), "detector_found_nothing"),
+    "NaN": (keypoints((np.nan, 50), (60, 60)), "detector_points_not_finite"),
+    "infinite": (keypoints((50, np.inf), (60, 60)), "detector_points_not_finite"),
+    "outside": (keypoints((-5, 50), (400, 10), (1e30, 10), (60, 60)), "detector_points_outside"),
+    "too many": (lambda image, n: GOOD(image, 10_000), "detector_too_many_points"),
+    "flat": (Keypoints(np.zeros(8, np.float32), np.ones(8, np.float32)), "detector_failed"),
+    "three columns": (Keypoints(np.zeros((8, 3), np.float32), np.ones(8, np.float32)), "detector_failed"),
+    "None": (None, "detector_failed"),
+    "text": (Keypoints(np.array([["a", "b"]]), np.ones(1, np.float32)), "detector_failed"),
+    "raises": (RuntimeError("out of memory\nand more"), "detector_failed"),
+}
+
+
+@pytest.mark.parametrize(("answer", "kind"), MISBEHAVIOURS.values(), ids=MISBEHAVIOURS)
+def test_a_misbehaving_detector_is_survived_and_counted(answer, kind):
+    incidents = Incidents()
+    detector = Scripted(GOOD, answer)
+    steps = play(
+        frontend(detector, incidents, refill_below=1.0, max_points=400, candidates_per_point=1),
+        [view(np.eye(3))] * 4,
+    )
+    assert incidents.counts[kind] >= 1
+    assert np.isin(steps[0].ids, steps[-1].ids).all()
+    for tracks in steps:
+        assert np.isfinite(tracks.xy).all()
+        assert np.isfinite(tracks.xy_normalised).all()
+        assert CAMERA.contains(tracks.xy).all()
+
+
+def test_a_detector_that_never_works_is_an_error_of_the_plugin():
+    incidents = Incidents()
+    broken = frontend(Scripted(RuntimeError("no weights")), incidents)
+    play(broken, [view(np.eye(3))] * 9)
+    assert incidents.counts["detector_failed"] == 9
+    with pytest.raises(PluginError, match=r"Scripted failed .* 10 calls .*no weights"):
+        play(broken, [view(np.eye(3))])
+
+
+def test_a_detector_that_has_worked_may_fail_for_long():
+    incidents = Incidents()
+    play(
+        frontend(Scripted(GOOD, RuntimeError("busy")), incidents, refill_below=1.0, max_points=400),
+        [view(np.eye(3))] * 15,
+    )
+    assert incidents.counts["detector_failed"] == 14
+
+
+def test_the_detector_is_asked_only_when_tracks_are_missing():
+    calls = []
+    detector = Scripted(lambda image, n: calls.append(n) or GOOD(image, n))
+    play(frontend(detector, max_points=60), [view(np.eye(3))] * 5)
+    assert len(calls) == 1
+
+
+def test_new_points_keep_their_distance_and_spread():
+    tracks = play(frontend(max_points=80, min_distance_px=12.0, grid=(4, 4)), [view(np.eye(3))])[0]
+    gap = np.linalg.norm(tracks.xy[:, None] - tracks.xy[None], axis=2)
+    assert gap[np.triu_indices(len(gap), 1)].min() >= 12.0
+    cells = Counter(map(tuple, (tracks.xy // [80, 60]).astype(int)))
+    assert len(cells) == 16
+    assert max(cells.values()) - min(cells.values()) <= 1
+
+
+def test_spread_fills_the_emptiest_cell_with_its_strongest():
+    candidates = np.array([[10, 10], [30, 10], [80, 10], [70, 30], [20, 80]], float)
+    live = np.array([[90, 90], [40, 90]], float)
+    taken = spread(candidates, live, 3, size=(100, 100), grid=(2, 2), min_distance_px=5.0)
+    np.testing.assert_array_equal(taken, [0, 2, 1])
+
+
+def test_spread_stays_away_from_live_tracks():
+    candidates = np.array([[10, 10], [50, 50]], float)
+    live = np.array([[14, 10]], float)
+    taken = spread(candidates, live, 5, size=(100, 100), grid=(1, 1), min_distance_px=5.0)
+    np.testing.assert_array_equal(taken, [1])
+
+
+def test_of_two_tracks_that_meet_the_older_stays():
+    xy = np.array([[10, 10], [12, 10], [14, 10], [50, 50]], float)
+    # 9 goes for 3; 4 would only have to go for 9, which is gone.
+    np.testing.assert_array_equal(thin(xy, np.array([3, 9, 4, 8]), 3.0), [True, False, True, True])
+
+
+def test_whole_pixels_are_refined_and_others_left():
+    board = np.kron([[50, 200], [200, 50]], np.ones((20, 20))).astype(np.uint8)
+    image = cv2.GaussianBlur(board, (0, 0), 1.0)
+    refined = refine_whole_pixels(image, np.array([[21.0, 21.0], [20.3, 21.0]]), 5)
+    np.testing.assert_allclose(refined[0], [19.5, 19.5], atol=0.02)
+    np.testing.assert_array_equal(refined[1], [20.3, 21.0])
+
+
+@pytest.mark.parametrize("equalisation", ["clahe", "histogram"])
+def test_equalisation_finds_points_in_a_dim_image(equalisation):
+    """FAST asks for a contrast in grey levels, which a dim image does not have."""
+    from vioframe_fast import Fast
+
+    dim = (view(np.eye(3)) // 8 + 20).astype(np.uint8)
+    found = {
+        method: len(play(frontend(Fast(threshold=20), equalisation=method), [dim])[0].ids)
+        for method in ("none", equalisation)
+    }
+    assert found["none"] < 10
+    assert found[equalisation] > 50
+
+
+def test_the_answer_belongs_to_the_caller():
+    twin, other = frontend(), frontend()
+    images = [view(np.eye(3))] * 3
+    expected = play(twin, images)[-1]
+    for k, image in enumerate(images, start=1):
+        tracks = other.track(segment(STILL, k), Frame(k * PERIOD_NS, image), R_BC)
+        kept = tracks.xy.copy()
+        tracks.xy[:] = 0.0
+        tracks.ids[:] = 0
+        tracks.xy_normalised[:] = 0.0
+    np.testing.assert_array_equal(kept, expected.xy)
+
+
+@pytest.mark.parametrize(
+    "bad",
+    [
+        {"max_points": 0},
+        {"grid": (0, 4)},
+        {"equalisation": "gamma"},
+        {"klt_window_px": 20},
+        {"rejection": "ransac"},
+        {"refill_below": 0.0},
+        {"border_px": -1.0},
+    ],
+    ids=str,
+)
+def test_an_option_out_of_range_is_refused_by_name(bad):
+    with pytest.raises(ConfigError, match=next(iter(bad))):
+        FrontendOptions(**bad)
+
+
+# ---- real images -----------------------------------------------------------------------------------------------------
+
+
+def euroc(shared_data, name, frames, **options):
+    """The data set and its tracks of the first ``frames`` frames, as (segment, tracks) pairs."""
+    dataset = EurocDataset(shared_data / "euroc" / name)
+    incidents = Incidents()
+    tracker = Frontend(ShiTomasi(), dataset.calibration.camera, FrontendOptions(**options), incidents)
+    packets = synchronise(dataset.measurements(), duration_s=frames / 20.0, incidents=incidents)
+    return dataset, [tracker.track(imu, frame, dataset.calibration.R_BC) for imu, frame in packets]
+
+
+def test_two_runs_are_byte_identical(shared_data):
+    for rejection in ("essential", "fundamental", "magsac", "two_point"):
+        first, second = (euroc(shared_data, "MH_01_easy_15s", 10, rejection=rejection)[1] for _ in range(2))
+        for a, b in zip(first, second, strict=True):
+            assert a.ids.tobytes() == b.ids.tobytes()
+            assert a.xy.tobytes() == b.xy.tobytes()
+
+
+def test_at_rest_tracks_live_on(shared_data):
+    """The whole view shifts by 1.8 px as the vehicle settles; tracks keep to it and to each other for 95 frames."""
+    _, steps = euroc(shared_data, "V1_01_easy_rest", 95)
+    assert len(steps) >= 90
+    survivors, i, j = np.intersect1d(steps[0].ids, steps[-1].ids, return_indices=True)
+    assert len(survivors) >= 0.9 * len(steps[0].ids)
+    moved = steps[-1].xy[j] - steps[0].xy[i]
+    assert np.median(np.linalg.norm(moved - np.median(moved, axis=0), axis=1)) < 0.4
+
+
+def test_in_flight_tracks_obey_the_true_epipolar_geometry(shared_data):
+    """Against the recorded ground truth, whose own error is part of what is measured."""
+    dataset, steps = euroc(shared_data, "MH_01_easy_15s", 100)
+    calibration, truth = dataset.calibration, dataset.ground_truth
+    t_ns = np.array([s.t_ns for s in steps])
+    at = np.abs(truth.t_ns[:, None] - t_ns).argmin(axis=0)
+    assert np.abs(truth.t_ns[at] - t_ns).max() < 1000
+    R_WC = truth.R_WB[at] @ calibration.R_BC
+    p_WC = truth.p_WB[at] + truth.R_WB[at] @ calibration.p_BC
+    for baseline, median_px, outliers in ((1, 0.2, 0.005), (5, 0.8, 0.1)):
+        errors = []
+        for k in range(len(steps) - baseline):
+            before, after = steps[k], steps[k + baseline]
+            _, i, j = np.intersect1d(before.ids, after.ids, return_indices=True)
+            R_C2W = R_WC[k + baseline].T
+            E = two_view.essential_matrix(R_C2W @ R_WC[k], R_C2W @ (p_WC[k] - p_WC[k + baseline]))
+            errors.append(two_view.sampson_distance(E, before.xy_normalised[i], after.xy_normalised[j]))
+        # Sampson's distance shares an error between both views: the root of two turns it into one view's pixels.
+        error_px = np.abs(np.concatenate(errors)) * calibration.camera.focal_px * np.sqrt(2.0)
+        assert np.median(error_px) < median_px
+        assert (error_px > 3.0).mean() < outliers
+    lifetimes = np.bincount(np.concatenate([s.ids for s in steps]))
+    assert lifetimes.mean() > 8.0
+
+
+def test_a_gap_between_images_restarts_lost_tracks(shared_data):
+    """Half a second without images: what cannot be found again is replaced, and nothing is tracked to a wrong place."""
+    dataset = EurocDataset(shared_data / "euroc" / "MH_01_easy_15s")
+    incidents = Incidents()
+    tracker = Frontend(ShiTomasi(), dataset.calibration.camera, FrontendOptions(), incidents)
+
+    def with_gap():
+        start = None
+        for item in dataset.measurements():
+            if isinstance(item, Frame):
+                start = item.t_ns if start is None else start
+                if 0.5 < (item.t_ns - start) * 1e-9 < 1.0:
+                    continue
+            yield item
+
+    packets = synchronise(with_gap(), duration_s=1.5, incidents=incidents)
+    counts = [len(tracker.track(imu, frame, dataset.calibration.R_BC).ids) for imu, frame in packets]
+    assert incidents.counts["camera_gap"] == 1
+    assert min(counts) >= 120
