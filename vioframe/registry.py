@@ -237,6 +237,7 @@ def _checked(kind: Kind, name: object, factory: Any) -> Any:
         raise PluginError(f"{kind.hook} must map names to callables, got {name!r}: {factory!r}")
     if kind is DATASET and not callable(getattr(factory, "accepts", None)):
         raise PluginError(f"the reader {name!r} has no accepts(path)")
+    inspect.signature(factory)  # raises ValueError for the few callables that have none, hence no options to read
     return factory
 
 

@@ -1,0 +1,216 @@
+"""The run folder: complete after a run, readable after an interruption, never silently replaced."""
+
+import json
+from time import perf_counter
+
+import numpy as np
+import pytest
+
+from vioframe import machine
+from vioframe.errors import PluginError, RunError
+from vioframe.geometry import so3
+from vioframe.incidents import Incidents
+from vioframe.recorder import (
+    POSE_COV_COLUMNS,
+    STATE_COLUMNS,
+    Recorder,
+    check_run_folder,
+    free_run_folder,
+    new_run_folder,
+)
+from vioframe.report.run_folder import RunFolder
+from vioframe.types import Estimate, Frame, FrameTracks, NavState, Status, Step
+
+FIRST_NS = 1_403_636_579_763_555_584  # a float of seconds would lose the last digits
+PERIOD_NS = 50_000_000
+
+
+def step(k: int, status: Status = Status.TRACKING, *, points: int = 2, cov: bool = True, **more) -> Step:
+    """Frame ``k`` of a run that moves 0.1 m a frame and yaws 0.02 rad."""
+    t_ns = FIRST_NS + k * PERIOD_NS
+    tracks = FrameTracks(t_ns, np.arange(points), np.full((points, 2), 10.25 + k), np.zeros((points, 2)))
+    state = None
+    if status is Status.TRACKING:
+        R_WB, p_WB = so3.exp([0.0, 0.0, 0.02 * k]), np.array([0.1 * k, 0.0, 1e-9])
+        covariance = np.diag(np.arange(1.0, 16.0)) + 0.5 if cov else None
+        v_WB = more.pop("v_WB", np.array([2.0, 0.0, 0.0]))
+        state = NavState(t_ns, R_WB, p_WB, v_WB, np.full(3, 1e-3), np.full(3, 2e-2), covariance)
+    seconds = {"klt": 0.004, "backend": 0.006} | ({"backend.update": 0.005} if state else {})
+    estimate = Estimate(status, state, **more)
+    return Step(Frame(t_ns, np.zeros((4, 4), np.uint8)), tracks, estimate, seconds)
+
+
+def record(folder, steps, incidents=None):
+    new_run_folder(folder)
+    with Recorder(folder, {"name": "test"}, incidents or Incidents(), perf_counter()) as recorder:
+        for one in steps:
+            recorder.add(one)
+    return recorder.summary
+
+
+def columns(path):
+    return path.read_text().splitlines()[0].split(",")
+
+
+def test_a_run_says_everything(tmp_path):
+    incidents = Incidents()
+    incidents.add("imu_nan", FIRST_NS, "dropped")
+    waiting = [step(0, Status.INITIALISING, events=("refused: no parallax",)), step(1, Status.INITIALISING)]
+    record(tmp_path / "run", [*waiting, *(step(k) for k in range(2, 10))], incidents)
+    summary = json.loads((tmp_path / "run" / "summary.json").read_text())
+    assert summary["finished"] is True
+    assert summary["frames"] == 10
+    assert summary["first_frame_t_ns"] == FIRST_NS
+    assert summary["initialised_t_ns"] == FIRST_NS + 2 * PERIOD_NS
+    assert summary["initialised_after_s"] == 0.1
+    assert summary["completion"] == 1.0
+    assert summary["resets"] == 0
+    assert summary["tracked_points_mean"] == 2.0
+    assert summary["mean_ms"] == pytest.approx({"klt": 4.0, "backend": 6.0, "backend.update": 4.0})
+    assert summary["mean_frame_ms"] == pytest.approx(10.0), "a back-end's stages are parts of its whole"
+    assert summary["real_time_factor"] == pytest.approx(0.45 / summary["wall_s"])
+    assert summary["events"] == [{"t_ns": FIRST_NS, "event": "refused: no parallax"}]
+    assert summary["incidents"] == {"imu_nan": 1}
+
+
+def test_the_files_hold_what_the_steps_said(tmp_path):
+    record(tmp_path / "run", [step(k) for k in range(5)])
+    run = RunFolder.open(tmp_path / "run")
+    estimate = run.trajectory()
+    np.testing.assert_array_equal(estimate.t_ns, FIRST_NS + PERIOD_NS * np.arange(5))
+    np.testing.assert_allclose(estimate.p_WB[:, 0], 0.1 * np.arange(5), atol=1e-9)
+    np.testing.assert_allclose(estimate.p_WB[:, 2], 1e-9, atol=0.0)
+    np.testing.assert_allclose(so3.log(estimate.R_WB)[:, 2], 0.02 * np.arange(5), atol=1e-11)
+    np.testing.assert_allclose(estimate.cov_pose[3], (np.diag(np.arange(1.0, 16.0)) + 0.5)[:6, :6])
+    assert columns(run.path / "states.csv") == list(STATE_COLUMNS)
+    assert columns(run.path / "pose_cov.csv") == list(POSE_COV_COLUMNS)
+    states = np.loadtxt(run.path / "states.csv", delimiter=",", skiprows=1)
+    np.testing.assert_allclose(states[2, 1:10], [2.0, 0.0, 0.0, *[1e-3] * 3, *[2e-2] * 3])
+    np.testing.assert_allclose(states[2, 10:], np.arange(1.0, 16.0) + 0.5)
+    counts = run.track_counts()
+    assert counts.tracked.tolist() == [2] * 5
+    assert counts.new.tolist() == [2, 0, 0, 0, 0]
+
+
+def test_a_stage_that_first_occurs_later_is_a_column_for_all_rows(tmp_path):
+    record(tmp_path / "run", [step(0, Status.INITIALISING), step(1), step(2)])
+    timings = RunFolder.open(tmp_path / "run").timings()
+    assert timings.seconds["backend.update"].tolist() == [0.0, 0.005, 0.005]
+    assert timings.seconds["klt"].tolist() == [0.004] * 3
+    assert len(timings.t_ns) == 3
+
+
+def test_an_unknown_covariance_is_nan(tmp_path):
+    record(tmp_path / "run", [step(0, cov=False), step(1)])
+    states = np.loadtxt(tmp_path / "run" / "states.csv", delimiter=",", skiprows=1)
+    assert np.isnan(states[0, 10:]).all()
+    assert np.isfinite(states[1]).all()
+
+
+def test_a_reset_is_counted_and_its_landmarks_are_dropped(tmp_path):
+    seen = [step(k, landmark_ids=np.array([k, 7]), p_WF=np.full((2, 3), float(k))) for k in (0, 1)]
+    again = step(4, landmark_ids=np.array([9, 8]), p_WF=np.array([[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]]))
+    summary = record(tmp_path / "run", [*seen, step(2, Status.LOST), step(3, Status.INITIALISING), again])
+    assert summary["resets"] == 1
+    assert summary["completion"] == 3 / 5
+    header, rows = (tmp_path / "run" / "map.ply").read_text().split("end_header\n")
+    assert "element vertex 2\n" in header
+    assert rows == "4.000000 5.000000 6.000000 8\n1.000000 2.000000 3.000000 9\n"
+
+
+def test_a_landmark_is_written_as_last_refined(tmp_path):
+    refined = [step(k, landmark_ids=np.array([3]), p_WF=np.full((1, 3), 0.5 * k)) for k in (1, 2)]
+    record(tmp_path / "run", refined)
+    assert (tmp_path / "run" / "map.ply").read_text().endswith("end_header\n1.000000 1.000000 1.000000 3\n")
+
+
+def test_an_interrupted_run_keeps_what_it_had(tmp_path):
+    def steps():
+        yield from (step(k) for k in range(3))
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        record(tmp_path / "run", steps())
+    run = RunFolder.open(tmp_path / "run")
+    assert len(run.trajectory()) == 3
+    assert run.summary["finished"] is False
+    assert run.summary["frames"] == 3
+    assert run.summary["stopped_by"] == "KeyboardInterrupt:"
+
+
+def test_a_run_that_is_killed_has_written_every_frame_so_far(tmp_path):
+    new_run_folder(tmp_path / "run")
+    recorder = Recorder(tmp_path / "run", {"name": "test"}, Incidents(), perf_counter())
+    for k in range(3):
+        recorder.add(step(k))
+        run = RunFolder.open(tmp_path / "run")
+        assert len(run.trajectory()) == k + 1
+        assert len(run.timings().t_ns) == k + 1
+        assert run.summary["finished"] is False
+
+
+def test_a_state_that_is_not_finite_ends_the_run_before_it_is_written(tmp_path):
+    with pytest.raises(PluginError, match=f"state at {FIRST_NS + PERIOD_NS} ns is not finite"):
+        record(tmp_path / "run", [step(0), step(1, v_WB=np.array([np.nan, 0.0, 0.0]))])
+    assert len(RunFolder.open(tmp_path / "run").trajectory()) == 1
+
+
+def test_a_run_that_never_initialises_is_readable(tmp_path):
+    summary = record(tmp_path / "run", [step(0, Status.INITIALISING, points=0)])
+    assert (summary["initialised_t_ns"], summary["completion"], summary["finished"]) == (None, 0.0, True)
+    assert RunFolder.open(tmp_path / "run").trajectory() is None
+
+
+def test_two_runs_are_the_same_byte_for_byte(tmp_path):
+    for name in ("a", "b"):
+        record(tmp_path / name, [step(k, landmark_ids=np.array([k]), p_WF=np.ones((1, 3)) / 3) for k in range(4)])
+    for file in ("trajectory.tum", "states.csv", "pose_cov.csv", "tracks.csv", "map.ply"):
+        assert (tmp_path / "a" / file).read_bytes() == (tmp_path / "b" / file).read_bytes()
+
+
+def test_a_run_is_replaced_only_on_request_and_completely(tmp_path):
+    run = tmp_path / "run"
+    record(run, [step(0)])
+    (run / "plot.png").touch()
+    with pytest.raises(RunError, match="exists already; choose another --out or pass --overwrite"):
+        new_run_folder(run)
+    assert (run / "trajectory.tum").exists()
+    new_run_folder(run, overwrite=True)
+    assert list(run.iterdir()) == []
+
+
+def test_what_is_no_run_is_never_replaced(tmp_path):
+    (tmp_path / "thesis").mkdir()
+    (tmp_path / "thesis" / "chapter.tex").touch()
+    (tmp_path / "file").touch()
+    for path in (tmp_path / "thesis", tmp_path / "file"):
+        with pytest.raises(RunError, match="is not a run folder and is not overwritten"):
+            new_run_folder(path, overwrite=True)
+    assert (tmp_path / "thesis" / "chapter.tex").exists()
+
+
+def test_a_folder_that_cannot_be_made_is_an_error_in_one_line(tmp_path):
+    (tmp_path / "file").touch()
+    with pytest.raises(RunError, match="cannot create the run folder"):
+        new_run_folder(tmp_path / "file" / "run")
+
+
+def test_free_names_are_numbered(tmp_path):
+    assert free_run_folder(tmp_path, "a").name == "a"
+    (tmp_path / "a").mkdir()
+    (tmp_path / "a_2").mkdir()
+    assert free_run_folder(tmp_path, "a").name == "a_3"
+    check_run_folder(tmp_path / "a")  # an empty folder may be used
+
+
+def test_the_machine_is_described_in_plain_values():
+    facts = machine.describe()
+    assert json.loads(json.dumps(facts)) == facts
+    assert {"numpy", "opencv-python-headless", "scipy"} <= set(facts["versions"])
+    assert facts["cpu"]
+    assert facts["threads"]["opencv"] >= 1
+
+
+def test_the_commit_is_that_of_the_code_or_none(tmp_path):
+    (tmp_path / "__init__.py").touch()
+    assert machine.commit(tmp_path) is None
