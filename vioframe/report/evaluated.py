@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from vioframe.errors import VioframeError
 from vioframe.report.run_folder import RunFolder
 from vioframe.trajectory import Trajectory, TrajectoryErrors, evaluate, load_trajectory
 
@@ -65,15 +67,21 @@ def evaluate_path(path: Path, ground_truth: Trajectory | None, alignment: str = 
 
 
 def evaluate_paths(
-    paths: Iterable[Path], ground_truth: Path | None = None, alignment: str = "posyaw"
+    paths: Sequence[Path], ground_truth: Path | None = None, alignment: str = "posyaw"
 ) -> list[Evaluated]:
-    """Evaluate each of ``paths`` against ``ground_truth`` or its own; an error notes the path it came from."""
+    """Evaluate each of ``paths`` against ``ground_truth`` or its own; an error notes the path it came from.
+
+    Runs that would share a name are called by their paths.
+    """
     truth = None if ground_truth is None else load_trajectory(ground_truth)
     evaluated = []
     for path in paths:
         try:
             evaluated.append(evaluate_path(path, truth, alignment))
-        except Exception as error:
+        except VioframeError as error:
             error.add_note(f"while evaluating {path}")
             raise
-    return evaluated
+    times = Counter(run.name for run in evaluated)
+    return [
+        replace(run, name=str(path)) if times[run.name] > 1 else run for path, run in zip(paths, evaluated, strict=True)
+    ]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -39,8 +39,9 @@ class TrajectoryErrors:
 
     ``position_m`` (N, 3) estimate minus truth, ``rotation_rpy_deg`` (N, 3) about the world's axes. ``ate_se3_m`` and
     ``scale``, the factor the estimate would have to be multiplied by, come from alignments of their own and are None
-    where the body did not move enough to tell. NEES is taken in the gauge of the first pose in any case. ``coverage`` is
-    the part of the ground truth's time between the first and the last associated pose.
+    where the body did not move enough to tell. ``relative`` is by length in metres, ``relative_by_fraction`` by fraction
+    of the whole path. NEES is taken in the gauge of the first pose in any case. ``coverage`` is the part of the ground
+    truth's time between the first and the last associated pose.
     """
 
     alignment_name: str
@@ -54,8 +55,8 @@ class TrajectoryErrors:
     yaw_deg: Stats
     ate_se3_m: float | None
     scale: float | None
-    relative: tuple[RelativeErrors, ...]
-    relative_by_fraction: tuple[RelativeErrors, ...]
+    relative: Mapping[float, RelativeErrors]
+    relative_by_fraction: Mapping[float, RelativeErrors]
     nees: tuple[Nees, ...]
     coverage: float
     notes: tuple[str, ...]
@@ -85,8 +86,10 @@ class TrajectoryErrors:
             "yaw_deg": self.yaw_deg.to_dict(),
             "max_position_m": dict(zip("xyz", self.max_position_m.tolist(), strict=True)),
             "max_rotation_deg": dict(zip(("roll", "pitch", "yaw"), self.max_rotation_deg.tolist(), strict=True)),
-            "relative": [errors.to_dict() for errors in self.relative],
-            "relative_by_fraction": [errors.to_dict() for errors in self.relative_by_fraction],
+            "relative": {f"{length:g}m": errors.to_dict() for length, errors in self.relative.items()},
+            "relative_by_fraction": {
+                f"{100 * f:g}%": errors.to_dict() for f, errors in self.relative_by_fraction.items()
+            },
             "nees": {n.part: n.to_dict() for n in self.nees},
             "notes": list(self.notes),
         }
@@ -116,7 +119,9 @@ def evaluate(
     aligned = transform.apply(raw)
     rotation_rpy_deg = rotation_error_rpy_deg(aligned, truth)
     position_m = position_error_W(aligned, truth)
-    fractions_m = [] if at_rest else [fraction * truth.path_length_m for fraction in FRACTIONS]
+    path_m = truth.path_length_m
+    by_length = {} if at_rest else relative_errors(aligned, truth, {length: length for length in lengths_m})
+    by_fraction = {} if at_rest else relative_errors(aligned, truth, {part: part * path_m for part in FRACTIONS})
     ate_se3_m, scale = (None, None) if at_rest else _se3_ate_and_scale(raw, truth)
     return TrajectoryErrors(
         alignment_name=alignment,
@@ -130,8 +135,8 @@ def evaluate(
         yaw_deg=Stats.of(rotation_rpy_deg[:, 2]),
         ate_se3_m=ate_se3_m,
         scale=scale,
-        relative=() if at_rest else relative_errors(aligned, truth, lengths_m),
-        relative_by_fraction=relative_errors(aligned, truth, fractions_m),
+        relative=by_length,
+        relative_by_fraction=by_fraction,
         nees=() if raw.cov_pose is None else nees(ALIGNMENTS["first"](raw, truth).apply(raw), truth),
         coverage=min(1.0, raw.duration_s / ground_truth.duration_s) if len(ground_truth) > 1 else 1.0,
         notes=tuple(_notes(estimate, raw, aligned, truth, at_rest)),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 
 import numpy as np
@@ -80,15 +80,17 @@ class RelativeErrors:
         }
 
 
-def relative_errors(estimate: Trajectory, truth: Trajectory, lengths_m: Sequence[float]) -> tuple[RelativeErrors, ...]:
-    """Relative errors over each of ``lengths_m`` that fits into the true path; the others are left out.
+def relative_errors(
+    estimate: Trajectory, truth: Trajectory, lengths_m: Mapping[float, float]
+) -> dict[float, RelativeErrors]:
+    """Relative errors over each of ``lengths_m`` that fits into the true path, under its key; the others are left out.
 
     With A = T_i^-1 T_j of the truth and B of the estimate, the error is A^-1 B (Zhang and Scaramuzza, IROS 2018); R_j
     of the truth turns its rotation into the world's axes, to tell yaw from tilt. No rigid alignment changes it.
     """
     travelled = truth.travelled_m
-    found = (_over_length(estimate, truth, travelled, length) for length in lengths_m)
-    return tuple(errors for errors in found if errors is not None)
+    found = {key: _over_length(estimate, truth, travelled, length) for key, length in lengths_m.items()}
+    return {key: errors for key, errors in found.items() if errors is not None}
 
 
 def _over_length(estimate: Trajectory, truth: Trajectory, travelled: Float, length_m: float) -> RelativeErrors | None:

@@ -1,0 +1,54 @@
+"""``vioframe evaluate``: runs and trajectory files against the ground truth, as a table."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+_FILE = click.Path(path_type=Path)
+_WIDE = 1000
+
+
+@click.command("evaluate")
+@click.argument("runs", metavar="RUN...", type=_FILE, nargs=-1, required=True)
+@click.option("--ground-truth", type=_FILE, help="TUM or EuRoC csv; a run folder's own is the default.")
+@click.option(
+    "--alignment",
+    type=click.Choice(["posyaw", "se3", "sim3", "first"]),
+    default="posyaw",
+    show_default=True,
+    help="How the estimate is brought into the ground truth's frame.",
+)
+@click.option(
+    "--format",
+    "format_",
+    type=click.Choice(["table", "json", "csv", "markdown"]),
+    default="table",
+    show_default=True,
+    help="What to print.",
+)
+def command(runs: tuple[Path, ...], ground_truth: Path | None, alignment: str, format_: str) -> None:
+    """Compare each RUN, a run folder or a trajectory file, with the ground truth.
+
+    The result is printed, and kept as `evaluation.json` in each run folder.
+    """
+    from vioframe.recorder import write_json
+    from vioframe.report.evaluated import evaluate_paths
+    from vioframe.report.rows import notes
+    from vioframe.report.tables import to_csv, to_json, to_markdown, to_rich
+
+    evaluated = evaluate_paths(runs, ground_truth, alignment)
+    for run in evaluated:
+        if run.folder is not None:
+            write_json(run.folder.path / "evaluation.json", run.to_dict())
+    if format_ == "table":
+        from rich.console import Console
+
+        console = Console()
+        # Into a file or a pipe the table goes whole: rich would fold it at 80 columns.
+        (console if console.is_terminal else Console(width=_WIDE)).print(to_rich(evaluated))
+    else:
+        click.echo({"json": to_json, "csv": to_csv, "markdown": to_markdown}[format_](evaluated))
+    for note in notes(evaluated):
+        click.echo(f"note: {note}", err=True)

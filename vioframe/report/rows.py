@@ -1,0 +1,138 @@
+"""What an evaluation says, as labelled rows of text; :mod:`vioframe.report.tables` lays them out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+
+from vioframe.report.evaluated import Evaluated
+from vioframe.trajectory import RelativeErrors, Stats, TrajectoryErrors
+
+ALIGNED_BY = {"posyaw": "position + yaw", "se3": "SE(3)", "sim3": "Sim(3)", "first": "first pose"}
+
+_UNKNOWN = "–"
+Rows = list[tuple[str, list[str]]]
+Section = tuple[str, Rows]
+
+
+def sections(runs: Sequence[Evaluated]) -> list[Section]:
+    """(title, rows) by topic; a row is a label and one cell a run. Rows that no run has are left out."""
+    groups = [
+        ("Run", _run_rows(runs)),
+        *_error_sections(runs),
+        ("Time, ms a frame", _timing_rows(runs)),
+    ]
+    known = [(title, [row for row in rows if any(cell != _UNKNOWN for cell in row[1])]) for title, rows in groups]
+    return [(title, rows) for title, rows in known if rows]
+
+
+def notes(runs: Sequence[Evaluated]) -> Iterator[str]:
+    """One line for each thing a reader of the figures should know."""
+    for run in runs:
+        if run.folder and not run.summary.get("finished", False):
+            yield f"{run.name}: the run was interrupted; these figures cover what it left"
+        if run.estimate is None:
+            yield f"{run.name}: never initialised, so there is no pose to evaluate"
+        elif run.errors is None:
+            yield f"{run.name}: no ground truth; pass --ground-truth to measure errors"
+        else:
+            yield from (f"{run.name}: {note}" for note in run.errors.notes)
+
+
+def _run_rows(runs: Sequence[Evaluated]) -> Rows:
+    def errors(format_: Callable[[TrajectoryErrors], str]) -> list[str]:
+        return _cells(runs, format_)
+
+    def summary(key: str, spec: str, factor: float | None = None) -> list[str]:
+        found = [run.summary.get(key) for run in runs]
+        return [_UNKNOWN if x is None else format(x if factor is None else factor * x, spec) for x in found]
+
+    return [
+        ("detector", summary("detector", "")),
+        ("back-end", summary("backend", "")),
+        ("start offset [s]", summary("start_s", ".1f")),
+        ("initialised after [s]", summary("initialised_after_s", ".2f")),
+        ("completion after that [%]", summary("completion", ".1f", 100.0)),
+        ("resets", summary("resets", "d")),
+        ("evaluated poses", errors(lambda e: str(len(e.estimate)))),
+        ("ground truth covered [%]", errors(lambda e: f"{100.0 * e.coverage:.1f}")),
+        ("path length [m]", errors(lambda e: f"{e.truth.path_length_m:.2f}")),
+    ]
+
+
+def _error_sections(runs: Sequence[Evaluated]) -> list[Section]:
+    def cells(format_: Callable[[TrajectoryErrors], str]) -> list[str]:
+        return _cells(runs, format_)
+
+    how = next((ALIGNED_BY[run.errors.alignment_name] for run in runs if run.errors), "")
+    position = [
+        ("RMSE", cells(lambda e: f"{e.ate_m.rmse:.4f}")),
+        ("mean", cells(lambda e: f"{e.ate_m.mean:.4f}")),
+        ("median", cells(lambda e: f"{e.ate_m.median:.4f}")),
+        ("max", cells(lambda e: f"{e.ate_m.max:.4f}")),
+        ("max |x|, |y|, |z|", cells(lambda e: ", ".join(f"{x:.3f}" for x in e.max_position_m))),
+        ("RMSE after SE(3) alignment", cells(lambda e: _or_unknown(e.ate_se3_m, ".4f"))),
+        ("scale by Sim(3) [1]", cells(lambda e: _or_unknown(e.scale, ".4f"))),
+    ]
+    orientation = [
+        ("RMSE", cells(lambda e: f"{e.orientation_deg.rmse:.3f}")),
+        ("yaw RMSE", cells(lambda e: f"{e.yaw_deg.rmse:.3f}")),
+        ("max |roll|, |pitch|, |yaw|", cells(lambda e: ", ".join(f"{x:.2f}" for x in e.max_rotation_deg))),
+    ]
+    return [
+        (f"Position error, {how} aligned [m]", position),
+        (f"Orientation error, {how} aligned [deg]", orientation),
+        ("Relative error, mean: translation [%] / yaw [deg] / rotation [deg]", _relative_rows(runs)),
+        ("NEES, mean (inside the 95 % band)", _nees_rows(runs)),
+    ]
+
+
+def _relative_rows(runs: Sequence[Evaluated]) -> Rows:
+    """Over fixed lengths where a path is long enough for any, over fractions of the path where none is."""
+    errors = [run.errors for run in runs if run.errors]
+    lengths = sorted({length for e in errors for length in e.relative})
+    if lengths:
+        return [
+            (f"{d:g} m", [_relative_cell(run.errors and run.errors.relative.get(d)) for run in runs]) for d in lengths
+        ]
+    parts = sorted({part for e in errors for part in e.relative_by_fraction})
+    return [
+        (
+            f"{100 * part:g} % of the path",
+            [_relative_cell(run.errors and run.errors.relative_by_fraction.get(part)) for run in runs],
+        )
+        for part in parts
+    ]
+
+
+def _relative_cell(errors: RelativeErrors | None) -> str:
+    if errors is None:
+        return _UNKNOWN
+    means = (Stats.of(x).mean for x in (errors.translation_percent, errors.yaw_deg, errors.rotation_deg))
+    return " / ".join(f"{mean:.2f}" for mean in means)
+
+
+def _nees_rows(runs: Sequence[Evaluated]) -> Rows:
+    def cell(errors: TrajectoryErrors, part: str) -> str:
+        found = [f"{n.mean:.2f} ({100.0 * n.inside:.0f} %)" for n in errors.nees if n.part == part]
+        return found[0] if found else _UNKNOWN
+
+    parts = {"orientation": 3, "position": 3, "pose": 6}
+    return [
+        (f"{part}, ideally {dof}", [cell(run.errors, part) if run.errors else _UNKNOWN for run in runs])
+        for part, dof in parts.items()
+    ]
+
+
+def _timing_rows(runs: Sequence[Evaluated]) -> Rows:
+    spent = [run.stage_ms() for run in runs]
+    stages = dict.fromkeys(stage for each in spent for stage in each)
+    rows = [(stage, [_or_unknown(each.get(stage), ".2f") for each in spent]) for stage in stages]
+    return [("all", [_or_unknown(sum(each.values()) if each else None, ".2f") for each in spent]), *rows]
+
+
+def _cells(runs: Sequence[Evaluated], format_: Callable[[TrajectoryErrors], str]) -> list[str]:
+    return [_UNKNOWN if run.errors is None else format_(run.errors) for run in runs]
+
+
+def _or_unknown(value: float | None, spec: str) -> str:
+    return _UNKNOWN if value is None else format(value, spec)
