@@ -88,20 +88,12 @@ def _error_sections(runs: Sequence[Evaluated]) -> list[Section]:
 
 def _relative_rows(runs: Sequence[Evaluated]) -> Rows:
     """Over fixed lengths where a path is long enough for any, over fractions of the path where none is."""
-    errors = [run.errors for run in runs if run.errors]
-    lengths = sorted({length for e in errors for length in e.relative})
-    if lengths:
-        return [
-            (f"{d:g} m", [_relative_cell(run.errors and run.errors.relative.get(d)) for run in runs]) for d in lengths
-        ]
-    parts = sorted({part for e in errors for part in e.relative_by_fraction})
-    return [
-        (
-            f"{100 * part:g} % of the path",
-            [_relative_cell(run.errors and run.errors.relative_by_fraction.get(part)) for run in runs],
-        )
-        for part in parts
-    ]
+    by_length = [run.errors.relative if run.errors else {} for run in runs]
+    by_fraction = [run.errors.relative_by_fraction if run.errors else {} for run in runs]
+    if lengths := sorted(set().union(*by_length)):
+        return [(f"{d:g} m", [_relative_cell(each.get(d)) for each in by_length]) for d in lengths]
+    parts = sorted(set().union(*by_fraction))
+    return [(f"{100 * f:g} % of the path", [_relative_cell(each.get(f)) for each in by_fraction]) for f in parts]
 
 
 def _relative_cell(errors: RelativeErrors | None) -> str:

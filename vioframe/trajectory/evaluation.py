@@ -39,9 +39,9 @@ class TrajectoryErrors:
 
     ``position_m`` (N, 3) estimate minus truth, ``rotation_rpy_deg`` (N, 3) about the world's axes. ``ate_se3_m`` and
     ``scale``, the factor the estimate would have to be multiplied by, come from alignments of their own and are None
-    where the body did not move enough to tell. ``relative`` is by length in metres, ``relative_by_fraction`` by fraction
-    of the whole path. NEES is taken in the gauge of the first pose in any case. ``coverage`` is the part of the ground
-    truth's time between the first and the last associated pose.
+    where the body did not move enough to tell. ``relative`` is by length in metres, ``relative_by_fraction`` by the
+    fraction of the whole path. NEES is taken in the gauge of the first pose in any case. ``coverage`` is the part of the
+    ground truth's time between the first and the last associated pose.
     """
 
     alignment_name: str
@@ -163,11 +163,10 @@ def _notes(estimate: Trajectory, raw: Trajectory, aligned: Trajectory, truth: Tr
     notes = []
     if at_rest:
         notes.append("body at rest: yaw aligned by attitude; SE(3), scale and relative errors left out")
-    placeholders = int(np.argmin(_is_identity(estimate))) if not _is_identity(estimate).all() else len(estimate)
+    placeholders = int(np.logical_and.accumulate(_is_identity(estimate)).sum())
     if placeholders:
-        notes.append(
-            f"the first {placeholders} poses of the estimate are the identity; were they written before it began?"
-        )
+        poses = "pose of the estimate is" if placeholders == 1 else f"{placeholders} poses of the estimate are"
+        notes.append(f"the first {poses} the identity: written before initialisation?")
     E = aligned.R_WB @ truth.R_WB.transpose(0, 2, 1)
     in_body = so3.project((truth.R_WB.transpose(0, 2, 1) @ aligned.R_WB).mean(axis=0))
     offset = float(np.degrees(np.linalg.norm(so3.log(in_body))))
