@@ -139,6 +139,8 @@ def _opened(path: Path) -> Iterator[AnyReader]:
     if not path.exists():
         raise DatasetError(f"{path} does not exist")
     try:
+        for file in path.glob("*.db3") if path.is_dir() else [path]:
+            _check_sqlite_size(file)
         # The type store serves older ROS 2 recordings, which bring no message definitions.
         reader = AnyReader([path], default_typestore=get_typestore(Stores.LATEST))
         reader.open()
@@ -149,6 +151,17 @@ def _opened(path: Path) -> Iterator[AnyReader]:
         yield reader
     finally:
         reader.close()
+
+
+def _check_sqlite_size(file: Path) -> None:
+    """Raise EOFError for a truncated sqlite file: sqlite itself reads what is missing of the last page as zeros."""
+    with file.open("rb") as stream:
+        header = stream.read(100)
+    if header.startswith(b"SQLite format 3\0") and len(header) == 100:
+        page_size = int.from_bytes(header[16:18], "big")
+        page_size = 65536 if page_size == 1 else page_size
+        if file.stat().st_size < page_size * int.from_bytes(header[28:32], "big"):
+            raise EOFError(f"{file.name} is shorter than its header says")
 
 
 def _damaged(path: Path, err: Exception) -> DatasetError:

@@ -1,0 +1,529 @@
+"""Readers: what is in a recording comes out exactly; what is wrong with one is said in a line, or counted."""
+
+import logging
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from recordings import (
+    CALIBRATION,
+    HEIGHT,
+    T0_NS,
+    WIDTH,
+    Message,
+    assert_equal,
+    compressed_message,
+    image_message,
+    imu_message,
+    measurements,
+    write_bag,
+)
+
+from vioframe.calibration import packaged_calibration, sidecar_folder, write_calibration
+from vioframe.convert import convert
+from vioframe.errors import CalibrationError, DatasetError
+from vioframe.incidents import Incidents
+from vioframe.interfaces import Dataset
+from vioframe.synchronise import synchronise
+from vioframe.types import Frame, ImuSample, Measurement, Unreadable
+from vioframe_euroc import EurocDataset
+from vioframe_rosbag import RosbagDataset
+
+
+@pytest.fixture
+def asl(tmp_path: Path) -> Path:
+    convert(measurements(), CALIBRATION, tmp_path / "flight")
+    return tmp_path / "flight"
+
+
+@pytest.fixture
+def bag(tmp_path: Path) -> Path:
+    convert(measurements(), CALIBRATION, tmp_path / "flight.bag")
+    return tmp_path / "flight.bag"
+
+
+def frames_of(dataset: Dataset) -> list[Frame]:
+    return [m for m in dataset.measurements() if isinstance(m, Frame)]
+
+
+def incidents_of(dataset: Dataset) -> dict[str, int]:
+    incidents = Incidents()
+    for _ in synchronise(dataset.measurements(), incidents=incidents):
+        pass
+    return dict(incidents.counts)
+
+
+def one_line(caught: pytest.ExceptionInfo[Exception]) -> str:
+    text = str(caught.value)
+    assert "\n" not in text
+    return text
+
+
+class TestAsl:
+    @pytest.mark.parametrize("inner", [".", "mav0"])
+    def test_everything_comes_out_exactly(self, asl: Path, inner: str, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.chdir(asl / inner)
+        for path in (asl / inner, Path()):
+            assert EurocDataset.accepts(path)
+            dataset = EurocDataset(path)
+            assert isinstance(dataset, Dataset)
+            assert (dataset.name, dataset.frame_count, dataset.ground_truth) == ("flight", 6, None)
+            assert dataset.calibration.camera == CALIBRATION.camera
+            assert dataset.calibration.time_offset_ns == CALIBRATION.time_offset_ns
+            assert_equal(dataset.measurements(), measurements())
+            assert_equal(dataset.measurements(), measurements())
+
+    def test_files_as_other_tools_write_them(self, asl: Path) -> None:
+        """A heading without '#', carriage returns, blank lines, a byte-order mark, no names of image files."""
+        for sensor in ("cam0", "imu0"):
+            file = asl / "mav0" / sensor / "data.csv"
+            rows = file.read_text().splitlines()[1:]
+            if sensor == "cam0":
+                rows = [row.split(",")[0] for row in rows]
+            file.write_bytes("\ufefftimestamp,rest\r\n\r\n".encode() + "\r\n".join(rows).encode())
+        assert_equal(EurocDataset(asl).measurements(), measurements())
+
+    def test_images_that_cannot_be_read_are_counted(self, asl: Path) -> None:
+        images = sorted((asl / "mav0" / "cam0" / "data").iterdir())
+        images[1].write_bytes(images[1].read_bytes()[:1000])
+        images[2].write_bytes(b"")
+        images[3].unlink()
+        dataset = EurocDataset(asl)
+        lost = [m for m in dataset.measurements() if isinstance(m, Unreadable)]
+        assert [m.t_ns for m in lost] == [int(image.stem) for image in images[1:4]]
+        assert [frame.t_ns for frame in frames_of(dataset)] == [int(images[i].stem) for i in (0, 4, 5)]
+        assert incidents_of(dataset)["frame_unreadable"] == 3
+
+    def test_imu_rows_that_cannot_be_read_are_counted(self, asl: Path) -> None:
+        file = asl / "mav0" / "imu0" / "data.csv"
+        lines = file.read_text().splitlines()
+        stamps = [line.split(",")[0] for line in lines]
+        lines[20] = f"{stamps[20]},0.1,0.2"
+        lines[30] = f"{stamps[30]},0.1,0.2,zero,0.1,0.2,0.3"
+        lines[40] = f"{stamps[40]},nan,0.2,0.3,0.1,0.2,0.3"
+        lines[50] = "garbage"
+        file.write_text("\n".join(lines))
+        counts = incidents_of(EurocDataset(asl))
+        assert counts == {"imu_unreadable": 3, "imu_nan": 1}
+
+    def test_disorder_is_left_to_synchronisation(self, asl: Path) -> None:
+        """Rows come in the order of the file, and one wild stamp does not hold up the rest."""
+        file = asl / "mav0" / "imu0" / "data.csv"
+        heading, *rows = file.read_text().splitlines()
+        rows[20], rows[21] = rows[21], rows[20]
+        rows.insert(30, rows[30])
+        rows.insert(40, "4000000000000000000,9,9,9,9,9,9")
+        rows.insert(50, "5,9,9,9,9,9,9")
+        file.write_text("\n".join([heading, *rows]))
+        dataset = EurocDataset(asl)
+        read = [m.t_ns for m in dataset.measurements() if isinstance(m, ImuSample)]
+        assert read == [int(row.split(",")[0]) for row in rows]
+        incidents = Incidents()
+        packets = list(synchronise(dataset.measurements(), incidents=incidents))
+        clean = list(synchronise(measurements(), incidents=Incidents()))
+        assert [frame.t_ns for _, frame in packets] == [frame.t_ns for _, frame in clean]
+        for (imu, _), (imu_clean, _) in zip(packets, clean, strict=True):
+            np.testing.assert_array_equal(imu.t_ns, imu_clean.t_ns)
+            np.testing.assert_array_equal(imu.gyro_B, imu_clean.gyro_B)
+        assert incidents.counts["imu_duplicate"] == 1
+        assert incidents.counts["imu_out_of_order"] == 3
+
+    def test_colour_images_become_gray(self, asl: Path) -> None:
+        colour = np.random.default_rng(1).integers(0, 256, (HEIGHT, WIDTH, 3), dtype=np.uint8)
+        for image in (asl / "mav0" / "cam0" / "data").iterdir():
+            cv2.imwrite(str(image), colour)
+        # ITU-R BT.601 weights, channels in OpenCV's order.
+        expected = colour @ np.array([0.114, 0.587, 0.299])
+        for frame in frames_of(EurocDataset(asl)):
+            assert np.abs(frame.image - expected).max() <= 0.51
+
+    def test_16_bit_images_need_their_depth(self, asl: Path) -> None:
+        deep = np.random.default_rng(1).integers(0, 4096, (HEIGHT, WIDTH), dtype=np.uint16)
+        for image in (asl / "mav0" / "cam0" / "data").iterdir():
+            cv2.imwrite(str(image), deep)
+        with pytest.raises(DatasetError, match=r"cam0 has 16-bit images; set the reader's option bit_depth"):
+            frames_of(EurocDataset(asl))
+        for frame in frames_of(EurocDataset(asl, bit_depth=12)):
+            np.testing.assert_array_equal(frame.image, deep // 16)
+        # Values above the stated depth saturate instead of wrapping round.
+        np.testing.assert_array_equal(frames_of(EurocDataset(asl, bit_depth=10))[0].image, np.minimum(deep // 4, 255))
+        with pytest.raises(DatasetError, match="bit_depth must lie between 8 and 16, not 7"):
+            EurocDataset(asl, bit_depth=7)
+
+    def test_images_of_another_size_than_calibrated(self, asl: Path) -> None:
+        for image in (asl / "mav0" / "cam0" / "data").iterdir():
+            cv2.imwrite(str(image), np.zeros((10, 20), np.uint8))
+        with pytest.raises(DatasetError, match=r"images of 20x10, but the calibration is for 64x48; name the right"):
+            frames_of(EurocDataset(asl))
+
+    def test_another_camera_and_calibration(self, asl: Path, tmp_path: Path) -> None:
+        shutil.copytree(asl / "mav0" / "cam0", asl / "mav0" / "cam1")
+        sensor = asl / "mav0" / "cam1" / "sensor.yaml"
+        sensor.write_text(sensor.read_text().replace("40.0", "44.0"))
+        assert EurocDataset(asl).calibration.camera.fx == 40.0
+        assert EurocDataset(asl, camera="cam1").calibration.camera.fx == 44.0
+        write_calibration(CALIBRATION, tmp_path / "other")
+        sensor = tmp_path / "other" / "cam0" / "sensor.yaml"
+        sensor.write_text(sensor.read_text().replace("40.0", "55.0"))
+        imu = tmp_path / "other" / "imu0" / "sensor.yaml"
+        assert EurocDataset(asl, calibration=tmp_path / "other").calibration.camera.fx == 55.0
+        assert EurocDataset(asl, calibration=[sensor, imu]).calibration.camera.fx == 55.0
+
+    def test_ground_truth(self, asl: Path) -> None:
+        folder = asl / "mav0" / "state_groundtruth_estimate0"
+        folder.mkdir()
+        heading = "#timestamp, p_RS_R_x [m], ..., b_a_RS_S_z [m s^-2]\n"
+        row = ",".join(map(str, [1.5, 2.5, 3.5, 1.0, 0.0, 0.0, 0.0, *range(9)]))
+        (folder / "data.csv").write_text(heading + f"{T0_NS},{row}\n{T0_NS + 5_000_064},{row}\n")
+        truth = EurocDataset(asl).ground_truth
+        assert truth is not None
+        assert truth.t_ns.tolist() == [T0_NS, T0_NS + 5_000_064]
+
+    def test_what_is_wrong_with_a_folder_is_said(self, asl: Path, tmp_path: Path) -> None:
+        with pytest.raises(DatasetError, match=r"is not a folder"):
+            EurocDataset(tmp_path / "nowhere")
+        (tmp_path / "empty").mkdir()
+        assert not EurocDataset.accepts(tmp_path / "empty")
+        with pytest.raises(DatasetError, match=r"empty holds no mav0/; name the folder of one sequence"):
+            EurocDataset(tmp_path / "empty")
+        with pytest.raises(DatasetError, match=r"cam1/data.csv is missing; choose camera and imu among: cam0, imu0"):
+            EurocDataset(asl, camera="cam1")
+        mav0 = asl / "mav0"
+        (mav0 / "imu0" / "sensor.yaml").rename(mav0 / "imu0" / "sensor.txt")
+        with pytest.raises(CalibrationError, match=r"imu0/sensor.yaml: No such file"):
+            EurocDataset(asl)
+        (mav0 / "imu0" / "sensor.txt").rename(mav0 / "imu0" / "sensor.yaml")
+        heading, *rows = (mav0 / "imu0" / "data.csv").read_text().splitlines()
+        (mav0 / "imu0" / "data.csv").write_text(heading)
+        with pytest.raises(DatasetError, match=r"imu0/data.csv holds no sample"):
+            EurocDataset(asl)
+        (mav0 / "imu0" / "data.csv").write_text("\n".join(rows))
+        (mav0 / "cam0" / "data.csv").write_text("#heading\n")
+        with pytest.raises(DatasetError, match=r"cam0/data.csv lists no image"):
+            EurocDataset(asl)
+        (mav0 / "cam0" / "data.csv").write_text("#heading\n1.4e18,a.png\n")
+        with pytest.raises(DatasetError, match=r"'1.4e18,a.png' does not begin with a stamp in integer nanoseconds"):
+            EurocDataset(asl)
+        (mav0 / "imu0" / "data.csv").unlink()
+        with pytest.raises(DatasetError, match=r"imu0/data.csv is missing; choose camera and imu among: cam0"):
+            EurocDataset(asl)
+
+
+ROS_FORMATS = pytest.mark.parametrize(
+    ("name", "compression"),
+    [
+        ("flight.bag", None),
+        ("flight.bag", "bz2"),
+        ("flight.bag", "lz4"),
+        ("flight.ros2", None),
+        ("flight.ros2", "zstd"),
+        ("flight.mcap", None),
+        ("flight.mcap", "zstd"),
+    ],
+)
+
+IMAGE = np.random.default_rng(2).integers(0, 256, (HEIGHT, WIDTH), dtype=np.uint8)
+IMU = [imu_message("/imu0", ImuSample(T0_NS + i, np.ones(3), np.ones(3))) for i in range(3)]
+
+
+def bag_with(folder: Path, *messages: Message, calibrated: bool = True) -> Path:
+    """A bag of these messages and three of the IMU."""
+    path = write_bag(folder / "test.bag", [*IMU, *messages])
+    if calibrated:
+        write_calibration(CALIBRATION, sidecar_folder(path))
+    return path
+
+
+class TestRosbag:
+    @ROS_FORMATS
+    def test_everything_comes_out_exactly(self, tmp_path: Path, name: str, compression: str | None) -> None:
+        path = tmp_path / name
+        convert(measurements(), CALIBRATION, path, compression=compression)
+        assert RosbagDataset.accepts(path)
+        assert not EurocDataset.accepts(path)
+        dataset = RosbagDataset(path)
+        assert isinstance(dataset, Dataset)
+        assert (dataset.frame_count, dataset.ground_truth) == (6, None)
+        assert dataset.name == ("flight.ros2" if path.is_dir() else "flight")
+        assert dataset.calibration.camera == CALIBRATION.camera
+        assert dataset.calibration.time_offset_ns == CALIBRATION.time_offset_ns
+        assert_equal(dataset.measurements(), measurements())
+        assert_equal(dataset.measurements(), measurements())
+
+    def test_a_bare_sqlite_file(self, tmp_path: Path) -> None:
+        convert(measurements(), CALIBRATION, tmp_path / "flight.ros2")
+        file = tmp_path / "flight.ros2" / "flight.ros2.db3"
+        assert RosbagDataset.accepts(file)
+        assert_equal(RosbagDataset(file, calibration=tmp_path / "flight.ros2.calib").measurements(), measurements())
+
+    @ROS_FORMATS
+    @pytest.mark.parametrize("kept", [0.0, 0.001, 0.1, 0.5, 0.9, 0.9999])
+    def test_a_truncated_recording(self, tmp_path: Path, name: str, compression: str | None, kept: float) -> None:
+        path = tmp_path / name
+        convert(measurements(), CALIBRATION, path, compression=compression)
+        file = path / f"{name}.db3" if path.is_dir() else path
+        data = file.read_bytes()
+        file.write_bytes(data[: int(len(data) * kept)])
+        with pytest.raises(DatasetError, match=r"cannot read .*flight.*; if it is truncated") as caught:
+            list(RosbagDataset(path).measurements())
+        command = {".bag": "`rosbag reindex`", ".mcap": "`mcap recover`", ".ros2": "`ros2 bag reindex`"}[path.suffix]
+        assert command in one_line(caught)
+
+    def test_a_bag_that_was_not_closed(self, bag: Path) -> None:
+        data = bytearray(bag.read_bytes())
+        at = data.index(b"index_pos=") + len(b"index_pos=")
+        data[at : at + 8] = bytes(8)
+        bag.write_bytes(data)
+        with pytest.raises(DatasetError, match=r"not indexed.*; if .* run `rosbag reindex`") as caught:
+            RosbagDataset(bag)
+        one_line(caught)
+
+    def test_damage_further_on_leaves_what_came_before(self, tmp_path: Path) -> None:
+        path = tmp_path / "flight.bag"
+        source = measurements(frame_count=40, size=(480, 640))
+        calibration = replace(CALIBRATION, camera=replace(CALIBRATION.camera, resolution=(640, 480)))
+        convert(source, calibration, path, compression="bz2")
+        data = bytearray(path.read_bytes())
+        # Ten chunks of four images: this is in the middle of the sixth.
+        place = len(data) * 55 // 100
+        data[place : place + 1000] = bytes(1000)
+        path.write_bytes(data)
+        read: list[Measurement] = []
+        with pytest.raises(DatasetError, match="cannot read") as caught:
+            read.extend(RosbagDataset(path).measurements())
+        one_line(caught)
+        assert 16 <= sum(isinstance(m, Frame) for m in read) <= 24
+        assert_equal(read, source[: len(read)])
+
+    @pytest.mark.parametrize("suffix", [".bag", ".db3", ".mcap"])
+    def test_a_file_that_is_something_else(self, tmp_path: Path, suffix: str) -> None:
+        path = tmp_path / f"song{suffix}"
+        path.write_bytes(b"ID3 this is no recording" * 100)
+        with pytest.raises(DatasetError, match="cannot read") as caught:
+            RosbagDataset(path)
+        one_line(caught)
+        path.write_bytes(b"")
+        with pytest.raises(DatasetError, match="cannot read"):
+            RosbagDataset(path)
+
+    def test_missing_files(self, tmp_path: Path) -> None:
+        with pytest.raises(DatasetError, match=r"nowhere.bag does not exist"):
+            RosbagDataset(tmp_path / "nowhere.bag")
+        convert(measurements(), CALIBRATION, tmp_path / "flight.ros2")
+        (tmp_path / "flight.ros2" / "metadata.yaml").unlink()
+        assert RosbagDataset.accepts(tmp_path / "flight.ros2")
+        with pytest.raises(DatasetError, match=r"metadata.*`ros2 bag reindex`") as caught:
+            RosbagDataset(tmp_path / "flight.ros2")
+        one_line(caught)
+        assert not RosbagDataset.accepts(tmp_path)
+
+    def test_no_camera_or_no_imu(self, tmp_path: Path) -> None:
+        with pytest.raises(DatasetError, match=r"has no camera messages .*; its topics: /imu0") as caught:
+            RosbagDataset(bag_with(tmp_path))
+        one_line(caught)
+        path = write_bag(tmp_path / "blind.bag", [image_message("/cam0/image_raw", T0_NS, IMAGE, "mono8")])
+        with pytest.raises(DatasetError, match=r"has no IMU messages .*; its topics: /cam0/image_raw") as caught:
+            RosbagDataset(path)
+        one_line(caught)
+
+    def test_stamps_are_those_of_the_headers(self, tmp_path: Path) -> None:
+        """Images reach the recorder 30 ms late; what counts is when they were taken."""
+        source = measurements()
+        messages = [
+            imu_message("/imu0", m, recorded_ns=m.t_ns + 1_000_000)
+            if isinstance(m, ImuSample)
+            else image_message("/cam0/image_raw", m.t_ns, m.image, "mono8", recorded_ns=m.t_ns + 30_000_000)
+            for m in source
+            if not isinstance(m, Unreadable)
+        ]
+        path = write_bag(tmp_path / "late.bag", messages)
+        write_calibration(CALIBRATION, sidecar_folder(path))
+        read = list(RosbagDataset(path).measurements())
+        assert [m.t_ns for m in read] != sorted(m.t_ns for m in read)
+        assert_equal(sorted(read, key=lambda m: m.t_ns), source)
+        packets = list(synchronise(read, incidents=(incidents := Incidents())))
+        assert len(packets) == 6
+        assert not incidents.counts
+        for (imu, _), (expected, _) in zip(packets, synchronise(source, incidents=Incidents()), strict=True):
+            np.testing.assert_array_equal(imu.t_ns, expected.t_ns)
+            np.testing.assert_array_equal(imu.accel_B, expected.accel_B)
+
+    @pytest.mark.parametrize("padding", [0, 16])
+    @pytest.mark.parametrize("encoding", ["mono8", "8UC1"])
+    def test_gray_images_with_and_without_padding(self, tmp_path: Path, encoding: str, padding: int) -> None:
+        path = bag_with(tmp_path, image_message("/cam0/image_raw", T0_NS, IMAGE, encoding, padding))
+        np.testing.assert_array_equal(frames_of(RosbagDataset(path))[0].image, IMAGE)
+
+    @pytest.mark.parametrize("padding", [0, 16])
+    @pytest.mark.parametrize(("encoding", "channels"), [("bgr8", 3), ("rgb8", 3), ("bgra8", 4), ("rgba8", 4)])
+    def test_colour_images(self, tmp_path: Path, encoding: str, channels: int, padding: int) -> None:
+        colour = np.random.default_rng(3).integers(0, 256, (HEIGHT, WIDTH, channels), dtype=np.uint8)
+        path = bag_with(tmp_path, image_message("/camera/color", T0_NS, colour, encoding, padding))
+        weights = np.array([0.299, 0.587, 0.114] if encoding.startswith("r") else [0.114, 0.587, 0.299])
+        image = frames_of(RosbagDataset(path))[0].image
+        assert np.abs(image - colour[:, :, :3] @ weights).max() <= 0.51
+
+    @pytest.mark.parametrize("encoding", ["bayer_rggb8", "bayer_bggr8", "bayer_gbrg8", "bayer_grbg8"])
+    def test_bayer_images(self, tmp_path: Path, encoding: str) -> None:
+        """A pure red scene is equally dark everywhere once demosaicked, wherever its red pixels lie."""
+        place = encoding.removeprefix("bayer_").removesuffix("8").index("r")
+        mosaic = np.zeros((HEIGHT, WIDTH), np.uint8)
+        mosaic[place // 2 :: 2, place % 2 :: 2] = 200
+        path = bag_with(tmp_path, image_message("/camera/raw", T0_NS, mosaic, encoding))
+        image = frames_of(RosbagDataset(path))[0].image
+        assert np.abs(image[4:-4, 4:-4] - 0.299 * 200).max() <= 1.0
+
+    def test_compressed_images(self, tmp_path: Path) -> None:
+        gray = compressed_message("/cam0/compressed", T0_NS, cv2.imencode(".png", IMAGE)[1].tobytes())
+        colour = np.random.default_rng(4).integers(0, 256, (HEIGHT, WIDTH, 3), dtype=np.uint8)
+        messages = [
+            gray,
+            compressed_message("/cam0/compressed", T0_NS + 1, cv2.imencode(".png", colour)[1].tobytes()),
+            compressed_message("/cam0/compressed", T0_NS + 2, cv2.imencode(".jpg", IMAGE)[1].tobytes()),
+            compressed_message("/cam0/compressed", T0_NS + 3, cv2.imencode(".png", IMAGE)[1].tobytes()[:500]),
+        ]
+        dataset = RosbagDataset(bag_with(tmp_path, *messages))
+        first, second, third = frames_of(dataset)
+        np.testing.assert_array_equal(first.image, IMAGE)
+        assert np.abs(second.image - colour @ np.array([0.114, 0.587, 0.299])).max() <= 0.51
+        assert third.image.shape == IMAGE.shape
+        assert [m.t_ns for m in dataset.measurements() if isinstance(m, Unreadable)] == [T0_NS + 3]
+
+    def test_16_bit_images_need_their_depth(self, tmp_path: Path) -> None:
+        deep = np.random.default_rng(5).integers(0, 4096, (HEIGHT, WIDTH), dtype=np.uint16)
+        path = bag_with(tmp_path, image_message("/cam0/image_raw", T0_NS, deep, "mono16", padding=6))
+        with pytest.raises(DatasetError, match=r"image_raw\] has 16-bit images; set the reader's option bit_depth"):
+            RosbagDataset(path)
+        np.testing.assert_array_equal(frames_of(RosbagDataset(path, bit_depth=12))[0].image, deep // 16)
+
+    @pytest.mark.parametrize("encoding", ["32FC1", "8UC3", "unheard of"])
+    def test_other_encodings_are_refused(self, tmp_path: Path, encoding: str) -> None:
+        pixels = np.zeros((HEIGHT, WIDTH, 4), np.uint8)
+        path = bag_with(tmp_path, image_message("/cam0/image_raw", T0_NS, pixels, encoding))
+        with pytest.raises(DatasetError, match=r"is not supported; convert the images to mono8") as caught:
+            RosbagDataset(path)
+        one_line(caught)
+
+    def test_images_with_missing_pixels_are_counted(self, tmp_path: Path) -> None:
+        whole = [image_message("/cam0/image_raw", T0_NS + i, IMAGE, "mono8") for i in range(3)]
+        whole[1].fields["data"] = whole[1].fields["data"][:-1]
+        dataset = RosbagDataset(bag_with(tmp_path, *whole))
+        assert [frame.t_ns for frame in frames_of(dataset)] == [T0_NS, T0_NS + 2]
+        whole[0].fields["step"] = 1
+        whole[2].fields["step"] = 1
+        (tmp_path / "test.bag").unlink()
+        with pytest.raises(DatasetError, match=r"no image of /cam0/image_raw can be read"):
+            RosbagDataset(bag_with(tmp_path, *whole))
+
+    def test_images_of_another_size_than_calibrated(self, tmp_path: Path) -> None:
+        other = np.zeros((10, 20), np.uint8)
+        path = bag_with(tmp_path, image_message("/cam0/image_raw", T0_NS, other, "mono8"))
+        with pytest.raises(DatasetError, match=r"image_raw\] has images of 20x10, but the calibration is for 64x48"):
+            RosbagDataset(path)
+
+    def test_a_size_that_changes_on_the_way(self, tmp_path: Path) -> None:
+        other = image_message("/cam0/image_raw", T0_NS + 9, np.zeros((10, 20), np.uint8), "mono8")
+        path = bag_with(tmp_path, image_message("/cam0/image_raw", T0_NS, IMAGE, "mono8"), other)
+        with pytest.raises(DatasetError, match=r"has images of 20x10"):
+            list(RosbagDataset(path).measurements())
+
+    def test_choice_of_topics(self, tmp_path: Path) -> None:
+        images = {
+            "/cam1/image_raw": IMAGE + 1,
+            "/cam0/image_raw": IMAGE,
+            "/stereo/right": IMAGE + 2,
+        }
+        png = cv2.imencode(".png", IMAGE + 3)[1].tobytes()
+        path = bag_with(
+            tmp_path,
+            *(image_message(topic, T0_NS, image, "mono8") for topic, image in images.items()),
+            compressed_message("/cam0/a_compressed", T0_NS, png),
+            imu_message("/other_imu", ImuSample(T0_NS, np.zeros(3), np.zeros(3))),
+            Message("/leica/position", "geometry_msgs/msg/PointStamped", T0_NS, {"point": _point()}),
+        )
+
+        def image(**options: str) -> np.ndarray:
+            return frames_of(RosbagDataset(path, **options))[0].image
+
+        np.testing.assert_array_equal(image(), IMAGE)
+        np.testing.assert_array_equal(image(camera_topic="/stereo/right"), IMAGE + 2)
+        np.testing.assert_array_equal(image(camera_topic="/cam0/a_compressed"), IMAGE + 3)
+        calibration = sidecar_folder(path)
+        shutil.copytree(calibration / "cam0", calibration / "cam1")
+        np.testing.assert_array_equal(image(camera="cam1"), IMAGE + 1)
+        np.testing.assert_array_equal(image(camera="cam1", camera_topic="/stereo/right"), IMAGE + 2)
+        with pytest.raises(CalibrationError, match=r"describes no camera '/stereo/right'; choose one of: cam0, cam1"):
+            image(camera_topic="/stereo/right")
+        samples = [m for m in RosbagDataset(path, imu_topic="/other_imu").measurements() if isinstance(m, ImuSample)]
+        assert [m.t_ns for m in samples] == [T0_NS]
+        with pytest.raises(DatasetError, match=r"no IMU messages on /imu9; its IMU topics: /imu0, /other_imu"):
+            image(imu_topic="/imu9")
+        with pytest.raises(DatasetError, match=r"no camera messages on /cam9; its camera topics: /cam0/image_raw, "):
+            image(camera_topic="/cam9")
+        assert RosbagDataset(path).ground_truth is None
+
+
+def _point() -> object:
+    from rosbags.typesys import Stores, get_typestore
+
+    return get_typestore(Stores.ROS1_NOETIC).types["geometry_msgs/msg/Point"](x=1.0, y=2.0, z=3.0)
+
+
+class TestCalibrationOfABag:
+    def euroc_like(self, folder: Path, topic: str = "/cam0/image_raw", width: int = 752) -> Path:
+        image = image_message(topic, T0_NS, np.zeros((480, width), np.uint8), "mono8")
+        return bag_with(folder, image, calibrated=False)
+
+    @pytest.mark.parametrize("camera", ["cam0", "cam1"])
+    def test_a_bag_like_eurocs_gets_the_packaged_one_with_a_notice(
+        self, tmp_path: Path, caplog: pytest.LogCaptureFixture, camera: str
+    ) -> None:
+        dataset = RosbagDataset(self.euroc_like(tmp_path, f"/{camera}/image_raw"))
+        assert dataset.calibration.camera == packaged_calibration("euroc", camera).camera
+        (record,) = caplog.records
+        assert (record.name, record.levelno) == ("vioframe.rosbag", logging.WARNING)
+        assert f"using EuRoC's published calibration of {camera}" in record.getMessage()
+
+    def test_any_other_bag_needs_one(self, tmp_path: Path) -> None:
+        for options in ({"topic": "/camera/image_raw"}, {"width": 640}):
+            path = self.euroc_like(tmp_path, **options)
+            with pytest.raises(
+                DatasetError, match=r"brings no calibration; name its files .* or put them in"
+            ) as caught:
+                RosbagDataset(path)
+            one_line(caught)
+            path.unlink()
+
+    def test_the_sidecar_comes_before_the_packaged_one_and_the_option_before_both(
+        self, tmp_path: Path, caplog: pytest.LogCaptureFixture
+    ) -> None:
+        path = self.euroc_like(tmp_path)
+        for folder, fx in ((sidecar_folder(path), "500.0"), (tmp_path / "option", "600.0")):
+            write_calibration(packaged_calibration("euroc"), folder)
+            sensor = folder / "cam0" / "sensor.yaml"
+            sensor.write_text(sensor.read_text().replace("458.654", fx))
+        assert RosbagDataset(path).calibration.camera.fx == 500.0
+        assert RosbagDataset(path, calibration=tmp_path / "option").calibration.camera.fx == 600.0
+        files = [tmp_path / "option" / "cam0" / "sensor.yaml", tmp_path / "option" / "imu0" / "sensor.yaml"]
+        assert RosbagDataset(path, calibration=files).calibration.camera.fx == 600.0
+        assert not caplog.records
+
+
+def test_the_real_recordings(shared_data: Path) -> None:
+    moving = EurocDataset(shared_data / "euroc" / "MH_01_easy_15s")
+    assert (moving.name, moving.frame_count) == ("MH_01_easy_15s", 300)
+    assert incidents_of(moving) == {}
+    truth = moving.ground_truth
+    assert truth is not None
+    assert len(truth.t_ns) == 3111
+    resting = EurocDataset(shared_data / "euroc" / "V1_01_easy_rest" / "mav0")
+    packets = list(synchronise(resting.measurements(), incidents=Incidents()))
+    assert len(packets) == resting.frame_count == 95
+    imu, frame = packets[-1]
+    assert frame.image.shape == (480, 752)
+    # Every frame of EuRoC falls on an IMU sample: eleven stamps, both ends included.
+    assert len(imu.t_ns) == 11
+    assert np.linalg.norm(imu.accel_B.mean(axis=0)) == pytest.approx(9.81, abs=0.2)
