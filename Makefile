@@ -1,0 +1,63 @@
+# Everything on a fresh Debian or Ubuntu machine with Python >= 3.11, make and a compiler:
+#   make demo   set up, then the main job: recording -> bag -> run -> evaluation and plots
+#   make test   set up, then lint, types and all tests
+PYTHON ?= $(shell for p in python3 python3.13 python3.12 python3.11 python; do \
+	$$p -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null && echo $$p && break; done)
+VENV := .venv
+BIN := $(VENV)/bin
+INSTALLED := $(VENV)/.installed
+CODE := vioframe plugins tests docs/example-plugin
+
+RECORDING ?= ../shared/data/euroc/MH_01_easy_15s
+DEMO := build/demo
+
+# What Open3D's wheel needs from the system.
+SYSTEM_LIBRARIES := libusb-1.0-0 libgl1 libgomp1 libx11-6 libegl1
+
+export OMP_NUM_THREADS := 1
+export OPENBLAS_NUM_THREADS := 1
+
+.PHONY: demo test test-fast lint install system-libraries clean
+
+test: lint
+	$(BIN)/pytest -n 2
+
+test-fast: lint
+	$(BIN)/pytest -n 2 -m "not slow"
+
+lint: install
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+demo: install
+	@test -d $(RECORDING)/mav0 || { echo "make demo: there is no recording at $(RECORDING);" \
+		"name a EuRoC sequence in ASL layout: make demo RECORDING=path/to/MH_05_difficult"; exit 2; }
+	@mkdir -p $(DEMO) && rm -f $(DEMO)/recording.bag
+	$(BIN)/vioframe convert $(RECORDING) $(DEMO)/recording.bag
+	$(BIN)/vioframe run $(DEMO)/recording.bag --detector shi_tomasi --backend msckf \
+		--ground-truth $(RECORDING)/mav0/state_groundtruth_estimate0/data.csv --out $(DEMO)/run --overwrite
+	$(BIN)/vioframe evaluate $(DEMO)/run
+	$(BIN)/vioframe plot $(DEMO)/run
+
+install: $(INSTALLED) system-libraries
+
+$(INSTALLED): pyproject.toml constraints.txt
+	@test -n "$(PYTHON)" || { echo "vioframe needs Python 3.11 or newer: make PYTHON=/path/to/python3.11"; exit 2; }
+	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV) || { rm -rf $(VENV); \
+		echo "cannot create $(VENV); on Debian or Ubuntu: apt-get install python3-venv"; exit 2; }
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable ".[test,open3d]"
+	@touch $@
+
+# Only the 3-D views need these, so what cannot be installed is said and not fatal.
+system-libraries:
+	@command -v dpkg >/dev/null || exit 0; \
+	missing=""; for library in $(SYSTEM_LIBRARIES); do \
+		dpkg -s $$library >/dev/null 2>&1 || missing="$$missing $$library"; done; \
+	test -z "$$missing" && exit 0; \
+	command="apt-get update && apt-get install -y --no-install-recommends$$missing"; \
+	if [ "$$(id -u)" = 0 ] && sh -c "$$command" >/dev/null 2>&1; then echo "installed:$$missing"; \
+	else echo "Open3D's 3-D views need system libraries: sudo sh -c '$$command'"; fi
+
+clean:
+	rm -rf build .mypy_cache .pytest_cache .ruff_cache
