@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from dataclasses import dataclass
 from itertools import pairwise
-from time import perf_counter
+from time import perf_counter, thread_time
 
 import numpy as np
 
@@ -20,11 +20,16 @@ _POSE = DP.stop  # [dtheta dp] come first in the error state
 
 @dataclass(frozen=True)
 class BackendRun:
-    """What a back-end said after each packet, and how long each took it: ``t_ns``, ``estimates``, ``seconds`` (N,)."""
+    """What a back-end said after each packet: ``t_ns`` and ``estimates`` (N,), and how long each took it.
+
+    ``seconds`` (N,) are those of the clock, ``cpu_seconds`` (N,) those the thread was computing: on a machine that is busy
+    with other things the first are longer.
+    """
 
     t_ns: tuple[int, ...]
     estimates: tuple[Estimate, ...]
     seconds: Float
+    cpu_seconds: Float
 
     @property
     def states(self) -> tuple[NavState, ...]:
@@ -79,10 +84,11 @@ class BackendRun:
 
 def run_backend(sequence: TrackSequence, backend: Backend) -> BackendRun:
     """Feed every packet of ``sequence`` to ``backend`` in order."""
-    estimates, seconds = [], []
+    estimates, seconds, cpu_seconds = [], [], []
     for imu, tracks in sequence.packets:
-        begin = perf_counter()
+        begin, cpu_begin = perf_counter(), thread_time()
         estimates.append(backend.process(imu, tracks))
         seconds.append(perf_counter() - begin)
+        cpu_seconds.append(thread_time() - cpu_begin)
     stamps = tuple(tracks.t_ns for _, tracks in sequence.packets)
-    return BackendRun(stamps, tuple(estimates), np.array(seconds))
+    return BackendRun(stamps, tuple(estimates), np.array(seconds), np.array(cpu_seconds))

@@ -1,0 +1,96 @@
+"""What the benchmark scripts share: their options, running back-ends on tracks, and what is printed and kept."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from functools import wraps
+from pathlib import Path
+from typing import Any
+
+import click
+from rich.console import Console
+from threadpoolctl import threadpool_limits
+
+from vioframe import config as configuration
+from vioframe import registry
+from vioframe.bench import Row, backend_row, record, run_backend, table
+from vioframe.config import Config, PartConfig
+from vioframe.errors import VioframeError
+from vioframe.simulation import TrackSequence
+
+HERE = Path(__file__).resolve().parent
+SHARED_DATA = HERE.parents[1] / "shared" / "data"
+
+BACKEND_COLUMNS = {
+    "sequence": "",
+    "seed": "",
+    "path_m": ".1f",
+    "ate_m": ".4f",
+    "percent": ".3f",
+    "scale": ".4f",
+    "yaw_deg": ".2f",
+    "initialised_s": ".2f",
+    "completion": ".1%",
+    "resets": "d",
+    "cpu_ms": ".2f",
+    "stage_ms.total": ".2f",
+}
+
+
+def benchmark(command: Callable[..., None]) -> click.Command:
+    """A script with the options all of them have; a :class:`VioframeError` becomes one line and exit code 2."""
+
+    @wraps(command)
+    def checked(**arguments: Any) -> None:
+        try:
+            # Small matrices: more threads only wait for one another.
+            with threadpool_limits(1):
+                command(**arguments)
+        except VioframeError as error:
+            click.echo(f"error: {error}", err=True)
+            sys.exit(2)
+
+    for option in (
+        click.option("--record", "keep", is_flag=True, help="Write the results to benchmarks/results."),
+        click.option("-o", "--option", "assignments", multiple=True, metavar="KEY=VALUE", help="Set a part's option."),
+        click.option("--backend", default="msckf", show_default=True, help="Back-end to run."),
+        click.option(
+            "--data",
+            type=click.Path(exists=True, file_okay=False, path_type=Path),
+            default=SHARED_DATA,
+            help="Folder of the recordings.  [default: ../shared/data]",
+        ),
+    ):
+        checked = option(checked)
+    return click.command()(checked)
+
+
+def backend_rows(
+    sequences: Iterable[tuple[Row, TrackSequence]], backend: str, assignments: Sequence[str]
+) -> Iterator[Row]:
+    """A row for each sequence, with the values that come with it first."""
+    installed = registry.load()
+    config = configuration.override(Config(backend=PartConfig(name=backend)), installed, assignments)
+    for about, sequence in sequences:
+        estimator = installed.create_backend(backend, sequence.calibration, config.backend.options)
+        yield {**about, **backend_row(sequence, run_backend(sequence, estimator))}
+
+
+def present(
+    name: str, title: str, rows: Iterable[Row], columns: Mapping[str, str], settings: Mapping[str, Any], keep: bool
+) -> None:
+    """Print the table, and write ``results/NAME.json`` if asked to."""
+    console = Console()
+    if not console.is_terminal:
+        console = Console(width=140)  # a file or pipe has no width of its own
+    done = []
+    with console.status(f"{name} ...") as status:
+        for row in rows:
+            done.append(row)
+            status.update(f"{name}: {len(done)} done")
+    console.print(table(title, done, columns))
+    if keep:
+        path = HERE / "results" / f"{name}.json"
+        record(path, done, settings)
+        console.print(f"written to {path.relative_to(HERE.parent)}")
