@@ -109,27 +109,20 @@ def _appearing(destination: Path) -> Iterator[Path]:
     if destination.exists():
         raise DatasetError(f"{destination} exists already; remove it or choose another name")
     workspace = destination.with_name(f".{destination.name}.unfinished")
-    _remove(workspace)
     try:
+        shutil.rmtree(workspace, ignore_errors=True)
         workspace.mkdir(parents=True)
         yield workspace / destination.name
         (workspace / destination.name).rename(destination)
     except OSError as err:
         raise DatasetError(f"cannot write {destination}: {err.strerror or err}") from err
     finally:
-        _remove(workspace)
+        shutil.rmtree(workspace, ignore_errors=True)
 
 
 def _replace_sidecar(calibration: Calibration, destination: Path) -> None:
     """Written before the recording appears, so that none ever stands without its calibration."""
     sidecar = sidecar_folder(destination)
-    _remove(sidecar)
+    shutil.rmtree(sidecar, ignore_errors=True)
     with _appearing(sidecar) as unfinished:
         write_calibration(calibration, unfinished)
-
-
-def _remove(path: Path) -> None:
-    if path.is_dir():
-        shutil.rmtree(path)
-    else:
-        path.unlink(missing_ok=True)

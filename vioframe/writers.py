@@ -85,8 +85,9 @@ class _RosWriter:
         self._header_extra = header_extra
         self._recorded_ns = 0
         bag.open()
-        self._camera = bag.add_connection(CAMERA_TOPIC, _IMAGE, typestore=store)
+        # rosbags reads messages of the same time in the order of their topics: the IMU first, as from an ASL folder.
         self._imu = bag.add_connection(IMU_TOPIC, _IMU, typestore=store)
+        self._camera = bag.add_connection(CAMERA_TOPIC, _IMAGE, typestore=store)
 
     def __enter__(self) -> Self:
         return self
