@@ -49,7 +49,7 @@ def backend_row(sequence: TrackSequence, run: BackendRun) -> Row:
 
 
 def table(title: str, rows: Sequence[Row], columns: Mapping[str, str]) -> Table:
-    """A rich table; ``columns`` maps keys (``stage_ms.total`` reaches into a nested one) to how values are formatted."""
+    """A rich table; ``columns`` maps keys (``stage_ms.total`` reaches into ``stage_ms``) to format specifications."""
     from rich.table import Table
 
     out = Table(title=title)

@@ -22,8 +22,8 @@ _POSE = DP.stop  # [dtheta dp] come first in the error state
 class BackendRun:
     """What a back-end said after each packet: ``t_ns`` and ``estimates`` (N,), and how long each took it.
 
-    ``seconds`` (N,) are those of the clock, ``cpu_seconds`` (N,) those the thread was computing: on a machine that is busy
-    with other things the first are longer.
+    ``seconds`` (N,) are those of the clock, ``cpu_seconds`` (N,) those the thread was computing: on a machine that is
+    busy with other things the first are longer.
     """
 
     t_ns: tuple[int, ...]

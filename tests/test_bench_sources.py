@@ -1,0 +1,208 @@
+"""Track sources of the benchmarks, and what is made of a back-end's run on them."""
+
+import json
+
+import numpy as np
+import pytest
+
+from vioframe.bench import backend_row, record, run_backend, table
+from vioframe.bench.april import (
+    BoardView,
+    april_sequence,
+    board_poses,
+    corner_count,
+    read_board_views,
+    reprojection_px,
+)
+from vioframe.bench.gravity import gravity_in_frame, rotation_to_vertical
+from vioframe.calibration import packaged_calibration
+from vioframe.errors import DatasetError, TrajectoryError
+from vioframe.geometry import so3
+from vioframe.simulation import simulated_sequence
+from vioframe.trajectory import Trajectory
+from vioframe.types import Estimate, NavState, Status, g_W
+
+CALIBRATION = packaged_calibration("euroc")
+
+
+@pytest.fixture(scope="module")
+def april(shared_data):
+    return shared_data / "euroc_imu_april"
+
+
+@pytest.fixture(scope="module")
+def april_tracks(april):
+    return april_sequence(april)
+
+
+def rows_of(segments):
+    """Stamps, gyroscope and accelerometer of all segments in one, without the ends that neighbours share."""
+    parts = [(s.t_ns[:-1], s.gyro_B[:-1], s.accel_B[:-1]) for s in segments]
+    return tuple(np.concatenate(column) for column in zip(*parts, strict=True))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_gravity_is_found_in_a_turned_frame(seed):
+    """Exact poses in an arbitrary frame A, noisy and biased readings: down to 0.1 deg, which the bias alone would break."""
+    bias = np.array([0.2, -0.1, 0.15])
+    sequence = simulated_sequence("figure_eight", seed=seed, max_points=1, bias_accel_B=bias)
+    R_AW = so3.exp(np.random.default_rng(seed).normal(size=3))
+    truth = sequence.ground_truth
+    in_A = Trajectory(truth.t_ns, R_AW @ truth.R_WB, truth.p_WB @ R_AW.T)
+    t_ns, _, accel_B = rows_of([imu for imu, _ in sequence.packets[1:]])
+    g_A = gravity_in_frame(in_A, t_ns, accel_B)
+    assert np.linalg.norm(g_A) == pytest.approx(9.81, abs=0.03)
+    assert np.degrees(np.arccos(g_A @ (R_AW @ g_W) / np.linalg.norm(g_A) / 9.81)) < 0.1
+    np.testing.assert_allclose(rotation_to_vertical(g_A) @ g_A, [0, 0, -np.linalg.norm(g_A)], atol=1e-12)
+
+
+def test_gravity_needs_some_motion():
+    sequence = simulated_sequence("hover", duration_s=1.5, max_points=1)
+    t_ns, _, accel_B = rows_of([imu for imu, _ in sequence.packets[1:]])
+    with pytest.raises(TrajectoryError, match="2 s"):
+        gravity_in_frame(sequence.ground_truth, t_ns, accel_B)
+
+
+@pytest.mark.parametrize("g_A", [[0.0, 0.0, -9.81], [0.0, 0.0, 9.81], [9.81, 0.0, 0.0]])
+def test_any_direction_can_be_brought_to_the_vertical(g_A):
+    R_WA = rotation_to_vertical(np.array(g_A))
+    np.testing.assert_allclose(R_WA @ g_A, g_W, atol=1e-12)
+    np.testing.assert_allclose(R_WA @ R_WA.T, np.eye(3), atol=1e-12)
+
+
+def test_board_poses_recover_a_known_camera():
+    """A synthetic board, seen without noise and with 0.3 px: exact, and within a few millimetres at 1.2 m."""
+    rng = np.random.default_rng(0)
+    p_A = np.column_stack(
+        [np.stack(np.meshgrid(np.arange(12), np.arange(12)), -1).reshape(-1, 2) * 0.06, np.zeros(144)]
+    )
+    views, R_true, p_true = [], [], []
+    for k in range(20):
+        # Looking at the board's centre from its front, tilted by up to 30 deg.
+        R_AC = so3.exp(rng.uniform(-0.5, 0.5, 3))
+        p_AC = np.array([0.33, 0.33, 0.0]) - R_AC @ [0.0, 0.0, 1.2]
+        xy = CALIBRATION.camera.project((p_A - p_AC) @ R_AC)
+        keep = CALIBRATION.camera.contains(xy)
+        views.append(BoardView(k, np.flatnonzero(keep), xy[keep], p_A[keep]))
+        R_true.append(R_AC)
+        p_true.append(p_AC)
+    R_AC, p_AC = board_poses(views, CALIBRATION.camera)
+    np.testing.assert_allclose(R_AC, R_true, atol=1e-6)
+    np.testing.assert_allclose(p_AC, p_true, atol=1e-6)
+    noisy = [BoardView(v.t_ns, v.corner, v.xy + rng.normal(0, 0.3, v.xy.shape), v.p_A) for v in views]
+    R_AC, p_AC = board_poses(noisy, CALIBRATION.camera)
+    assert np.linalg.norm(p_AC - p_true, axis=1).max() < 5e-3
+    assert np.sqrt(np.mean(reprojection_px(noisy, CALIBRATION.camera, R_AC, p_AC) ** 2)) == pytest.approx(
+        0.3 * np.sqrt(2), rel=0.05
+    )
+
+
+def test_april_corners_fit_the_published_calibration(april, april_tracks):
+    views = read_board_views(april)
+    assert len(views) == 720
+    R_AC, p_AC = board_poses(views, CALIBRATION.camera)
+    assert np.sqrt(np.mean(reprojection_px(views, CALIBRATION.camera, R_AC, p_AC) ** 2)) < 0.42
+    # The first image is 15 ms older than the first reading.
+    assert len(april_tracks.packets) == 719
+    assert april_tracks.ground_truth.path_length_m == pytest.approx(20.0, abs=0.1)
+
+
+def test_april_ids_are_corners_and_new_after_every_absence(april, april_tracks):
+    views = read_board_views(april)
+    count = corner_count(views)
+    assert count == 144
+    last: dict[int, tuple[int, int]] = {}
+    returned = 0
+    for k, ((_, tracks), view) in enumerate(zip(april_tracks.packets, views[1:], strict=True)):
+        assert np.array_equal(tracks.ids % count, view.corner)
+        assert np.array_equal(tracks.xy, view.xy)
+        for i in tracks.ids.tolist():
+            at, before = last.get(i % count, (k - 1, i))
+            assert (i == before) == (at == k - 1)
+            returned += i != before
+            last[i % count] = (k, i)
+    assert returned > 100
+
+
+def test_april_truth_agrees_with_the_gyroscope_and_the_vertical(april_tracks):
+    """Rotation over 0.2 s by PnP and by gyroscope, and the mean specific force, which must point up."""
+    R_WB, step = april_tracks.ground_truth.R_WB, 4
+    bias = np.array([-0.0022, 0.0250, 0.0762])
+    residual, turned = [], []
+    for k in range(0, len(R_WB) - step, step):
+        turn = np.eye(3)
+        for imu, _ in april_tracks.packets[k + 1 : k + 1 + step]:
+            for rate, dt in zip(0.5 * (imu.gyro_B[1:] + imu.gyro_B[:-1]) - bias, imu.dt, strict=True):
+                turn = turn @ so3.exp(rate * dt)
+        turned.append(np.linalg.norm(so3.log(turn)))
+        residual.append(np.linalg.norm(so3.log(R_WB[k + step].T @ R_WB[k] @ turn)))
+    assert np.median(residual) < 5e-3
+    assert max(turned) > 0.25
+    force_W = np.mean([R @ imu.accel_B[-1] for R, (imu, _) in zip(R_WB, april_tracks.packets, strict=True)], axis=0)
+    assert np.degrees(np.arccos(force_W[2] / np.linalg.norm(force_W))) < 2.0
+
+
+def test_missing_files_are_named(tmp_path):
+    with pytest.raises(DatasetError, match="imu0"):
+        april_sequence(tmp_path)
+
+
+class Oracle:
+    """A back-end that is told the truth, with an offset along x; it takes its time to begin and loses itself once."""
+
+    def __init__(self, states, offset_m):
+        self._states = iter(states)
+        self._offset = np.array([offset_m, 0.0, 0.0])
+        self._frame = -1
+
+    def process(self, imu, tracks):
+        self._frame += 1
+        s = next(self._states)
+        if self._frame < 10:
+            return Estimate(Status.INITIALISING, stage_seconds={"initialise": 0.5})
+        if 20 <= self._frame < 25:
+            return Estimate(Status.LOST)
+        p_WB = s.p_WB + (self._offset if self._frame % 2 else -self._offset)
+        state = NavState(s.t_ns, s.R_WB, p_WB, s.v_WB, s.bias_gyro_B, s.bias_accel_B, np.eye(15) * 0.01)
+        return Estimate(Status.TRACKING, state)
+
+
+def test_a_run_is_counted_and_measured():
+    sequence = simulated_sequence("figure_eight", max_points=5, duration_s=5.0)
+    run = run_backend(sequence, Oracle(sequence.true_states, offset_m=0.1))
+    row = backend_row(sequence, run)
+    assert row["frames"] == 101
+    assert row["initialised_s"] == pytest.approx(0.5)
+    assert row["resets"] == 1
+    assert row["completion"] == pytest.approx(86 / 91)
+    assert row["ate_m"] == pytest.approx(0.1, rel=0.01)
+    assert row["path_m"] == pytest.approx(run.trajectory.at(run.trajectory.t_ns).path_length_m, abs=100)
+    assert row["percent"] == pytest.approx(100 * row["ate_m"] / row["path_m"])
+    assert row["stage_ms"]["initialise"] == pytest.approx(10 * 500 / 101)
+    assert run.trajectory.cov_pose.shape == (86, 6, 6)
+
+
+def test_a_back_end_that_never_begins_is_a_row_too():
+    sequence = simulated_sequence("figure_eight", max_points=5, duration_s=0.4)
+    run = run_backend(sequence, Oracle(sequence.true_states, offset_m=0.0))
+    row = backend_row(sequence, run)
+    assert row["initialised_s"] is None
+    assert row["completion"] == 0.0
+    assert "ate_m" not in row
+    with pytest.raises(TrajectoryError, match="initialisation"):
+        _ = run.trajectory
+
+
+def test_rows_are_shown_and_kept(tmp_path):
+    from rich.console import Console
+
+    rows = [{"sequence": "one", "ate_m": 0.12345, "stage_ms": {"total": 3.21}}, {"sequence": "two"}]
+    console = Console(width=80, record=True, quiet=True)
+    console.print(table("Title", rows, {"sequence": "", "ate_m": ".3f", "stage_ms.total": ".1f"}))
+    text = console.export_text()
+    assert [word for word in ("Title", "one", "0.123", "3.2", "two", "-") if word not in text] == []
+    record(tmp_path / "new" / "x.json", rows, {"seed": 1})
+    kept = json.loads((tmp_path / "new" / "x.json").read_text())
+    assert kept["results"] == rows
+    assert kept["settings"] == {"seed": 1}
+    assert kept["machine"]["cpu"]
