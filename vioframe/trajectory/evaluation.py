@@ -40,8 +40,8 @@ class TrajectoryErrors:
     ``position_m`` (N, 3) estimate minus truth, ``rotation_rpy_deg`` (N, 3) about the world's axes. ``ate_se3_m`` and
     ``scale``, the factor the estimate would have to be multiplied by, come from alignments of their own and are None
     where the body did not move enough to tell. ``relative`` is by length in metres, ``relative_by_fraction`` by the
-    fraction of the whole path. NEES is taken in the gauge of the first pose in any case. ``coverage`` is the part of the
-    ground truth's time between the first and the last associated pose.
+    fraction of the whole path. NEES is taken in the gauge of the first pose in any case. ``coverage`` is the part of
+    the ground truth's time between the first and the last associated pose.
     """
 
     alignment_name: str
