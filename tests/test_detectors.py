@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from vioframe.interfaces import Detector
+from vioframe.testing import check_detector
 from vioframe_fast import Fast
 from vioframe_orb import Orb
 from vioframe_shi_tomasi import ShiTomasi
@@ -48,6 +49,11 @@ def test_keypoints_are_what_the_types_promise(make):
     assert (np.diff(found.score) <= 0).all()
     assert found.descriptors is None
     assert len(np.unique(found.xy, axis=0)) == len(found.xy)
+
+
+@each_detector
+def test_the_conformance_kit_agrees(make):
+    check_detector(make)
 
 
 @each_detector

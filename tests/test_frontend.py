@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
+from vioframe.bench.epipolar import epipolar_errors_px
 from vioframe.errors import ConfigError, DatasetError, PluginError
 from vioframe.frontend import Frontend, FrontendOptions
 from vioframe.frontend.flow import camera_rotation, predict
@@ -381,22 +382,8 @@ def test_at_rest_tracks_live_on(shared_data):
 def test_in_flight_tracks_obey_the_true_epipolar_geometry(shared_data):
     """Against the recorded ground truth, whose own error is part of what is measured."""
     dataset, steps = euroc(shared_data, "MH_01_easy_15s", 100)
-    calibration, truth = dataset.calibration, dataset.ground_truth
-    t_ns = np.array([s.t_ns for s in steps])
-    at = np.abs(truth.t_ns[:, None] - t_ns).argmin(axis=0)
-    assert np.abs(truth.t_ns[at] - t_ns).max() < 1000
-    R_WC = truth.R_WB[at] @ calibration.R_BC
-    p_WC = truth.p_WB[at] + truth.R_WB[at] @ calibration.p_BC
     for baseline, median_px, outliers in ((1, 0.2, 0.005), (5, 0.8, 0.1)):
-        errors = []
-        for k in range(len(steps) - baseline):
-            before, after = steps[k], steps[k + baseline]
-            _, i, j = np.intersect1d(before.ids, after.ids, return_indices=True)
-            R_C2W = R_WC[k + baseline].T
-            E = two_view.essential_matrix(R_C2W @ R_WC[k], R_C2W @ (p_WC[k] - p_WC[k + baseline]))
-            errors.append(two_view.sampson_distance(E, before.xy_normalised[i], after.xy_normalised[j]))
-        # Sampson's distance shares an error between both views: the root of two turns it into one view's pixels.
-        error_px = np.abs(np.concatenate(errors)) * calibration.camera.focal_px * np.sqrt(2.0)
+        error_px = epipolar_errors_px(steps, dataset.ground_truth, dataset.calibration, baseline)
         assert np.median(error_px) < median_px
         assert (error_px > 3.0).mean() < outliers
     lifetimes = np.bincount(np.concatenate([s.ids for s in steps]))

@@ -16,8 +16,8 @@ def epipolar_errors_px(
 ) -> Float:
     """(N,) distances of all points seen both in one frame and ``baseline`` frames later, in pixels of one view.
 
-    Frames that the ground truth does not cover are left out. Its own error, of a pixel or so over ten frames of EuRoC, is
-    part of what is measured: compare front-ends by it, do not read it as noise.
+    Frames that the ground truth does not cover are left out. Its own error, of a pixel or so over ten frames of EuRoC,
+    is part of what is measured: compare front-ends by it, do not read it as noise.
     """
     covered = [s for s in steps if ground_truth.covers([s.t_ns])[0]]
     truth = ground_truth.at([s.t_ns for s in covered])
@@ -31,4 +31,5 @@ def epipolar_errors_px(
         E = essential_matrix(R_C2W @ R_WC[k], R_C2W @ (p_WC[k] - p_WC[k + baseline]))
         errors.append(np.abs(sampson_distance(E, before.xy_normalised[i], after.xy_normalised[j])))
     # Sampson's distance shares an error evenly between two views; the root of two puts all of it into one.
-    return np.sqrt(2.0) * calibration.camera.focal_px * np.concatenate(errors)
+    error_px: Float = np.sqrt(2.0) * calibration.camera.focal_px * np.concatenate(errors)
+    return error_px

@@ -18,7 +18,8 @@ class FrontendOptions:
     max_points: int = 150
     """Tracks kept alive at once."""
     min_distance_px: float = 15.0
-    """New points keep this far from every track and from each other."""
+    """New points keep this far from every track and from each other; of two tracks that come within half of it, the
+    younger is dropped."""
     grid: tuple[int, int] = (6, 8)
     """Rows and columns of the grid whose emptiest cells are refilled first."""
     border_px: float = 5.0
