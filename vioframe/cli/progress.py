@@ -26,17 +26,20 @@ class RunProgress:
         self._first_t_ns: int | None = None
 
     def __enter__(self) -> Self:
-        self._progress.start()
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._progress.stop()
+        if self._first_t_ns is not None:
+            self._progress.stop()
 
     def __call__(self, step: Step) -> None:
         if self._first_t_ns is None:
             self._first_t_ns = step.frame.t_ns
+            # Not before: an error ahead of the first frame is then one line and nothing else.
+            self._progress.start()
+            self._progress.reset(self._task)
         task = self._progress.tasks[self._task]
         wall_s = max(task.elapsed or 0.0, 1e-3)
         data_s = (step.frame.t_ns - self._first_t_ns) / NS_PER_S

@@ -1,0 +1,291 @@
+"""The command line, end to end on a small made-up recording: what it writes, says and returns."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+from plugin_helpers import install
+from ruamel.yaml import YAML
+
+import vioframe.cli
+from vioframe import config
+from vioframe.cli import main
+from vioframe.report.run_folder import RunFolder
+
+HEAVY = {"cv2", "torch", "open3d", "filterpy", "numba", "matplotlib", "scipy", "numpy", "pydantic", "rich"}
+
+# A recording of 20 frames, a back-end that tracks from the third on, and parts that fail in every way.
+PARTS = """
+import time
+from dataclasses import replace
+import numpy as np
+from vioframe.calibration import packaged_calibration
+from vioframe.errors import DatasetError
+from vioframe.geometry.cameras import Camera
+from vioframe.types import *
+
+class Toy:
+    "Twenty small frames of noise."
+    name, frame_count, ground_truth = "toy", 20, None
+    def __init__(self, path, *, broken_at: int = 99, pause_s: float = 0.0, calibration: list[str] | None = None):
+        camera = Camera(100.0, 100.0, 32.0, 24.0, (0.0, 0.0, 0.0, 0.0), (64, 48))
+        self.calibration = replace(packaged_calibration("euroc"), camera=camera)
+        self.broken_at, self.pause_s = broken_at, pause_s
+    @staticmethod
+    def accepts(path): return path.suffix == ".toy"
+    def measurements(self):
+        image = np.random.default_rng(0).integers(0, 255, (48, 64), dtype=np.uint8)
+        for k in range(240):
+            yield ImuSample(10**9 + k * 5_000_000, np.zeros(3), np.array([0.0, 0.0, 9.81]))
+            if k % 10 == 0 and k < 200:
+                if k == 10 * self.broken_at:
+                    raise DatasetError("the recording ends in the middle of a message; record it again")
+                time.sleep(self.pause_s)
+                yield Frame(10**9 + k * 5_000_000, image)
+
+class Still:
+    "Says that the body rests."
+    def __init__(self, calibration, *, raise_at: int = 99, speed: float = 0.0):
+        self.k, self.raise_at, self.speed = 0, raise_at, speed
+    def process(self, imu, tracks):
+        self.k += 1
+        if self.k == self.raise_at: raise ZeroDivisionError("division\\nby zero")
+        if self.k < 3: return Estimate(Status.INITIALISING)
+        state = NavState(tracks.t_ns, np.eye(3), np.array([self.speed * self.k, 0, 0]), *np.zeros((3, 3)))
+        return Estimate(Status.TRACKING, state, np.array([1]), np.ones((1, 3)))
+
+@hookimpl
+def vioframe_datasets(): return {"toy": Toy}
+@hookimpl
+def vioframe_backends(): return {"still": Still}
+"""
+
+
+@pytest.fixture
+def toy(tmp_path, monkeypatch):
+    """The recording, in a working folder of its own, with its parts installed."""
+    install(tmp_path / "site", monkeypatch, distribution="toy-parts", module="toy_parts", code=PARTS)
+    monkeypatch.chdir(tmp_path)
+    Path("flight.toy").touch()
+    return Path("flight.toy")
+
+
+def vioframe_(*arguments: object, code: int = 0):
+    result = CliRunner().invoke(main, [str(a) for a in arguments], catch_exceptions=False)
+    assert result.exit_code == code, result.output
+    return result
+
+
+def error_line(*arguments: object) -> str:
+    """What a command that fails says: one line, exit code 2."""
+    result = vioframe_(*arguments, code=2)
+    assert result.stderr.count("\n") == 1, result.stderr
+    return result.stderr
+
+
+def run_toy(toy, *arguments: object, **kwargs):
+    return vioframe_("run", toy, "--backend", "still", *arguments, **kwargs)
+
+
+LOOK_AT_HELP = "from vioframe.cli import main; main(['--help'], standalone_mode=False)"
+
+
+@pytest.mark.parametrize("statement", ["import vioframe", "import vioframe.types, vioframe.interfaces", LOOK_AT_HELP])
+def test_help_loads_nothing_heavy(statement):
+    code = f"import sys; {statement}; print(*sorted({{m.partition('.')[0] for m in sys.modules}}), file=sys.stderr)"
+    done = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
+    loaded = set(done.stderr.split())
+    assert not loaded & (HEAVY if statement is LOOK_AT_HELP else HEAVY - {"numpy"})
+
+
+def test_module_and_script_are_the_same():
+    done = subprocess.run([sys.executable, "-m", "vioframe", "--version"], check=True, capture_output=True, text=True)
+    assert done.stdout == f"vioframe, version {vioframe.__version__}\n"
+
+
+def test_every_listed_command_exists_and_says_what_it_does():
+    listing = vioframe_("--help").output
+    for name, short in vioframe.cli._COMMANDS.items():
+        assert f"{name} " in listing
+        assert short in listing
+        assert "Usage: " in vioframe_(name, "--help").output
+
+
+def test_an_unknown_command_is_refused():
+    assert "No such command 'rnu'" in vioframe_("rnu", code=2).output
+
+
+def test_a_run_from_recording_to_folder(toy):
+    result = run_toy(toy)
+    folder = Path("runs/toy_shi_tomasi_still")
+    assert {p.name for p in folder.iterdir()} == {
+        *("trajectory.tum", "states.csv", "pose_cov.csv", "tracks.csv", "timings.csv", "map.ply"),
+        *("config.yaml", "machine.json", "summary.json"),
+    }
+    run = RunFolder.open(folder)
+    assert run.summary["finished"] is True
+    assert run.summary["frames"] == 20
+    assert run.summary["initialised_after_s"] == pytest.approx(0.1)
+    assert run.summary["plugins"]["backend"] == "toy-parts 1.0"
+    assert len(run.trajectory()) == 18
+    assert "20 frames, initialised after 0.10 s, then 100.0% tracked, 0 resets" in result.stdout
+    assert f"vioframe evaluate {folder}" in result.stdout
+    assert "frames/s" in result.stderr
+    assert "x real time" in result.stderr
+
+
+def test_quiet_says_nothing(toy):
+    assert run_toy(toy, "--quiet").output == ""
+
+
+def test_a_run_is_repeated_from_its_own_configuration(toy):
+    run_toy(toy, "-o", "speed=0.5", "-o", "max_points=37", "--start", 0.2, "--duration", 0.4, "--out", "a", "--quiet")
+    vioframe_("run", "--config", "a/config.yaml", "--out", "b", "--quiet")
+    assert json.loads(Path("b/summary.json").read_text())["frames"] == 9
+    for name in ("trajectory.tum", "states.csv", "pose_cov.csv", "tracks.csv", "map.ply", "config.yaml"):
+        assert Path("a", name).read_bytes() == Path("b", name).read_bytes()
+
+
+def test_the_command_line_overrides_the_file(toy):
+    Path("c.yaml").write_text("backend: {name: still, options: {speed: 2}}\nfrontend: {max_points: 9}\nstart_s: 0.5\n")
+    vioframe_("run", toy, "--config", "c.yaml", "-o", "speed=3", "--start", 0.1, "--out", "a", "--quiet")
+    used = config.read("a/config.yaml")
+    assert (used.backend.options["speed"], used.frontend["max_points"], used.start_s) == (3.0, 9, 0.1)
+
+
+def test_another_part_does_not_inherit_the_options_of_the_one_in_the_file(toy):
+    Path("c.yaml").write_text("detector: {name: shi_tomasi, options: {quality_level: 0.5}}\nbackend: {name: still}\n")
+    vioframe_("run", toy, "--config", "c.yaml", "--detector", "orb", "--out", "a", "--quiet")
+    assert config.read("a/config.yaml").detector.name == "orb"
+    vioframe_("run", toy, "--config", "c.yaml", "--detector", "shi_tomasi", "--out", "b", "--quiet")
+    assert config.read("b/config.yaml").detector.options["quality_level"] == 0.5
+
+
+def test_ground_truth_is_kept_with_the_run_and_compared(toy):
+    rows = "".join(f"{1 + 0.05 * k:.9f} {0.5 * (k + 1)} 0 0 0 0 0 1\n" for k in range(20))
+    Path("truth.tum").write_text(rows)
+    result = run_toy(toy, "-o", "speed=0.5", "--ground-truth", "truth.tum", "--out", "a")
+    assert "ATE 0.0 mm (position and yaw aligned) over 8.5 m" in result.stdout
+    assert len(RunFolder.open("a").ground_truth()) == 20
+
+
+def test_runs_never_overwrite_one_another_unless_asked(toy):
+    run_toy(toy, "--quiet")
+    run_toy(toy, "--quiet")
+    assert Path("runs/toy_shi_tomasi_still_2").is_dir()
+    out = "runs/toy_shi_tomasi_still"
+    before = Path(out, "trajectory.tum").stat().st_mtime_ns
+    assert "exists already" in error_line("run", toy, "--backend", "still", "--out", out)
+    assert Path(out, "trajectory.tum").stat().st_mtime_ns == before
+    run_toy(toy, "--out", out, "--overwrite", "--quiet")
+    assert Path(out, "trajectory.tum").stat().st_mtime_ns > before
+
+
+def test_a_plugin_that_raises_is_named_and_what_was_done_is_kept(toy):
+    line = error_line("run", toy, "--backend", "still", "-o", "raise_at=10", "--quiet", "--out", "a")
+    assert "plug-in 'toy_parts' (toy-parts 1.0) failed: ZeroDivisionError: division by zero" in line
+    assert "what was estimated until then is in a" in line
+    run = RunFolder.open("a")
+    assert len(run.trajectory()) == 7
+    assert (run.summary["finished"], run.summary["frames"]) == (False, 9)
+    assert "toy-parts" in run.summary["stopped_by"]
+
+
+def test_a_recording_that_breaks_off_keeps_what_was_done(toy):
+    line = error_line("run", toy, "--backend", "still", "-o", "broken_at=12", "--quiet", "--out", "a")
+    assert "ends in the middle of a message; record it again; what was estimated until then is in a" in line
+    assert len(RunFolder.open("a").trajectory()) >= 7
+
+
+def test_an_error_before_the_first_frame_leaves_everything_as_it_was(toy):
+    run_toy(toy, "--out", "a", "--quiet")
+    before = Path("a/trajectory.tum").read_bytes()
+    error_line("run", toy, "--backend", "still", "-o", "raise_at=1", "--quiet", "--out", "a", "--overwrite")
+    assert Path("a/trajectory.tum").read_bytes() == before
+    error_line("run", toy, "--backend", "still", "-o", "raise_at=1", "--quiet", "--out", "new")
+    assert not Path("new").exists()
+
+
+def test_debug_shows_the_traceback(toy):
+    with pytest.raises(vioframe.errors.PluginError) as raised:
+        vioframe_("--debug", "run", toy, "--backend", "still", "-o", "raise_at=10", "--quiet")
+    assert isinstance(raised.value.__cause__, ZeroDivisionError)
+
+
+def test_ctrl_c_completes_the_folder_and_exits_130(toy, tmp_path):
+    command = [sys.executable, "-m", "vioframe", "run", toy, "--backend", "still", "-o", "pause_s=0.2", "--out", "a"]
+    environment = {**os.environ, "PYTHONPATH": str(tmp_path / "site")}
+    process = subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, text=True)
+    while not (Path("a/timings.csv").is_file() and len(Path("a/timings.csv").read_text().splitlines()) > 4):
+        assert process.poll() is None, process.stderr.read()
+        time.sleep(0.05)
+    process.send_signal(signal.SIGINT)
+    _, stderr = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert "interrupted; what was estimated until then is in a" in stderr
+    assert "Traceback" not in stderr
+    run = RunFolder.open("a")
+    assert run.summary["finished"] is False
+    assert 4 <= run.summary["frames"] < 20
+    assert Path("a/map.ply").read_text().startswith("ply\n")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "why"),
+    [
+        (["missing.bag"], "missing.bag does not exist"),
+        ([], "no data given: `vioframe run DATA`"),
+        (["flight.toy", "--detector", "obr"], "no detector is called 'obr' (did you mean 'orb'?)"),
+        (["flight.toy", "--backend", "stil"], "no backend is called 'stil' (did you mean 'still'?)"),
+        (["flight.toy", "--reader", "tyo"], "no dataset is called 'tyo' (did you mean 'toy'?)"),
+        (["flight.toy", "--backend", "still", "-o", "sped=1"], "no part has such an option (did you mean 'speed'?)"),
+        (["flight.toy", "--backend", "still", "-o", "speed=fast"], "speed='fast': Input should be a valid number"),
+        (["flight.toy", "--config", "none.yaml"], "cannot read the configuration none.yaml"),
+        (["flight.toy", "--start", "-1"], "command line: start_s: Input should be greater than or equal to 0"),
+        (["flight.toy", "--backend", "still", "--start", "50"], "toy has no image to process; check --start"),
+        (["flight.toy", "--backend", "still", "--ground-truth", "none.tum"], "none.tum: no such trajectory file"),
+    ],
+)
+def test_bad_input_is_one_line_and_exit_code_2(toy, arguments, why):
+    assert why in error_line("run", *arguments)
+    assert not Path("runs").exists()
+
+
+def test_plugins_lists_what_is_there_and_what_failed(toy, tmp_path, monkeypatch):
+    install(tmp_path / "bad", monkeypatch, distribution="bad-parts", module="bad_parts", code="import not_there_at_all")
+    monkeypatch.setenv("COLUMNS", "200")
+    result = vioframe_("plugins")
+    lines = result.stdout.splitlines()
+    assert any(line.split()[:4] == ["backend", "still", "toy-parts", "1.0"] for line in lines)
+    assert any(line.split()[:3] == ["dataset", "euroc", "vioframe"] for line in lines)
+    (failed,) = [line for line in lines if line.startswith("bad_parts")]
+    assert failed.split()[1:3] == ["bad-parts", "1.0"]
+    assert "ModuleNotFoundError: No module named 'not_there_at_all'" in failed
+    assert "warning: plug-in bad_parts (bad-parts 1.0) is skipped" in result.stderr
+
+
+def test_plugins_shows_the_options_of_one(monkeypatch):
+    monkeypatch.setenv("COLUMNS", "200")
+    lines = vioframe_("plugins", "msckf").stdout.splitlines()
+    (window,) = [line for line in lines if line.startswith("max_clones")]
+    assert window.split()[1:3] == ["int", "11"]
+    assert window.endswith("Past poses kept in the state.") or "kept in the state" in window
+    assert "did you mean 'msckf'?" in error_line("plugins", "msckff")
+
+
+def test_config_prints_a_complete_file_that_checks(tmp_path):
+    text = vioframe_("config", "--detector", "orb").stdout
+    file = tmp_path / "c.yaml"
+    file.write_text(text)
+    assert YAML(typ="safe").load(text)["detector"]["name"] == "orb"
+    assert vioframe_("config", "--check", file).stdout == f"{file} is valid\n"
+    file.write_text(text.replace("max_points:", "max_pionts:"))
+    assert "did you mean 'max_points'?" in error_line("config", "--check", file)

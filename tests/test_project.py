@@ -1,0 +1,78 @@
+"""The project itself: the example plug-in is a real distribution, and the parts that ship keep their promises."""
+
+import os
+import re
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from vioframe import registry
+from vioframe.testing import check_backend, check_dataset, check_detector
+
+ROOT = Path(__file__).resolve().parents[1]
+INSTALLED = registry.load()
+
+
+@pytest.fixture(scope="module")
+def example(tmp_path_factory):
+    """The environment of a Python into which the example plug-in was installed by pip, without a network."""
+    site = tmp_path_factory.mktemp("site")
+    pip = [sys.executable, "-m", "pip", "install", "--quiet", "--no-index", "--no-deps", "--no-build-isolation"]
+    subprocess.run([*pip, "--target", site, ROOT / "docs" / "example-plugin"], check=True)
+    return {**os.environ, "PYTHONPATH": str(site), "COLUMNS": "200"}
+
+
+def call(environment, *arguments):
+    done = subprocess.run([sys.executable, "-m", *arguments], env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr + done.stdout
+    return done.stdout
+
+
+def test_the_example_plugin_is_found_once_installed(example):
+    (row,) = [line for line in call(example, "vioframe", "plugins").splitlines() if " harris " in line]
+    assert row.split()[:4] == ["detector", "harris", "vioframe-harris", "0.1.0"]
+    assert "weakest corner kept, relative to the strongest" in call(example, "vioframe", "plugins", "harris")
+    assert "min_distance_px: 8.0" in call(example, "vioframe", "config", "--detector", "harris")
+
+
+def test_the_example_plugin_passes_its_own_tests(example):
+    test = ROOT / "docs" / "example-plugin" / "test_harris.py"
+    assert "1 passed" in call(example, "pytest", "-q", "-p", "no:cacheprovider", "-c", os.devnull, str(test))
+
+
+@pytest.mark.parametrize("name", INSTALLED.names(registry.DETECTOR))
+def test_every_detector_conforms(name):
+    check_detector(INSTALLED.find(registry.DETECTOR, name).factory)
+
+
+@pytest.mark.parametrize("name", INSTALLED.names(registry.BACKEND))
+def test_every_backend_conforms(name):
+    check_backend(INSTALLED.find(registry.BACKEND, name).factory)
+
+
+def test_the_folder_reader_conforms(shared_data):
+    check_dataset(INSTALLED.find(registry.DATASET, "euroc").factory, shared_data / "euroc" / "V1_01_easy_rest")
+
+
+def test_every_requirement_is_pinned():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    extras = project["optional-dependencies"]
+    wanted = {re.split(r"[^\w.-]", r)[0] for r in [*project["dependencies"], *extras["test"], *extras["open3d"]]}
+    pins = [line.split("==") for line in (ROOT / "constraints.txt").read_text().splitlines() if line[0] != "#"]
+    assert all(len(pin) == 2 for pin in pins)
+    assert wanted - {"vioframe"} <= {name for name, _ in pins}
+
+
+def test_every_builtin_plugin_is_declared():
+    modules = {path.stem for path in (ROOT / "plugins").iterdir() if path.name.startswith("vioframe_")}
+    entries = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["entry-points"]["vioframe"]
+    assert set(entries.values()) == modules
+
+
+def test_no_module_outgrows_its_reader():
+    files = [*(ROOT / "vioframe").rglob("*.py"), *(ROOT / "plugins").rglob("*.py")]
+    long = {str(path.relative_to(ROOT)): n for path in files if (n := len(path.read_text().splitlines())) > 300}
+    assert not long
