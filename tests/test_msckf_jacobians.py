@@ -30,9 +30,20 @@ def test_observation_jacobian_is_the_derivative_on_the_manifold(camera):
         perturbed = k + d[7:15]
         return Camera(*perturbed[:4], tuple(perturbed[4:]), camera.resolution, camera.model).project(point[None])[0]
 
-    xy = predicted(np.zeros(24)) + [0.3, -0.2]
+    xy = predicted(np.zeros(24)) + np.array([0.3, -0.2])
     blocks, residual = measurement._observations(
-        R_WB[None], p_WB[None], R_WB[None], p_WB[None], R_BC, p_BC, model, k, np.array([0]), p_WF[None], p_WF[None], xy[None]
+        R_WB[None],
+        p_WB[None],
+        R_WB[None],
+        p_WB[None],
+        R_BC,
+        p_BC,
+        model,
+        k,
+        np.array([0]),
+        p_WF[None],
+        p_WF[None],
+        xy[None],
     )
     eps = 1e-6
     numeric = np.stack([(predicted(eps * e) - predicted(-eps * e)) / (2 * eps) for e in np.eye(24)], axis=1)

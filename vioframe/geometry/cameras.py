@@ -86,8 +86,10 @@ class Camera:
             guess[:, 0] -= (J[:, 1, 1] * error[:, 0] - J[:, 0, 1] * error[:, 1]) / det
             guess[:, 1] -= (J[:, 0, 0] * error[:, 1] - J[:, 1, 0] * error[:, 0]) / det
         with np.errstate(invalid="ignore"):
-            diverged = ~(np.abs(self._distort(guess) - target) < 1e-6).all(axis=1)
-        guess[diverged] = np.nan
+            solved = (np.abs(self._distort(guess) - target) < 1e-6).all(axis=1)
+            # Past the fold of the distortion the image is mirrored: a solution there is not where the camera looks.
+            solved &= np.linalg.det(self._distort_jacobian(guess)) > 0.0
+        guess[~solved] = np.nan
         return guess
 
     def distort_jacobian(self, xy_normalised: ArrayLike) -> Float:

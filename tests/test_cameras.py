@@ -1,0 +1,100 @@
+"""Cameras against OpenCV, against numeric derivatives and against their own inverse; the compiled twins likewise."""
+
+import cv2
+import numpy as np
+import pytest
+
+from vioframe.errors import CalibrationError
+from vioframe.geometry import kernels, so3
+from vioframe.geometry.cameras import Camera
+
+CAMERAS = {
+    "radtan": Camera(458.654, 457.296, 367.215, 248.375, (-0.28340811, 0.07395907, 0.00019359, 1.76e-05), (752, 480)),
+    "equidistant": Camera(380.0, 379.0, 367.0, 248.0, (0.01, -0.02, 0.005, -0.001), (752, 480), "equidistant"),
+}
+CASES = pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS.keys())
+
+
+def _pixels(camera: Camera) -> np.ndarray:
+    width, height = camera.resolution
+    return np.stack(np.meshgrid(np.arange(0, width, 25.0), np.arange(0, height, 25.0)), axis=-1).reshape(-1, 2)
+
+
+@CASES
+def test_undistort_inverts_distort_over_the_whole_image(camera):
+    xy = _pixels(camera)
+    np.testing.assert_allclose(camera.distort(camera.undistort(xy)), xy, atol=1e-8)
+
+
+@CASES
+def test_projection_agrees_with_opencv(camera):
+    rng = np.random.default_rng(0)
+    p_C = rng.uniform([-2.0, -1.5, 2.0], [2.0, 1.5, 6.0], (100, 3))
+    d, zero = np.array(camera.distortion), np.zeros(3)
+    if camera.model == "radtan":
+        expected, _ = cv2.projectPoints(p_C, zero, zero, camera.K, d)
+    else:
+        expected, _ = cv2.fisheye.projectPoints(p_C[:, None], zero, zero, camera.K, d)
+    np.testing.assert_allclose(camera.project(p_C), expected.reshape(-1, 2), atol=1e-9)
+
+
+@CASES
+def test_jacobian_is_the_derivative(camera):
+    n, eps = camera.undistort(_pixels(camera)), 1e-6
+    numeric = np.stack([(camera.distort(n + eps * e) - camera.distort(n - eps * e)) / (2 * eps) for e in np.eye(2)], -1)
+    np.testing.assert_allclose(camera.distort_jacobian(n), numeric, atol=1e-5)
+
+
+@CASES
+def test_compiled_twins_agree(camera):
+    model, k = kernels.intrinsics_of(camera)
+    for xy, n, J in zip(
+        _pixels(camera),
+        camera.undistort(_pixels(camera)),
+        camera.distort_jacobian(camera.undistort(_pixels(camera))),
+        strict=True,
+    ):
+        drawn, drawn_J = kernels.distort(model, k, *n)
+        np.testing.assert_allclose(drawn, xy, atol=1e-8)
+        np.testing.assert_allclose(drawn_J, J, rtol=1e-9, atol=1e-9)
+        np.testing.assert_allclose(kernels.undistort(model, k, *xy, *(n + 0.01)), n, atol=1e-8)
+
+
+@CASES
+def test_compiled_intrinsics_jacobian_is_the_derivative(camera):
+    model, k = kernels.intrinsics_of(camera)
+    eps = 1e-6
+    for n in camera.undistort(_pixels(camera))[::7]:
+        numeric = np.stack(
+            [
+                (kernels.distort(model, k + eps * e, *n)[0] - kernels.distort(model, k - eps * e, *n)[0]) / (2 * eps)
+                for e in np.eye(8)
+            ],
+            axis=1,
+        )
+        np.testing.assert_allclose(kernels.intrinsics_jacobian(model, k, *n).T, numeric, atol=1e-5)
+
+
+def test_compiled_rotations_agree():
+    rng = np.random.default_rng(4)
+    for phi in [*rng.normal(size=(20, 3)), *(1e-5 * rng.normal(size=(20, 3))), np.zeros(3)]:
+        np.testing.assert_allclose(kernels.exp(phi), so3.exp(phi), atol=1e-12)
+        np.testing.assert_allclose(kernels.right_jacobian(phi), so3.right_jacobian(phi), atol=1e-9)
+        np.testing.assert_allclose(kernels.hat(phi), so3.hat(phi))
+
+
+def test_points_beyond_the_fold_of_the_distortion_come_back_as_nan():
+    # r (1 - 0.28 r^2) never exceeds 0.727: nothing is drawn 400 px from the centre.
+    camera = Camera(458.0, 458.0, 367.0, 248.0, (-0.28, 0.0, 0.0, 0.0), (752, 480))
+    undistorted = camera.undistort([[767.0, 248.0], [667.0, 248.0], [367.0, 248.0]])
+    assert np.isnan(undistorted[0]).all()
+    np.testing.assert_allclose(camera.distort(undistorted[1:]), [[667.0, 248.0], [367.0, 248.0]], atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    "change", [{"fx": 0.0}, {"distortion": (0.1, 0.2)}, {"distortion": (np.nan, 0, 0, 0)}, {"model": "mei"}]
+)
+def test_impossible_cameras_are_refused(change):
+    arguments = {"fx": 400.0, "fy": 400.0, "cx": 320.0, "cy": 240.0, "distortion": (0.0,) * 4, "resolution": (640, 480)}
+    with pytest.raises(CalibrationError):
+        Camera(**(arguments | change))
