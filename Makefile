@@ -10,6 +10,7 @@ CODE := vioframe plugins tests docs/example-plugin
 
 RECORDING ?= ../shared/data/euroc/MH_01_easy_15s
 DEMO := build/demo
+BAG := $(DEMO)/$(notdir $(RECORDING)).bag
 
 # What Open3D's wheel needs from the system.
 SYSTEM_LIBRARIES := libusb-1.0-0 libgl1 libgomp1 libx11-6 libegl1
@@ -33,9 +34,9 @@ lint: install
 demo: install
 	@test -d $(RECORDING)/mav0 || { echo "make demo: there is no recording at $(RECORDING);" \
 		"name a EuRoC sequence in ASL layout: make demo RECORDING=path/to/MH_05_difficult"; exit 2; }
-	@mkdir -p $(DEMO) && rm -f $(DEMO)/recording.bag
-	$(BIN)/vioframe convert $(RECORDING) $(DEMO)/recording.bag
-	$(BIN)/vioframe run $(DEMO)/recording.bag --detector shi_tomasi --backend msckf \
+	@mkdir -p $(DEMO) && rm -f $(BAG)
+	$(BIN)/vioframe convert $(RECORDING) $(BAG)
+	$(BIN)/vioframe run $(BAG) --detector shi_tomasi --backend msckf \
 		--ground-truth $(RECORDING)/mav0/state_groundtruth_estimate0/data.csv --out $(DEMO)/run --overwrite
 	$(BIN)/vioframe evaluate $(DEMO)/run
 	$(BIN)/vioframe plot $(DEMO)/run
