@@ -83,7 +83,7 @@ def present(
     """Print the table, and write ``results/NAME.json`` if asked to."""
     console = Console()
     if not console.is_terminal:
-        console = Console(width=140)  # a file or pipe has no width of its own
+        console = Console(width=160)  # a file or pipe has no width of its own
     done = []
     with console.status(f"{name} ...") as status:
         for row in rows:
