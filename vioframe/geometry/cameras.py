@@ -21,7 +21,7 @@ DistortionModel = Literal["radtan", "equidistant"]
 
 @dataclass(frozen=True)
 class Camera:
-    """``resolution`` is (width, height) px; ``distortion`` is (4,): k1 k2 p1 p2 (radtan) or k1 k2 k3 k4 (equidistant)."""
+    """``resolution`` is (width, height) px; ``distortion`` k1 k2 p1 p2 (radtan) or k1 k2 k3 k4 (equidistant)."""
 
     fx: float
     fy: float
@@ -66,7 +66,7 @@ class Camera:
         return self._distort(np.asarray(xy_normalised, dtype=np.float64)) * self._focal + self._centre
 
     def undistort(self, xy: ArrayLike) -> Float:
-        """(N, 2) px -> (N, 2) undistorted points on the z = 1 plane, by Newton's method; the inverse of :meth:`distort`.
+        """(N, 2) px -> (N, 2) undistorted points on the z = 1 plane: the inverse of :meth:`distort`, by Newton's method.
 
         Points so far outside the image that the model cannot be inverted come back as NaN.
         """
