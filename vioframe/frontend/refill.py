@@ -13,8 +13,7 @@ _LARGEST_SHIFT_PX = 3.0
 def thin(xy: Float, ids: Int, min_distance_px: float) -> NDArray[np.bool_]:
     """(N,) which tracks stay when of any two closer than ``min_distance_px`` the younger (larger id) goes."""
     order = np.argsort(ids)
-    gap2 = ((xy[order, None] - xy[None, order]) ** 2).sum(axis=2)
-    close = np.tril(gap2 < min_distance_px**2, -1)
+    close = np.tril(_squared_distances(xy[order], xy[order]) < min_distance_px**2, -1)
     keep = np.ones(len(xy), bool)
     for younger in np.flatnonzero(close.any(axis=1)):
         keep[younger] = not np.any(close[younger] & keep)
@@ -39,7 +38,7 @@ def spread(
         return row * columns + column
 
     limit = min_distance_px**2
-    free = ~(((candidates[:, None] - live[None]) ** 2).sum(axis=2) < limit).any(axis=1)
+    free = ~(_squared_distances(candidates, live) < limit).any(axis=1)
     cells = cell(candidates)
     population = np.bincount(cell(live), minlength=rows * columns)
     taken: list[int] = []
@@ -52,6 +51,12 @@ def spread(
         free &= ((candidates - candidates[best]) ** 2).sum(axis=1) >= limit
         free[best] = False
     return np.array(taken, np.int64)
+
+
+def _squared_distances(a: Float, b: Float) -> Float:
+    """(N, M) between (N, 2) and (M, 2); a coordinate at a time is several times faster than one (N, M, 2) array."""
+    squared: Float = np.subtract.outer(a[:, 0], b[:, 0]) ** 2 + np.subtract.outer(a[:, 1], b[:, 1]) ** 2
+    return squared
 
 
 def refine_whole_pixels(image: Image, xy: Float, half_window_px: int) -> Float:
