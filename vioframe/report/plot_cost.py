@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vioframe.report.evaluated import Evaluated
-from vioframe.report.style import caption, colour, legend_above, line
+from vioframe.report.style import PALETTE_SIZE, caption, colour, legend_above, line
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -28,12 +28,8 @@ def timing(runs: Sequence[Evaluated]) -> Figure:
     left = np.zeros(len(runs))
     handles = []
     for k, stage in enumerate(stages):
-        look: dict[str, Any] = {
-            "color": colour(k),
-            "hatch": _HATCHES[(k // 6) % len(_HATCHES)],
-            "edgecolor": "white",
-            "lw": 0.5,
-        }
+        hatch = _HATCHES[(k // PALETTE_SIZE) % len(_HATCHES)]
+        look: dict[str, Any] = {"facecolor": colour(k), "hatch": hatch, "edgecolor": "white", "lw": 0.5}
         width = np.array([each.get(stage, 0.0) for each in spent])
         ax.barh(range(len(runs)), width, left=left, height=0.6, **look)
         left += width
@@ -48,7 +44,7 @@ def timing(runs: Sequence[Evaluated]) -> Figure:
     legend_above(figure, handles)
     caption(
         figure,
-        "Without reading and decoding the images. A stage with parts of its own (a.b) shows what they leave of it.",
+        "Without reading and decoding the images.",
     )
     return figure
 
@@ -66,7 +62,8 @@ def tracks(runs: Sequence[Evaluated]) -> Figure:
             continue
         time_s = (counts.t_ns - counts.t_ns[0]) * 1e-9
         handles += panels[0].plot(time_s, counts.tracked, **line(i), label=run.name)
-        panels[1].plot(time_s, counts.new, **{**line(i), "lw": 1.0})
+        # In the first frame every feature is new, which would hide all that follows.
+        panels[1].plot(time_s[1:], counts.new[1:], **{**line(i), "lw": 1.0})
     for ax, name in zip(panels, ("features in the frame", "new among them"), strict=True):
         ax.set_ylabel(name)
         ax.set_ylim(bottom=0)

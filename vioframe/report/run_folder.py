@@ -27,15 +27,18 @@ class Timings:
     seconds: Mapping[str, Float]
 
     def exclusive(self) -> dict[str, Float]:
-        """Seconds by stage without those of its parts, so that the stages add up to the whole."""
+        """Seconds by stage such that they add up to the whole: ``a.other`` is what the parts of ``a`` leave of it."""
         out = {}
         for stage, spent in self.seconds.items():
             parts = [other for name, other in self.seconds.items() if name.rpartition(".")[0] == stage]
-            out[stage] = np.maximum(spent - np.sum(parts, axis=0), 0.0) if parts else spent
+            if parts:
+                out[f"{stage}.other"] = np.maximum(spent - np.sum(parts, axis=0), 0.0)
+            else:
+                out[stage] = spent
         return out
 
     def mean_ms(self) -> dict[str, float]:
-        """Mean milliseconds a frame of each stage by itself."""
+        """Mean milliseconds a frame by stage, adding up to the whole."""
         return {stage: 1e3 * float(spent.mean()) for stage, spent in self.exclusive().items()}
 
 

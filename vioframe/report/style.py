@@ -8,6 +8,7 @@ from typing import Any
 
 # Okabe and Ito's palette, strongest contrasts first; grey is the ground truth's.
 _COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
+PALETTE_SIZE = len(_COLOURS)
 _DASHES = ("-", (0, (6, 2)), (0, (2, 1.5)), (0, (6, 2, 1, 2)))
 
 # A broad grey ribbon stays visible below any number of lines that follow it.
@@ -39,12 +40,12 @@ RC: Mapping[Any, Any] = MappingProxyType(
 
 def line(i: int) -> dict[str, Any]:
     """Colour and dashes of the i-th run; runs beyond the palette differ by their dashes."""
-    return {"color": colour(i), "ls": _DASHES[(i // len(_COLOURS)) % len(_DASHES)]}
+    return {"color": colour(i), "ls": _DASHES[(i // PALETTE_SIZE) % len(_DASHES)]}
 
 
 def colour(i: int) -> str:
     """The i-th colour of the palette, which repeats."""
-    return _COLOURS[i % len(_COLOURS)]
+    return _COLOURS[i % PALETTE_SIZE]
 
 
 def caption(figure: Any, text: str) -> None:

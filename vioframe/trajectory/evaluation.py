@@ -137,7 +137,7 @@ def evaluate(
         scale=scale,
         relative=by_length,
         relative_by_fraction=by_fraction,
-        nees=() if raw.cov_pose is None else nees(ALIGNMENTS["first"](raw, truth).apply(raw), truth),
+        nees=nees(ALIGNMENTS["first"](raw, truth).apply(raw), truth),
         coverage=min(1.0, raw.duration_s / ground_truth.duration_s) if len(ground_truth) > 1 else 1.0,
         notes=tuple(_notes(estimate, raw, aligned, truth, at_rest)),
     )

@@ -61,7 +61,7 @@ def rotation_error_deg(aligned: Trajectory, truth: Trajectory) -> Float:
 class RelativeErrors:
     """How far the estimate drifts over stretches of ``length_m``, one entry for each pose a stretch starts from.
 
-    ``translation_percent`` (M,) of the length, ``yaw_deg`` (M,) about gravity, ``rotation_deg`` (M,) in all.
+    ``translation_percent`` (M,) of the way gone, ``yaw_deg`` (M,) about gravity, ``rotation_deg`` (M,) in all.
     """
 
     length_m: float
@@ -108,7 +108,7 @@ def _over_length(estimate: Trajectory, truth: Trajectory, travelled: Float, leng
     return RelativeErrors(
         length_m=float(length_m),
         start_ns=truth.t_ns[start],
-        translation_percent=100.0 / length_m * np.linalg.norm(p_est - p_true, axis=1),
+        translation_percent=100.0 * np.linalg.norm(p_est - p_true, axis=1) / (travelled[end] - travelled[start]),
         yaw_deg=np.degrees(np.abs(yaw_of(E_W))),
         rotation_deg=np.degrees(np.linalg.norm(so3.log(E_W), axis=1)),
     )

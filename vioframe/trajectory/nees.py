@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from vioframe.errors import TrajectoryError
 from vioframe.geometry import so3
 from vioframe.trajectory.trajectory import Trajectory
 from vioframe.types import DP, DTHETA, Float, Int
@@ -54,15 +53,15 @@ def nees(aligned: Trajectory, truth: Trajectory) -> tuple[Nees, ...]:
     """NEES of orientation, position and pose; ``aligned`` brings its covariance in the ground truth's world.
 
     Instants whose covariance is unknown (NaN) or singular, such as the very first where position and yaw are the gauge,
-    tell nothing and are left out. Raises :class:`TrajectoryError` where no instant is left.
+    tell nothing and are left out. Empty where no instant is left.
     """
     if aligned.cov_pose is None:
-        raise TrajectoryError("the estimate has no covariance, so there is no NEES")
+        return ()
     cov = 0.5 * (aligned.cov_pose + aligned.cov_pose.transpose(0, 2, 1))
     finite = np.flatnonzero(np.isfinite(cov).all(axis=(1, 2)))
     usable = finite[_well_conditioned(cov[finite])]
     if not usable.size:
-        raise TrajectoryError("no pose has a positive definite covariance, so there is no NEES")
+        return ()
     error, cov, t_ns = pose_error(aligned, truth)[usable], cov[usable], aligned.t_ns[usable]
     return tuple(
         Nees(part, error[:, s].shape[1], t_ns, mahalanobis(error[:, s], cov[:, s, s]), band(error[:, s].shape[1]))

@@ -1,0 +1,165 @@
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from trajectory_helpers import disturbed, flight, write_run
+
+from vioframe.cli import main
+from vioframe.report import plot_cost, plot_errors, plot_paths
+from vioframe.report.evaluated import evaluate_path, evaluate_paths
+from vioframe.report.figures import write_figures
+from vioframe.trajectory import Trajectory, evaluate, write_tum
+
+EVERYTHING = {
+    "path_3d",
+    "path_top",
+    "path_side",
+    "translation_error",
+    "rotation_error",
+    "relative_error",
+    "timing",
+    "tracks",
+}
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Run folders ``a`` and ``b`` of one flight, and ``b`` as a bare file."""
+    folder = tmp_path_factory.mktemp("runs")
+    truth = flight()
+    for name, sigma_m in (("a", 0.02), ("b", 0.1)):
+        write_run(folder / name, disturbed(truth, sigma_m, 0.01), truth)
+    write_tum(disturbed(truth, 0.1, 0.01), folder / "b.tum")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def runs(folder):
+    return evaluate_paths([folder / "a", folder / "b"])
+
+
+def legend(figure):
+    return [text.get_text() for text in figure.legends[0].get_texts()]
+
+
+def test_everything_is_drawn_of_runs_that_have_everything(folder, tmp_path):
+    result = CliRunner().invoke(main, ["plot", str(folder / "a"), str(folder / "b"), "--out", str(tmp_path), "--svg"])
+    assert result.exit_code == 0, result.output
+    written = {path.name for path in tmp_path.iterdir()}
+    assert written == {f"{name}.{ending}" for name in EVERYTHING for ending in ("png", "svg")}
+    assert {line.rsplit("/", 1)[-1] for line in result.stdout.splitlines()} == written
+    assert all(path.read_bytes()[:4] == b"\x89PNG" for path in tmp_path.glob("*.png"))
+
+
+def test_one_run_gets_its_plots_in_its_folder(folder):
+    assert CliRunner().invoke(main, ["plot", str(folder / "a")]).exit_code == 0
+    assert {path.stem for path in (folder / "a" / "plots").iterdir()} == EVERYTHING
+
+
+def test_equal_runs_give_equal_figures(runs, tmp_path):
+    for name in ("one", "two"):
+        write_figures(runs, tmp_path / name, formats=("svg", "png"))
+    for path in (tmp_path / "one").iterdir():
+        assert path.read_bytes() == (tmp_path / "two" / path.name).read_bytes(), path.name
+
+
+def test_a_bare_file_is_drawn_as_far_as_it_goes(folder, tmp_path):
+    truth = evaluate_path(folder / "a", None).ground_truth
+    with_truth = write_figures([evaluate_path(folder / "b.tum", truth)], tmp_path / "1")
+    assert {path.stem for path in with_truth} == EVERYTHING - {"timing", "tracks"}
+    without = write_figures([evaluate_path(folder / "b.tum", None)], tmp_path / "2")
+    assert {path.stem for path in without} == {"path_3d", "path_top", "path_side"}
+
+
+def test_a_run_without_a_pose_does_not_spoil_the_others(tmp_path, folder):
+    write_run(tmp_path / "never", flight(30), flight(30), waiting=30)
+    written = write_figures(evaluate_paths([tmp_path / "never", folder / "a"]), tmp_path / "plots")
+    assert {path.stem for path in written} == EVERYTHING
+
+
+@pytest.mark.parametrize(("draw", "axes"), [(plot_paths.path_top, (0, 1)), (plot_paths.path_side, (0, 2))])
+def test_a_metre_is_a_metre_on_both_axes_and_nothing_is_cut_off(runs, draw, axes):
+    ax = draw(runs).axes[0]
+    assert ax.get_aspect() == 1.0
+    p_WB = runs[0].ground_truth.p_WB
+    for k, (low, high) in zip(axes, (ax.get_xlim(), ax.get_ylim()), strict=True):
+        assert low < p_WB[:, k].min()
+        assert p_WB[:, k].max() < high
+    assert "[m]" in ax.get_xlabel()
+    assert "[m]" in ax.get_ylabel()
+
+
+def test_the_3d_axes_are_to_scale(runs):
+    ax = plot_paths.path_3d(runs).axes[0]
+    sizes = np.array([np.ptp(limits) for limits in (ax.get_xlim(), ax.get_ylim(), ax.get_zlim())])
+    np.testing.assert_allclose(ax._box_aspect / ax._box_aspect[0], sizes / sizes[0], rtol=1e-6)
+
+
+def test_every_run_is_named_and_the_alignment_stated(runs):
+    figures = [plot_paths.path_3d(runs), plot_paths.path_top(runs), plot_paths.path_side(runs)]
+    for figure in figures:
+        assert legend(figure) == ["ground truth", "a", "b"]
+    figures += [plot_errors.translation_error(runs), plot_errors.rotation_error(runs)]
+    for figure in figures:
+        assert "position + yaw" in figure._supxlabel.get_text()
+        assert set(legend(figure)) >= {"a", "b"}
+
+
+def test_the_curves_are_the_errors(runs):
+    expected = evaluate(runs[1].estimate, runs[1].ground_truth)
+    for draw, series in [
+        (plot_errors.translation_error, expected.position_m),
+        (plot_errors.rotation_error, expected.rotation_rpy_deg),
+    ]:
+        figure = draw(runs)
+        for k, ax in enumerate(figure.axes):
+            (line,) = [line for line in ax.get_lines() if line.get_label() == "b"]
+            np.testing.assert_array_equal(line.get_ydata(), series[:, k])
+            # The first ten frames had no estimate; time counts from where the ground truth begins.
+            assert line.get_xdata()[0] == pytest.approx(0.5)
+
+
+def test_the_band_is_as_wide_as_asked(runs):
+    with_band = plot_errors.translation_error(runs, band_m=0.2)
+    assert "±20 cm" in with_band._supxlabel.get_text()
+    for ax in with_band.axes:
+        (band,) = ax.patches
+        assert (band.get_y(), band.get_height()) == (-0.2, 0.4)
+    assert all(not ax.patches for ax in plot_errors.translation_error(runs).axes)
+
+
+def test_no_line_is_drawn_across_a_gap():
+    truth = flight()
+    holed = truth.select(np.r_[0:100, 200:400])
+    (run,) = [evaluate_run(holed, truth)]
+    ax = plot_errors.translation_error([run]).axes[0]
+    (line,) = [line for line in ax.get_lines() if line.get_label() == "holed"]
+    assert np.flatnonzero(np.isnan(line.get_ydata())).tolist() == [100]
+
+
+def evaluate_run(estimate, truth):
+    from vioframe.report.evaluated import Evaluated
+
+    return Evaluated("holed", None, estimate, truth, evaluate(estimate, truth))
+
+
+def test_a_short_path_shows_fractions_of_itself():
+    truth = flight()
+    short = Trajectory(truth.t_ns, truth.R_WB, truth.p_WB / 20.0)
+    lower = plot_errors.relative_error([evaluate_run(disturbed(short, 0.001, 0.001), short)]).axes[1]
+    assert lower.get_xlabel() == "length of the stretch [% of the path]"
+    assert [tick.get_text() for tick in lower.get_xticklabels()] == ["10", "20", "30", "40", "50"]
+
+
+def test_the_bars_add_up_to_the_time_a_frame(runs):
+    ax = plot_cost.timing(runs).axes[0]
+    ends = [bar.get_x() + bar.get_width() for bar in ax.patches]
+    assert max(ends) == pytest.approx(sum(runs[0].stage_ms().values()), rel=1e-9)
+    assert f"{max(ends):.1f} ms" in {text.get_text() for text in ax.texts}
+
+
+def test_figures_that_cannot_be_written_are_one_line(folder, tmp_path):
+    (tmp_path / "file").write_text("")
+    result = CliRunner().invoke(main, ["plot", str(folder / "a"), "--out", str(tmp_path / "file")])
+    assert result.exit_code == 2
+    assert "cannot write figures" in result.stderr
+    assert len(result.stderr.splitlines()) == 1
