@@ -1,8 +1,8 @@
 """A small visual-inertial bundle adjustment: the most likely states and landmarks of a window, and how sure they are.
 
 Levenberg-Marquardt over K states and L landmarks in inverse depth, with Cauchy's robust loss on the observations,
-pre-integrated readings between the states, and priors on the biases. The landmarks are eliminated by the Schur complement
-(Triggs et al., "Bundle Adjustment: A Modern Synthesis", 2000, section 6.1).
+pre-integrated readings between the states, and priors on the biases. The landmarks are eliminated by the Schur
+complement (Triggs et al., "Bundle Adjustment: A Modern Synthesis", 2000, section 6.1).
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ _YAW_W = np.array([0.0, 0.0, 1.0])
 
 @dataclass(frozen=True, slots=True)
 class Problem:
-    """What is known: observations with noise ``sigma`` on the z = 1 plane, readings, and the biases' priors about zero."""
+    """What is known: observations with noise ``sigma`` on the z = 1 plane, readings, the biases' priors about zero."""
 
     observations: Observations
     factors: ImuFactors
@@ -48,7 +48,7 @@ class Solution:
 
 
 def solve(problem: Problem, states: StateArrays, landmarks: Float) -> Solution:
-    """Minimise from the given states and landmarks. The first state keeps its position and its rotation about gravity."""
+    """Minimise from the given states and landmarks; the first state keeps its position and its turn about gravity."""
     cost = _cost(problem, states, landmarks)
     damping = _FIRST_DAMPING
     for _ in range(_MAX_ITERATIONS):
@@ -76,13 +76,16 @@ def covariance(problem: Problem, solution: Solution) -> Float:
     normal = _normal_equations(problem, solution.states, solution.landmarks)
     _hold_gauge(normal.H, solution.states, len(solution.states) - 1)
     S, _ = normal.reduced(0.0)
-    out: Float = np.linalg.inv(S)
+    out = np.asarray(np.linalg.inv(S), np.float64)
     return 0.5 * (out + out.T)
 
 
 @dataclass(frozen=True, slots=True)
 class _Normal:
-    """Normal equations [H W'; W V] over [states, landmarks] and gradients b, c; ``W`` (L, 3, 6 K) has pose columns only."""
+    """Normal equations [H W'; W V] over [states, landmarks], and gradients b, c.
+
+    ``W`` (L, 3, 6 K) has columns for the poses only.
+    """
 
     H: Float
     W: Float
@@ -95,7 +98,8 @@ class _Normal:
         pose = _pose_columns(len(self.H) // 15)
         W = self.W.reshape(-1, len(pose))
         Y = (self._inverse_V(damping) @ self.W).reshape(W.shape)
-        S = self.H + damping * np.diag(np.diag(self.H))
+        S = self.H.copy()
+        S[np.diag_indices_from(S)] *= 1.0 + damping
         S[np.ix_(pose, pose)] -= W.T @ Y
         rhs = self.b.copy()
         rhs[pose] -= Y.T @ self.c.ravel()
@@ -110,7 +114,7 @@ class _Normal:
 
     def _inverse_V(self, damping: float) -> Float:
         # The constant keeps a landmark without parallax solvable; it is far below one pixel's information.
-        return np.linalg.inv(self.V + (damping * self.V + 1e-6) * np.eye(3))
+        return np.asarray(np.linalg.inv(self.V + (damping * self.V + 1e-6) * np.eye(3)), np.float64)
 
 
 def _normal_equations(problem: Problem, states: StateArrays, landmarks: Float) -> _Normal:
@@ -123,15 +127,15 @@ def _normal_equations(problem: Problem, states: StateArrays, landmarks: Float) -
     J = np.zeros((len(r), 2, K, 6))
     J[M, :, obs.frame] = J_frame * weight[:, None, None]
     J[M, :, obs.host] += J_host * weight[:, None, None]
-    J = J.reshape(-1, 2, 6 * K)
+    by_pose: Float = J.reshape(-1, 2, 6 * K)
 
     H, b = _inertial(problem, states)
     pose = _pose_columns(K)
-    flat = J.reshape(-1, 6 * K)
+    flat = by_pose.reshape(-1, 6 * K)
     H[np.ix_(pose, pose)] += flat.T @ flat
     b[pose] += flat.T @ r.ravel()
     transposed = np.swapaxes(J_landmark, -1, -2)
-    W = np.add.reduceat(transposed @ J, obs.start)
+    W = np.add.reduceat(transposed @ by_pose, obs.start)
     V = np.add.reduceat(transposed @ J_landmark, obs.start)
     c = np.add.reduceat((transposed @ r[..., None])[..., 0], obs.start)
     return _Normal(H, W.reshape(L, 3, 6 * K), V, b, c)
@@ -172,7 +176,7 @@ def _cost(problem: Problem, states: StateArrays, landmarks: Float) -> float:
 
 
 def _robust_weight(r: Float, sigma: float) -> Float:
-    return 1.0 / (1.0 + (r**2).sum(axis=1) / (sigma * _CAUCHY) ** 2)
+    return np.asarray(1.0 / (1.0 + (r**2).sum(axis=1) / (sigma * _CAUCHY) ** 2))
 
 
 def _pose_columns(K: int) -> np.ndarray[tuple[int], np.dtype[np.int64]]:

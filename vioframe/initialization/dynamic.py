@@ -16,25 +16,26 @@ from vioframe.inertial.imu_factors import ImuFactors, StateArrays
 from vioframe.inertial.preintegration import Preintegrated, preintegrate
 from vioframe.initialization import bundle_adjustment
 from vioframe.initialization import landmarks as lm
-from vioframe.initialization.alignment import Alignment, align
+from vioframe.initialization.alignment import Alignment, align, rotations
 from vioframe.initialization.attitude import level_rotation
 from vioframe.initialization.bundle_adjustment import Problem, Solution
-from vioframe.initialization.estimate import InitialEstimate, Refused
+from vioframe.initialization.estimate import InitialEstimate, RefusalError
 from vioframe.initialization.gyro_bias import estimate_gyro_bias
 from vioframe.initialization.judgement import check_fit, check_lookahead, check_parallax, check_uncertainty
 from vioframe.initialization.landmarks import Observations
 from vioframe.initialization.options import InitializationOptions
+from vioframe.initialization.structure import Structure, solve_structure
 from vioframe.initialization.window import Bool, Packet, Window, build_window, spread_indices
 from vioframe.types import DP, DV, Calibration, Float, NavState
 
 _MIN_VIEWS = 4
 # Tracks farther off than this are not noise: standard deviations, typical over all views.
-_EPIPOLAR_LIMIT, _ALIGNMENT_LIMIT, _ADJUSTED_LIMIT = 3.0, 8.0, 3.0
+_EPIPOLAR_LIMIT, _STRUCTURE_LIMIT, _ADJUSTED_LIMIT = 3.0, 10.0, 3.0
 _FARTHEST_M = 200.0
 
 
 def initialise(packets: Sequence[Packet], calibration: Calibration, options: InitializationOptions) -> InitialEstimate:
-    """Estimate from consecutive ``packets``, the newest last; raises :class:`Refused`."""
+    """Estimate from consecutive ``packets``, the newest last; raises :class:`RefusalError`."""
     t_ns = np.array([tracks.t_ns for _, tracks in packets])
     held_out = int((t_ns > t_ns[-1] - options.lookahead_s * 1e9).sum())
     chosen = spread_indices(t_ns[:-held_out], options.keyframes)
@@ -46,8 +47,11 @@ def initialise(packets: Sequence[Packet], calibration: Calibration, options: Ini
     imu = _preintegrate(window, bias_gyro, np.zeros(3), calibration)
     check_parallax(window, imu, calibration, options)
 
-    window, start = _aligned(window, imu, calibration, sigma, options)
-    states, landmarks = _start_of_adjustment(window.without_last(), start, bias_gyro)
+    window, structure = _structure(window, rotations(imu) @ calibration.R_BC, sigma, options)
+    alignment = align(structure.position, imu[:-1], calibration, options.bias_accel_sigma)
+    if alignment.scale <= 0.0:
+        raise RefusalError("the readings contradict the direction of the motion in the images")
+    states, landmarks = _start_of_adjustment(window.without_last(), structure, alignment, bias_gyro)
     problem = _problem(window.without_last(), states, calibration, sigma, options)
     solution = bundle_adjustment.solve(problem, states, landmarks)
     keep = _explained(problem, solution)
@@ -73,7 +77,7 @@ def initialise(packets: Sequence[Packet], calibration: Calibration, options: Ini
 
 def _require(window: Window, what: str, options: InitializationOptions) -> None:
     if len(window.ids) < options.min_landmarks:
-        raise Refused(f"{len(window.ids)} {what}, {options.min_landmarks} are needed")
+        raise RefusalError(f"{len(window.ids)} {what}, {options.min_landmarks} are needed")
 
 
 def _preintegrate(
@@ -89,39 +93,26 @@ def _with_gyro_bias(
     imu = _preintegrate(window, np.zeros(3), np.zeros(3), calibration)
     bias, distance = estimate_gyro_bias(window, imu, calibration.R_BC, sigma, options.bias_gyro_sigma)
     if np.linalg.norm(bias) > 3.0 * options.bias_gyro_sigma:
-        raise Refused(f"gyroscope bias of {np.linalg.norm(bias):.2f} rad/s is not plausible")
+        raise RefusalError(f"gyroscope bias of {np.linalg.norm(bias):.2f} rad/s is not plausible")
     window = window.only(distance < _EPIPOLAR_LIMIT)
     _require(window, "tracks lie on their epipolar lines", options)
     return window, bias
 
 
-def _aligned(
-    window: Window, imu: Sequence[Preintegrated], calibration: Calibration, sigma: float, options: InitializationOptions
-) -> tuple[Window, Alignment]:
-    """The closed form without the newest keyframe, and the tracks that fit it; solved again without the others."""
+def _structure(window: Window, R_B0C: Float, sigma: float, options: InitializationOptions) -> tuple[Window, Structure]:
+    """The structure without the newest keyframe, from the tracks that fit it."""
     for _ in range(2):
-        inner = window.without_last()
-        alignment = align(inner, imu[:-1], calibration, sigma, options.bias_accel_sigma)
-        keep = _fit_alignment(inner, alignment, calibration, sigma)
+        structure = solve_structure(window.without_last(), R_B0C[:-1], sigma)
+        typical = np.nanmedian(structure.error, axis=0)
+        keep = structure.good & (typical < _STRUCTURE_LIMIT * sigma)
         window = window.only(keep)
-        _require(window, "tracks fit the closed form", options)
-        if keep.all():
-            break
-    return window, alignment.only(keep)
+        _require(window, "tracks have parallax and fit the structure", options)
+    return window, structure.only(keep)
 
 
-def _fit_alignment(window: Window, alignment: Alignment, calibration: Calibration, sigma: float) -> Bool:
-    """(L,) whether a track's landmark lies in front of all its cameras and near its observations."""
-    R_B0C = alignment.R_B0B @ calibration.R_BC
-    p_B0C = alignment.p_B0B + alignment.R_B0B @ calibration.p_BC
-    p_C = (alignment.p_B0F - p_B0C[:, None]) @ R_B0C
-    in_front = p_C[..., 2] > 0.0
-    error = np.linalg.norm(p_C[..., :2] / np.where(in_front, p_C[..., 2], 1.0)[..., None] - window.xy, axis=-1)
-    typical = np.nanmedian(np.where(window.seen, error, np.nan), axis=0)
-    return (in_front | ~window.seen).all(axis=0) & (typical < _ALIGNMENT_LIMIT * sigma)
-
-
-def _start_of_adjustment(window: Window, alignment: Alignment, bias_gyro_B: Float) -> tuple[StateArrays, Float]:
+def _start_of_adjustment(
+    window: Window, structure: Structure, alignment: Alignment, bias_gyro_B: Float
+) -> tuple[StateArrays, Float]:
     """States in a world with z up, and landmarks (L, 3) [x y rho] in the first frame that sees them."""
     R_WB0 = level_rotation(-alignment.g_B0)
     count = len(window.t_ns)
@@ -134,7 +125,7 @@ def _start_of_adjustment(window: Window, alignment: Alignment, bias_gyro_B: Floa
     )
     track = np.arange(len(window.ids))
     host = window.seen.argmax(axis=0)
-    inverse_depth = 1.0 / np.clip(alignment.depth[host, track], 0.1, _FARTHEST_M)
+    inverse_depth = 1.0 / (alignment.scale * structure.depth[host, track])
     return states, np.column_stack([window.xy[host, track], inverse_depth])
 
 
@@ -165,7 +156,8 @@ def _explained(problem: Problem, solution: Solution) -> Bool:
     views = np.diff(np.append(obs.start, len(obs.frame)))
     rms = np.sqrt(np.add.reduceat((r**2).sum(axis=1), obs.start) / (2 * views)) / problem.sigma
     in_front = np.minimum.reduceat(depth_ratio, obs.start) > 0.0
-    return (rms < _ADJUSTED_LIMIT) & in_front & (solution.landmarks[:, 2] > 1.0 / _FARTHEST_M)
+    keep: Bool = (rms < _ADJUSTED_LIMIT) & in_front & (solution.landmarks[:, 2] > 1.0 / _FARTHEST_M)
+    return keep
 
 
 def _predict(packets: Sequence[Packet], last: NavState, calibration: Calibration) -> list[NavState]:
@@ -178,7 +170,7 @@ def _predict(packets: Sequence[Packet], last: NavState, calibration: Calibration
 
 
 def _estimate(window: Window, solution: Solution, cov: Float, p_WF: Float) -> InitialEstimate:
-    """Yaw and position zero at the first state, exactly; the error state is the body's, so the covariance only turns."""
+    """The world turned and moved so that yaw and position are zero at the first state."""
     R_0, p_0 = solution.states.R_WB[0], solution.states.p_WB[0]
     R_new = level_rotation(R_0[2]) @ R_0.T  # R_0[2] is the vertical in the body
     turn = np.eye(15)

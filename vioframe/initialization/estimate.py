@@ -14,8 +14,9 @@ from vioframe.types import Float, Int, NavState
 class InitialEstimate:
     """Where an estimator begins, in a world with z up whose origin and yaw zero are those of the first state.
 
-    ``states`` are the window's frames, oldest first. The last is the newest frame and has ``cov`` (15, 15), with position
-    and yaw pinned at that frame. ``landmark_ids`` (L,) and ``p_WF`` (L, 3) m are the dynamic method's landmarks.
+    ``states`` are the window's frames, oldest first. The last is the newest frame and has ``cov`` (15, 15), with
+    position and yaw, which nothing measures, pinned at that frame. ``landmark_ids`` (L,) and ``p_WF`` (L, 3) m are the
+    dynamic method's landmarks.
     """
 
     method: Literal["static", "dynamic"]
@@ -24,5 +25,5 @@ class InitialEstimate:
     p_WF: Float = field(default_factory=lambda: np.empty((0, 3)))
 
 
-class Refused(Exception):
+class RefusalError(Exception):
     """An attempt came to nothing; the message says why in one line. Never leaves the package."""

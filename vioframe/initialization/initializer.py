@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from vioframe.initialization import dynamic, static
-from vioframe.initialization.estimate import InitialEstimate, Refused
+from vioframe.initialization.estimate import InitialEstimate, RefusalError
 from vioframe.initialization.options import InitializationOptions
 from vioframe.initialization.window import Packet
 from vioframe.types import Calibration, FrameTracks, ImuNoise, ImuSegment
@@ -43,13 +43,14 @@ class Initializer:
             self.reset()
             _log.info("no readings for %.2f s: begun anew", imu.largest_gap_s)
         self._packets.append((imu, _finite(tracks)))
+        self._packets = self._last(self._options.longest_window_s)
         reasons = []
         for method, attempt in (("static", self._static), ("dynamic", self._dynamic)):
             try:
                 estimate = attempt()
-            except Refused as refused:
-                reasons.append(f"{method}: {refused}")
-                _log.debug("%d %s refused: %s", tracks.t_ns, method, refused)
+            except RefusalError as refusal:
+                reasons.append(f"{method}: {refusal}")
+                _log.debug("%d %s refused: %s", tracks.t_ns, method, refusal)
                 continue
             if estimate is not None:
                 _log.info("%d %s initialisation accepted", tracks.t_ns, method)
@@ -66,12 +67,11 @@ class Initializer:
         return static.initialise(packets, self._calibration, self._options)
 
     def _dynamic(self) -> InitialEstimate | None:
-        self._packets = self._last(self._options.longest_window_s)
         newest_ns = self._packets[-1][1].t_ns
-        due = (
-            self._last_attempt_ns is None or newest_ns - self._last_attempt_ns >= self._options.attempt_interval_s * 1e9
-        )
-        if not due or _duration_s(self._packets) < self._options.shortest_window_s:
+        last_ns = self._last_attempt_ns
+        if last_ns is not None and newest_ns - last_ns < self._options.attempt_interval_s * 1e9:
+            return None
+        if _duration_s(self._packets) < self._options.shortest_window_s:
             return None
         self._last_attempt_ns = newest_ns
         return dynamic.initialise(self._packets, self._in_flight, self._options)

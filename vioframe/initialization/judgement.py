@@ -1,4 +1,4 @@
-"""What an attempt in motion must show before it is believed. Each check raises :class:`Refused` with its figure."""
+"""What an attempt in motion must show before it is believed. Each check raises :class:`RefusalError`."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 from vioframe.inertial.preintegration import Preintegrated
 from vioframe.initialization import landmarks as lm
 from vioframe.initialization.bundle_adjustment import Problem, Solution
-from vioframe.initialization.estimate import Refused
+from vioframe.initialization.estimate import RefusalError
 from vioframe.initialization.options import InitializationOptions
 from vioframe.initialization.window import Window
 from vioframe.types import DP, DTHETA, DV, Calibration, Float, FrameTracks, Int, NavState
@@ -33,27 +33,25 @@ def check_parallax(
     angle = np.nanmax(np.linalg.norm(rays_B0 - first, axis=2), axis=0)
     parallax = float(np.median(angle)) * calibration.camera.focal_px
     if parallax < options.min_parallax_px:
-        raise Refused(f"parallax of {parallax:.1f} px, {options.min_parallax_px:.1f} px are needed")
+        raise RefusalError(f"parallax of {parallax:.1f} px, {options.min_parallax_px:.1f} px are needed")
 
 
 def check_fit(problem: Problem, solution: Solution, options: InitializationOptions) -> None:
     """Observations, readings and biases must be as the noise and the priors have them."""
     if not solution.converged:
-        raise Refused("the bundle adjustment did not converge")
+        raise RefusalError("the bundle adjustment did not converge")
     r, _ = lm.project(solution.states, solution.landmarks, problem.observations, problem.calibration)
     rms = float(np.sqrt((r**2).mean())) * problem.calibration.camera.focal_px
     if rms > options.max_reprojection_px:
-        raise Refused(
-            f"reprojection error of {rms:.1f} px RMS, at most {options.max_reprojection_px:.1f} px is allowed"
-        )
+        raise RefusalError(f"reprojection error of {rms:.1f} px RMS, {options.max_reprojection_px:.1f} px are allowed")
     factors, states = problem.factors, solution.states
     readings = (factors.sqrt_information @ factors.residuals(states[:-1], states[1:])[..., None])[..., 0]
     inertial = float((readings**2).mean())
     if inertial > _MAX_INERTIAL:
-        raise Refused(f"the readings disagree with the images: {inertial:.1f} times their noise's variance")
+        raise RefusalError(f"the readings disagree with the images: {inertial:.1f} times their noise's variance")
     bias = float(np.linalg.norm(states.bias_accel_B[-1]))
     if bias > 3.0 * options.bias_accel_sigma * np.sqrt(3.0):
-        raise Refused(f"accelerometer bias of {bias:.2f} m/s^2 is not plausible")
+        raise RefusalError(f"accelerometer bias of {bias:.2f} m/s^2 is not plausible")
 
 
 def check_lookahead(
@@ -68,12 +66,12 @@ def check_lookahead(
     for state, tracks in zip(predicted, seen, strict=True):
         _, a, b = np.intersect1d(ids, tracks.ids, return_indices=True)
         if len(a) < _MIN_COMMON:
-            raise Refused(f"only {len(a)} landmarks were still tracked in the frames held back")
+            raise RefusalError(f"only {len(a)} landmarks were still tracked in the frames held back")
         p_C = ((p_WF[a] - state.p_WB) @ state.R_WB - calibration.p_BC) @ calibration.R_BC
         error = np.linalg.norm(p_C[:, :2] / p_C[:, 2:] - tracks.xy_normalised[b], axis=1)
         px = float(np.median(np.where(p_C[:, 2] > 0.0, error, np.inf))) * calibration.camera.focal_px
         if px > options.max_lookahead_px:
-            raise Refused(f"the prediction misses a later frame by {px:.1f} px")
+            raise RefusalError(f"the prediction misses a later frame by {px:.1f} px")
 
 
 def check_uncertainty(solution: Solution, cov: Float, options: InitializationOptions) -> None:
@@ -81,17 +79,17 @@ def check_uncertainty(solution: Solution, cov: Float, options: InitializationOpt
     newest = cov[-15:, -15:]
     velocity = float(np.sqrt(np.linalg.eigvalsh(newest[DV, DV])[-1]))
     if velocity > options.max_velocity_sigma:
-        raise Refused(f"velocity known to {velocity:.3f} m/s only (standard deviation)")
+        raise RefusalError(f"velocity known to {velocity:.3f} m/s only (standard deviation)")
     tilt = float(np.rad2deg(np.sqrt(np.linalg.eigvalsh(newest[DTHETA, DTHETA])[-1])))
     if tilt > options.max_tilt_sigma_deg:
-        raise Refused(f"gravity's direction known to {tilt:.2f} deg only (standard deviation)")
+        raise RefusalError(f"gravity's direction known to {tilt:.2f} deg only (standard deviation)")
     scale = scale_sigma(solution.states.p_WB, cov)
     if scale > options.max_scale_sigma:
-        raise Refused(f"scale known to {100.0 * scale:.0f} % only (standard deviation)")
+        raise RefusalError(f"scale known to {100.0 * scale:.0f} % only (standard deviation)")
 
 
 def scale_sigma(p_WB: Float, cov: Float) -> float:
-    """Relative standard deviation of the path's size: d s = sum q_k . dp_k / sum |q_k|^2, with q from the path's centre.
+    """Relative standard deviation of the path's size, sum q_k . dp_k / sum |q_k|^2 with q from the path's centre.
 
     Translations and rotations of the whole path have no part in it.
     """

@@ -17,9 +17,9 @@ _LEAST_DEPTH_RATIO = 0.05
 
 @dataclass(frozen=True, slots=True)
 class Observations:
-    """M observations sorted by track: ``frame``, ``landmark`` (M,), ``host`` (M,) the first frame of the track, ``xy`` (M, 2).
+    """M observations sorted by track, each (M,): ``frame``, ``landmark`` and ``host``, the first frame of the track.
 
-    ``start`` (L,) is where each track begins.
+    ``xy`` (M, 2) on the z = 1 plane; ``start`` (L,) is where each track begins.
     """
 
     frame: Int
@@ -51,7 +51,7 @@ def project(
 def linearise(
     states: StateArrays, landmarks: Float, observations: Observations, calibration: Calibration
 ) -> tuple[Float, Float, Float, Float]:
-    """Residuals (M, 2), and Jacobians by the pose [dtheta dp] of the frame and of the host (M, 2, 6), and by the landmark.
+    """Residuals (M, 2), Jacobians by the poses [dtheta dp] of frame and host (M, 2, 6), and by the landmark (M, 2, 3).
 
     Where the frame is the host itself the two pose Jacobians are zero.
     """
@@ -78,7 +78,7 @@ def linearise(
 def _transform(
     states: StateArrays, landmarks: Float, observations: Observations, calibration: Calibration
 ) -> tuple[Float, Float, Float, Float, Float]:
-    """The landmark times its inverse depth in the observing camera (M, 3), in the host's and the frame's body, R_CW, R_host."""
+    """Landmarks times inverse depth (M, 3) in the observing camera, the host's and the frame's body; R_CW; R_host."""
     m = landmarks[observations.landmark]
     rho = m[:, 2:]
     R_host, R_frame = states.R_WB[observations.host], states.R_WB[observations.frame]

@@ -24,11 +24,11 @@ class InitializationOptions:
     static_window_s: float = 1.0
     """Length of the standstill that the static method needs."""
     static_gyro_std: float = 0.02
-    """Most the gyroscope may vary at rest, rad/s."""
-    static_accel_std: float = 0.15
-    """Most the accelerometer may vary at rest, m/s^2."""
+    """Most the gyroscope's mean over 0.1 s may vary at rest, rad/s."""
+    static_accel_std: float = 0.2
+    """Most the accelerometer's mean over 0.1 s may vary at rest, m/s^2."""
     static_disparity_px: float = 1.0
-    """Most the median feature may have moved from the start of the window to any of its frames."""
+    """Most the median feature may move between the thirds of the window."""
 
     shortest_window_s: float = 1.0
     """The dynamic method is first tried when the window is this long ..."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,8 +20,8 @@ Packet = tuple[ImuSegment, FrameTracks]
 class Window:
     """K keyframes, the readings between them, and L tracks.
 
-    ``t_ns`` (K,), ``segments`` K - 1, ``ids`` (L,). ``xy`` (K, L, 2) are points on the z = 1 plane, NaN where ``seen`` (K, L)
-    is False.
+    ``t_ns`` (K,), ``segments`` K - 1, ``ids`` (L,). ``xy`` (K, L, 2) are points on the z = 1 plane, NaN where ``seen``
+    (K, L) is False.
     """
 
     t_ns: Int
@@ -39,11 +40,9 @@ class Window:
 
 
 def build_window(packets: Sequence[Packet], chosen: Sequence[int], min_views: int, max_landmarks: int) -> Window:
-    """The frames ``chosen`` (ascending indices into ``packets``) and the tracks seen in at least ``min_views`` of them."""
+    """The frames ``chosen`` (ascending indices of ``packets``) and the tracks that at least ``min_views`` of them see."""
     tracks = [packets[k][1] for k in chosen]
-    segments = tuple(
-        join_segments([imu for imu, _ in packets[a + 1 : b + 1]]) for a, b in zip(chosen[:-1], chosen[1:], strict=True)
-    )
+    segments = tuple(join_segments([imu for imu, _ in packets[a + 1 : b + 1]]) for a, b in pairwise(chosen))
     ids, views = np.unique(np.concatenate([t.ids for t in tracks]), return_counts=True)
     # The longest first; the older id where they are equally long.
     order = np.lexsort((ids, -views))
@@ -57,7 +56,7 @@ def build_window(packets: Sequence[Packet], chosen: Sequence[int], min_views: in
 
 
 def spread_indices(t_ns: Int, count: int) -> list[int]:
-    """At most ``count`` ascending indices of ``t_ns``, the first and last among them, as evenly spaced in time as can be."""
+    """At most ``count`` ascending indices of ``t_ns``, first and last among them, evenly spaced in time."""
     wanted = np.linspace(t_ns[0], t_ns[-1], count)
     nearest = np.abs(t_ns[:, None] - wanted).argmin(axis=0)
     return [int(k) for k in np.unique(nearest)]
