@@ -108,7 +108,7 @@ class _Normal:
     def solve(self, damping: float) -> tuple[Float, Float]:
         """The step of the states (15 K,) and of the landmarks (L, 3)."""
         S, rhs = self.reduced(damping)
-        dx = np.linalg.solve(S, -rhs)
+        dx = np.asarray(np.linalg.solve(S, -rhs), np.float64)
         along = self.c + self.W @ dx[_pose_columns(len(self.H) // 15)]
         return dx, -(self._inverse_V(damping) @ along[..., None])[..., 0]
 

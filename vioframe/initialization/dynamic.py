@@ -45,9 +45,10 @@ def initialise(packets: Sequence[Packet], calibration: Calibration, options: Ini
     _require(window, "tracks are long enough", options)
     window, bias_gyro = _with_gyro_bias(window, calibration, sigma, options)
     imu = _preintegrate(window, bias_gyro, np.zeros(3), calibration)
-    check_parallax(window, imu, calibration, options)
+    R_B0B = rotations(imu)
+    check_parallax(window, R_B0B, calibration, options)
 
-    window, structure = _structure(window, rotations(imu) @ calibration.R_BC, sigma, options)
+    window, structure = _structure(window, R_B0B @ calibration.R_BC, sigma, options)
     alignment = align(structure.position, imu[:-1], calibration, options.bias_accel_sigma)
     if alignment.scale <= 0.0:
         raise RefusalError("the readings contradict the direction of the motion in the images")

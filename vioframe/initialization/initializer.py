@@ -48,7 +48,7 @@ class Initializer:
         for method, attempt in (("static", self._static), ("dynamic", self._dynamic)):
             try:
                 estimate = attempt()
-            except RefusalError as refusal:
+            except (RefusalError, np.linalg.LinAlgError) as refusal:
                 reasons.append(f"{method}: {refusal}")
                 _log.debug("%d %s refused: %s", tracks.t_ns, method, refusal)
                 continue

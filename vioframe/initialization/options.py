@@ -27,12 +27,12 @@ class InitializationOptions:
     """Most the gyroscope's mean over 0.1 s may vary at rest, rad/s."""
     static_accel_std: float = 0.2
     """Most the accelerometer's mean over 0.1 s may vary at rest, m/s^2."""
-    static_disparity_px: float = 1.0
+    static_disparity_px: float = 1.5
     """Most the median feature may move between the thirds of the window."""
 
-    shortest_window_s: float = 1.0
-    """The dynamic method is first tried when the window is this long ..."""
-    longest_window_s: float = 2.5
+    shortest_window_s: float = 1.5
+    """The dynamic method is first tried when the window is this long, s ..."""
+    longest_window_s: float = 3.0
     """... and looks back no farther than this."""
     attempt_interval_s: float = 0.1
     """Time between two attempts of the dynamic method."""
@@ -42,7 +42,7 @@ class InitializationOptions:
     """Tracks that are used, the longest first."""
     min_landmarks: int = 20
     """Fewer usable tracks refuse the attempt."""
-    min_parallax_px: float = 8.0
+    min_parallax_px: float = 5.0
     """Least median parallax across the tracks, with the rotation taken out."""
     lookahead_s: float = 0.2
     """Length of the newest part of the window, which is predicted from the rest to test the estimate."""
@@ -50,9 +50,9 @@ class InitializationOptions:
     """Most the observations may disagree with the estimate (RMS) ..."""
     max_lookahead_px: float = 3.0
     """... and the predicted part of the window with its prediction (median)."""
-    max_scale_sigma: float = 0.08
+    max_scale_sigma: float = 0.06
     """Largest relative standard deviation of scale that is accepted."""
-    max_velocity_sigma: float = 0.06
+    max_velocity_sigma: float = 0.05
     """Largest standard deviation of velocity on any axis that is accepted, m/s."""
     max_tilt_sigma_deg: float = 1.0
     """Largest standard deviation of the gravity direction that is accepted."""

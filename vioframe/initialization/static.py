@@ -73,13 +73,13 @@ def _block_means(segments: Sequence[ImuSegment]) -> Float:
 
 
 def _check_images(packets: Sequence[Packet], options: InitializationOptions) -> None:
-    """A feature's mean place must be the same in every third of the window; the mean quietens noise and vibration."""
+    """A feature's typical place must be the same in every third of the window: medians quieten noise and outliers."""
     frames = [tracks for _, tracks in packets]
     common = reduce(np.intersect1d, (tracks.ids for tracks in frames))
     if len(common) < _MIN_COMMON:
         raise RefusalError(f"only {len(common)} features were tracked through the standstill window")
     xy = np.stack([t.xy[np.intersect1d(t.ids, common, return_indices=True)[1]] for t in frames])
-    first, middle, last = (third.mean(axis=0) for third in np.array_split(xy, 3))
+    first, middle, last = (np.median(third, axis=0) for third in np.array_split(xy, 3))
     for a, b in ((first, middle), (middle, last), (first, last)):
         moved = float(np.median(np.linalg.norm(b - a, axis=1)))
         if moved > options.static_disparity_px:

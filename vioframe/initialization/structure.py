@@ -2,8 +2,8 @@
 
 With known rotations R_k an observation says that [1 0 -x; 0 1 -y] R_k' (p_F - c_k) = 0, which is linear in the landmark
 p_F and the camera's position c_k (Rother, Carlsson, "Linear Multi View Reconstruction and Camera Recovery", ICCV 2001).
-Landmarks are eliminated, and the positions are the eigenvector of the least eigenvalue. No two-view geometry is involved,
-so that a planar scene is no special case.
+Landmarks are eliminated, and the positions are the eigenvector of the least eigenvalue. No two-view geometry is
+involved, so that a planar scene is no special case.
 
 Noise in x and y multiplies the unknown depth, hence plain least squares draws everything towards the cameras. The
 expectation of what noise adds to the normal equations is known, and taken off (total least squares; Van Huffel,

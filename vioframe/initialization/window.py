@@ -40,7 +40,7 @@ class Window:
 
 
 def build_window(packets: Sequence[Packet], chosen: Sequence[int], min_views: int, max_landmarks: int) -> Window:
-    """The frames ``chosen`` (ascending indices of ``packets``) and the tracks that at least ``min_views`` of them see."""
+    """The frames ``chosen``, ascending indices of ``packets``, and the tracks that ``min_views`` or more see."""
     tracks = [packets[k][1] for k in chosen]
     segments = tuple(join_segments([imu for imu, _ in packets[a + 1 : b + 1]]) for a, b in pairwise(chosen))
     ids, views = np.unique(np.concatenate([t.ids for t in tracks]), return_counts=True)
