@@ -91,7 +91,7 @@ def _integrate(dt, gyro, accel, variance):  # type: ignore[no-untyped-def]
     """
     R, p, v = np.eye(3), np.zeros(3), np.zeros(3)
     cov, transition = np.zeros((15, 15)), np.eye(15)
-    F, G = np.eye(15), np.zeros((9, 6))
+    F, by_gyro, by_accel = np.eye(15), np.zeros((9, 3)), np.zeros((9, 3))
     for i in range(len(dt)):
         h = dt[i]
         a_0, a_1 = accel[i], accel[i + 1]
@@ -111,16 +111,14 @@ def _integrate(dt, gyro, accel, variance):  # type: ignore[no-untyped-def]
         F[6:9, 0:3] = h * a_by_theta
         for k in range(3):
             F[3 + k, 6 + k] = h
-        G[0:3, 0:3] = theta_by_gyro
-        G[3:6, 0:3] = 0.5 * h * h * a_by_gyro
-        G[6:9, 0:3] = h * a_by_gyro
-        G[3:6, 3:6] = 0.5 * h * h * a_by_accel
-        G[6:9, 3:6] = h * a_by_accel
-        F[0:9, 9:15] = G
+        by_gyro[0:3] = theta_by_gyro
+        by_gyro[3:6], by_accel[3:6] = 0.5 * h * h * a_by_gyro, 0.5 * h * h * a_by_accel
+        by_gyro[6:9], by_accel[6:9] = h * a_by_gyro, h * a_by_accel
+        F[0:9, 9:12], F[0:9, 12:15] = by_gyro, by_accel
 
         transition = F @ transition
         cov = F @ cov @ F.T
-        cov[0:9, 0:9] += (variance[0] / h) * (G[:, 0:3] @ G[:, 0:3].T) + (variance[1] / h) * (G[:, 3:6] @ G[:, 3:6].T)
+        cov[0:9, 0:9] += (variance[0] / h) * (by_gyro @ by_gyro.T) + (variance[1] / h) * (by_accel @ by_accel.T)
         for k in range(3):
             cov[9 + k, 9 + k] += variance[2] * h
             cov[12 + k, 12 + k] += variance[3] * h
