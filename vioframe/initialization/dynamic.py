@@ -73,7 +73,8 @@ def initialise(packets: Sequence[Packet], calibration: Calibration, options: Ini
     cov = bundle_adjustment.covariance(problem, solution)
     check_uncertainty(solution, cov, options)
     p_WF = lm.positions(solution.states, solution.landmarks, problem.observations, calibration)
-    return _estimate(window, solution, cov, p_WF)
+    keep = _explained(problem, solution)
+    return _estimate(window.only(keep), solution, cov, p_WF[keep])
 
 
 def _require(window: Window, what: str, options: InitializationOptions) -> None:

@@ -23,7 +23,8 @@ class Initializer:
     attempt is also logged to ``vioframe.initialization``.
     """
 
-    def __init__(self, calibration: Calibration, options: InitializationOptions = InitializationOptions()) -> None:  # noqa: B008
+    def __init__(self, calibration: Calibration, options: InitializationOptions | None = None) -> None:
+        options = options or InitializationOptions()
         self._calibration = calibration
         self._in_flight = replace(calibration, imu=_inflated(calibration.imu, options.imu_noise_factor))
         self._options = options

@@ -16,7 +16,7 @@ from vioframe.initialization.options import InitializationOptions
 from vioframe.initialization.window import Packet
 from vioframe.types import DBA, DBG, DP, DTHETA, DV, GRAVITY_M_S2, Calibration, Float, ImuSegment, NavState, g_W
 
-_MIN_COMMON = 10
+_MIN_COMMON, _MIN_FRAMES = 10, 6
 _BLOCK_S = 0.1
 # How well "at rest" fixes what it says, m and m/s; position and yaw are the origin by definition.
 _VELOCITY_SIGMA = 0.02
@@ -75,6 +75,8 @@ def _block_means(segments: Sequence[ImuSegment]) -> Float:
 def _check_images(packets: Sequence[Packet], options: InitializationOptions) -> None:
     """A feature's typical place must be the same in every third of the window: medians quieten noise and outliers."""
     frames = [tracks for _, tracks in packets]
+    if len(frames) < _MIN_FRAMES:
+        raise RefusalError(f"only {len(frames)} frames in the standstill window")
     common = reduce(np.intersect1d, (tracks.ids for tracks in frames))
     if len(common) < _MIN_COMMON:
         raise RefusalError(f"only {len(common)} features were tracked through the standstill window")
