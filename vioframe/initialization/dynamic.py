@@ -184,5 +184,6 @@ def _estimate(window: Window, solution: Solution, cov: Float, p_WF: Float) -> In
         solution.states.bias_gyro_B,
         solution.states.bias_accel_B,
     ).unstack(window.t_ns)
-    states[-1] = replace(states[-1], cov=turn @ cov[-15:, -15:] @ turn.T)
+    newest = turn @ cov[-15:, -15:] @ turn.T
+    states[-1] = replace(states[-1], cov=0.5 * (newest + newest.T))
     return InitialEstimate("dynamic", tuple(states), window.ids, (p_WF - p_0) @ R_new.T)

@@ -19,8 +19,7 @@ _log = logging.getLogger("vioframe.initialization")
 class Initializer:
     """Tries the static method at every frame, and the dynamic one every so often, until one is sure of itself.
 
-    ``refusal`` says in one line why the last attempt came to nothing ("" before the first and after a success); every
-    attempt is also logged to ``vioframe.initialization``.
+    Every attempt is logged to ``vioframe.initialization``.
     """
 
     def __init__(self, calibration: Calibration, options: InitializationOptions | None = None) -> None:
@@ -28,15 +27,20 @@ class Initializer:
         self._calibration = calibration
         self._in_flight = replace(calibration, imu=_inflated(calibration.imu, options.imu_noise_factor))
         self._options = options
-        self.refusal = ""
+        self._refusals: dict[str, str] = {}
         self._packets: list[Packet] = []
         self._last_attempt_ns: int | None = None
+
+    @property
+    def refusal(self) -> str:
+        """Why the last attempt of each method came to nothing, in one line; "" before the first and after a success."""
+        return "; ".join(f"{method}: {reason}" for method, reason in self._refusals.items())
 
     def reset(self) -> None:
         """Forget everything seen."""
         self._packets.clear()
         self._last_attempt_ns = None
-        self.refusal = ""
+        self._refusals.clear()
 
     def add(self, imu: ImuSegment, tracks: FrameTracks) -> InitialEstimate | None:
         """Take one frame; an estimate whose newest state is at this frame, or None as long as none can be trusted."""
@@ -45,20 +49,17 @@ class Initializer:
             _log.info("no readings for %.2f s: begun anew", imu.largest_gap_s)
         self._packets.append((imu, _finite(tracks)))
         self._packets = self._last(self._options.longest_window_s)
-        reasons = []
         for method, attempt in (("static", self._static), ("dynamic", self._dynamic)):
             try:
                 estimate = attempt()
             except (RefusalError, np.linalg.LinAlgError) as refusal:
-                reasons.append(f"{method}: {refusal}")
+                self._refusals[method] = str(refusal)
                 _log.debug("%d %s refused: %s", tracks.t_ns, method, refusal)
                 continue
             if estimate is not None:
                 _log.info("%d %s initialisation accepted", tracks.t_ns, method)
-                self.refusal = ""
+                self._refusals.clear()
                 return estimate
-        if reasons:
-            self.refusal = "; ".join(reasons)
         return None
 
     def _static(self) -> InitialEstimate | None:
