@@ -72,7 +72,7 @@ def test_compiled_intrinsics_jacobian_is_the_derivative(camera):
             ],
             axis=1,
         )
-        np.testing.assert_allclose(kernels.intrinsics_jacobian(model, k, *n).T, numeric, rtol=1e-6, atol=1e-5)
+        np.testing.assert_allclose(kernels.intrinsics_jacobian(model, k, *n), numeric, rtol=1e-6, atol=1e-5)
 
 
 def test_compiled_rotations_agree():

@@ -62,7 +62,9 @@ def write_run(folder: Path, estimate: Trajectory, truth: Trajectory | None = Non
             ids = np.arange(3 * k, 3 * k + 120)
             tracks = FrameTracks(t_ns, ids, rng.uniform(0.0, 480.0, (120, 2)), np.zeros((120, 2)))
             seconds = dict(zip(("equalise", "klt", "reject", "detect"), rng.uniform(1e-3, 4e-3, 4), strict=True))
-            backend = {"backend": 5e-3, "backend.propagate": 5e-4, "backend.update": 3.5e-3} if state else {"backend": 1e-3}
+            backend = (
+                {"backend": 5e-3, "backend.propagate": 5e-4, "backend.update": 3.5e-3} if state else {"backend": 1e-3}
+            )
             frame = Frame(t_ns, np.zeros((1, 1), np.uint8))
             recorder.add(Step(frame, tracks, Estimate(status, state), {**seconds, **backend}))
 
@@ -74,5 +76,3 @@ def _state(estimate: Trajectory, k: int) -> NavState:
         cov[:6, :6] = estimate.cov_pose[k]
     zero = np.zeros(3)
     return NavState(int(estimate.t_ns[k]), estimate.R_WB[k], estimate.p_WB[k], zero, zero, zero, cov)
-
-

@@ -9,12 +9,13 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
+
 from vioframe.geometry import so3
 from vioframe.initialization import Initializer
 from vioframe.stopwatch import Stopwatch
 from vioframe.types import Calibration, Estimate, FrameTracks, ImuSegment, NavState, Status
 from vioframe_msckf.options import MsckfOptions
-from vioframe_msckf.standstill import hold_still, median_disparity_px
+from vioframe_msckf.standstill import StandstillDetector, hold_still
 from vioframe_msckf.state import FilterDivergedError, FilterState
 from vioframe_msckf.tracks import ObservationTable
 from vioframe_msckf.updates import promote_tracks, select_tracks, update_from_landmarks, update_from_tracks
@@ -39,7 +40,7 @@ class Msckf:
         self._gate = np.concatenate([[0.0], chi2.ppf(self._options.gate_quantile, dof)])
         self._state: FilterState | None = None
         self._observations = ObservationTable()
-        self._previous: FrameTracks | None = None
+        self._standstill = StandstillDetector(self._options.standstill_disparity_px)
         self._last: NavState | None = None
         self._seeing_ns = 0
         if initial_state is not None:
@@ -59,7 +60,7 @@ class Msckf:
             self._check(self._state, tracks.t_ns)
         except FilterDivergedError as error:
             return self._lose(str(error))
-        self._previous, self._last = tracks, estimate.state
+        self._last = estimate.state
         return estimate
 
     def _filter(self, state: FilterState, imu: ImuSegment, tracks: FrameTracks) -> Estimate:
@@ -103,14 +104,13 @@ class Msckf:
     def _stands_still(self, state: FilterState, imu: ImuSegment, tracks: FrameTracks) -> bool:
         """Hold the state where neither image nor IMU shows motion."""
         options = self._options
-        if not options.zero_velocity_update or self._previous is None:
-            return False
-        if median_disparity_px(self._previous, tracks) > options.standstill_disparity_px:
+        if not (options.zero_velocity_update and self._standstill.sees_standstill(tracks)):
             return False
         return hold_still(state, imu, self._calibration.imu, options.first_estimate_jacobians)
 
     def _initialise(self, imu: ImuSegment, tracks: FrameTracks) -> Estimate:
         watch = Stopwatch()
+        self._standstill.sees_standstill(tracks)
         initial = self._initializer.add(imu, tracks)
         watch.lap("initialise")
         if initial is None:
@@ -119,10 +119,8 @@ class Msckf:
             return Estimate(Status.INITIALISING, events=events, stage_seconds=watch.seconds)
         nav = initial.states[-1] if self._last is None else _moved_to(self._last, initial.states[-1])
         self._begin(nav)
-        self._previous, self._last = tracks, nav
-        return Estimate(
-            Status.TRACKING, nav, events=(f"initialised ({initial.method})",), stage_seconds=watch.seconds
-        )
+        self._last = nav
+        return Estimate(Status.TRACKING, nav, events=(f"initialised ({initial.method})",), stage_seconds=watch.seconds)
 
     def _begin(self, nav: NavState) -> None:
         options = self._options
@@ -142,15 +140,11 @@ class Msckf:
             raise FilterDivergedError(f"nothing usable was seen for {blind_s:.1f} s")
         if np.linalg.norm(state.v_WB) > _MAX_SPEED_M_S:
             raise FilterDivergedError(f"the speed exceeds {_MAX_SPEED_M_S:g} m/s")
-        if (
-            np.linalg.norm(state.bias_gyro_B) > _MAX_BIAS_GYRO
-            or np.linalg.norm(state.bias_accel_B) > _MAX_BIAS_ACCEL
-        ):
+        if np.linalg.norm(state.bias_gyro_B) > _MAX_BIAS_GYRO or np.linalg.norm(state.bias_accel_B) > _MAX_BIAS_ACCEL:
             raise FilterDivergedError("the IMU's biases became implausible")
 
     def _lose(self, why: str) -> Estimate:
         self._state = None
-        self._previous = None
         self._initializer.reset()
         return Estimate(Status.LOST, events=(f"lost: {why}",))
 

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
+
 from vioframe.geometry.kernels import distort, hat, intrinsics_jacobian, undistort
 from vioframe.types import Float, Int
 from vioframe_msckf.state import CALIBRATION, CLONES, FilterState
@@ -73,8 +74,10 @@ def msckf_measurement(
     gate: Float,
 ) -> FeatureUpdate:
     """Triangulate (F, C) tracks, linearise them, project out the landmarks, and gate each at ``gate[dof]``."""
-    P = np.ascontiguousarray(state.cov[CALIBRATION.start : state.landmarks_begin, CALIBRATION.start : state.landmarks_begin])
-    H, residual, p_WF, verdict = _msckf_rows(*window.arrays(), xy, xy_normalised, seen, P, pixel_sigma**2, gate)
+    P = np.ascontiguousarray(
+        state.cov[CALIBRATION.start : state.landmarks_begin, CALIBRATION.start : state.landmarks_begin]
+    )
+    H, residual, p_WF, verdict = _msckf_rows(*window.arrays(), xy, xy_normalised, seen, P, pixel_sigma, gate)
     return FeatureUpdate(H, residual, p_WF, verdict)
 
 
@@ -96,10 +99,10 @@ def landmark_rows(
 
 
 def track_rows(
-    window: Window, xy: Float, xy_normalised: Float, seen: NDArray[np.bool_]
+    window: Window, xy: Float, xy_normalised: Float, seen: NDArray[np.bool_], pixel_sigma: float
 ) -> tuple[Float, Float, Float, Float] | None:
     """One track (C,) -> (p_WF, H over [calibration, clones], H over the landmark, residual), or None untriangulated."""
-    ok, p_WF, H, H_f, residual = _track_rows(*window.arrays(), xy, xy_normalised, seen)
+    ok, p_WF, H, H_f, residual = _track_rows(*window.arrays(), xy, xy_normalised, seen, pixel_sigma)
     return (p_WF, H, H_f, residual) if ok else None
 
 
@@ -137,13 +140,25 @@ def _observations(R, p, R_first, p_first, R_BC, p_BC, model, k, clone, p_WF, p_W
     for i in range(m):
         c = clone[i]
         _observe(
-            R[c], p[c], R_first[c], p_first[c], R_BC, p_BC, model, k, p_WF[i], p_WF_first[i], xy[i], blocks[i], residual[i]
+            R[c],
+            p[c],
+            R_first[c],
+            p_first[c],
+            R_BC,
+            p_BC,
+            model,
+            k,
+            p_WF[i],
+            p_WF_first[i],
+            xy[i],
+            blocks[i],
+            residual[i],
         )
     return blocks, residual
 
 
 @njit(cache=True)
-def _track_rows(R, p, R_first, p_first, R_BC, p_BC, model, k, xy, xy_normalised, seen):
+def _track_rows(R, p, R_first, p_first, R_BC, p_BC, model, k, xy, xy_normalised, seen, pixel_sigma):
     C = len(seen)
     clones = np.flatnonzero(seen)
     m = len(clones)
@@ -154,10 +169,8 @@ def _track_rows(R, p, R_first, p_first, R_BC, p_BC, model, k, xy, xy_normalised,
         c = clones[i]
         R_WC[i] = R[c] @ R_BC
         p_WC[i] = R[c] @ p_BC + p[c]
-        points[i, 0], points[i, 1] = undistort(
-            model, k, xy[c, 0], xy[c, 1], xy_normalised[c, 0], xy_normalised[c, 1]
-        )
-    ok, p_WF = triangulate(R_WC, p_WC, points)
+        points[i, 0], points[i, 1] = undistort(model, k, xy[c, 0], xy[c, 1], xy_normalised[c, 0], xy_normalised[c, 1])
+    ok, p_WF = triangulate(R_WC, p_WC, points, pixel_sigma / k[0])
     H = np.zeros((2 * m, 15 + 6 * C))
     H_f = np.empty((2 * m, 3))
     residual = np.empty(2 * m)
@@ -224,7 +237,7 @@ def mahalanobis(H, residual, P, variance):
 
 
 @njit(cache=True)
-def _msckf_rows(R, p, R_first, p_first, R_BC, p_BC, model, k, xy, xy_normalised, seen, P, variance, gate):
+def _msckf_rows(R, p, R_first, p_first, R_BC, p_BC, model, k, xy, xy_normalised, seen, P, pixel_sigma, gate):
     F, C = seen.shape
     n = 15 + 6 * C
     H_all = np.empty((2 * seen.sum(), n))
@@ -234,14 +247,14 @@ def _msckf_rows(R, p, R_first, p_first, R_BC, p_BC, model, k, xy, xy_normalised,
     rows = 0
     for f in range(F):
         ok, p_WF[f], H, H_f, residual = _track_rows(
-            R, p, R_first, p_first, R_BC, p_BC, model, k, xy[f], xy_normalised[f], seen[f]
+            R, p, R_first, p_first, R_BC, p_BC, model, k, xy[f], xy_normalised[f], seen[f], pixel_sigma
         )
         if not ok:
             verdict[f] = NOT_TRIANGULATED
             continue
         reduce_landmark(H, H_f, residual)
         H, residual = H[3:], residual[3:]
-        if mahalanobis(H, residual, P, variance) > gate[len(residual)]:
+        if mahalanobis(H, residual, P, pixel_sigma**2) > gate[len(residual)]:
             verdict[f] = GATED
             continue
         verdict[f] = ACCEPTED

@@ -13,7 +13,7 @@ class MsckfOptions:
     """Features used at most in one update; the longest tracks go first."""
     min_track_length: int = 4
     """Observations that a finished track must have to be used."""
-    max_slam_features: int = 25
+    max_slam_features: int = 50
     """Long-lived landmarks kept in the state; 0 makes this a pure MSCKF."""
     pixel_sigma: float = 1.0
     """Standard deviation of a tracked feature's position, px."""
@@ -29,8 +29,8 @@ class MsckfOptions:
     """Estimate focal lengths, principal point and distortion."""
     zero_velocity_update: bool = True
     """Recognise standstill and hold the state there."""
-    standstill_disparity_px: float = 0.5
-    """Median image motion between frames below which the camera may be standing still."""
+    standstill_disparity_px: float = 0.7
+    """Median image motion over half a second below which the camera may be standing still."""
     max_blind_s: float = 4.0
     """Seconds without an accepted visual or standstill update after which the filter calls itself lost and starts again."""
 

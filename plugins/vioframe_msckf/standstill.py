@@ -1,18 +1,44 @@
-"""Recognising standstill, and holding the filter there: the zero-velocity update."""
+"""Recognising standstill, and holding the filter there: the zero-velocity update.
+
+The image decides, over half a second: a body that drifts slowly shows it in that time, while one that stands still but
+shakes (motors, a hand nearby) does not, although its IMU reads far more than noise. The IMU must only not object.
+"""
 
 from __future__ import annotations
 
+from collections import deque
+
 import numpy as np
 from scipy.stats import chi2
+
 from vioframe.geometry import so3
-from vioframe.types import DBA, DBG, DTHETA, DV, Float, FrameTracks, ImuNoise, ImuSegment, g_W
+from vioframe.types import DBA, DBG, DTHETA, DV, NS_PER_S, FrameTracks, ImuNoise, ImuSegment, g_W
 from vioframe_msckf.state import IMU, FilterState
 
 _MIN_COMMON_TRACKS = 10
+_LOOK_BACK_NS = NS_PER_S // 2
 _GATE = float(chi2.ppf(0.95, 9))
 _VELOCITY_SIGMA_M_S = 0.01
-# A motor or a hand shakes a body that stands still: readings may scatter this many times more than the sensor's noise.
-_SHAKING = 3.0
+# A body that stands still may yet shake, so its readings scatter this many times more than the sensor's noise.
+_SHAKING = 10.0
+
+
+class StandstillDetector:
+    """Tells from the tracks of the last half second whether the camera may be standing still."""
+
+    def __init__(self, max_disparity_px: float) -> None:
+        self._max_disparity_px = max_disparity_px
+        self._recent: deque[FrameTracks] = deque()
+
+    def sees_standstill(self, tracks: FrameTracks) -> bool:
+        """Take in a frame's tracks; whether it shows the same picture as the frame half a second before it."""
+        recent = self._recent
+        recent.append(tracks)
+        while len(recent) > 1 and tracks.t_ns - recent[1].t_ns >= _LOOK_BACK_NS:
+            recent.popleft()
+        if tracks.t_ns - recent[0].t_ns < _LOOK_BACK_NS:
+            return False
+        return median_disparity_px(recent[0], tracks) <= self._max_disparity_px
 
 
 def median_disparity_px(before: FrameTracks, now: FrameTracks) -> float:
@@ -29,25 +55,7 @@ def hold_still(state: FilterState, imu: ImuSegment, noise: ImuNoise, first_estim
     Standing still says: mean gyro = bias, mean accelerometer = -R_WB^T g + bias, velocity = 0. The readings serve as
     measurements here and so do not propagate the pose as well.
     """
-    H, residual, variance = standstill_measurement(state, imu, noise, first_estimates)
-    S = H @ state.cov[:IMU, :IMU] @ H.T + np.diag(variance)
-    if residual @ np.linalg.solve(S, residual) > _GATE:
-        return False
-    state.drift_biases(imu.duration_s, noise)
-    state.update(H, residual, slice(0, IMU), variance)
-    return True
-
-
-def standstill_measurement(
-    state: FilterState, imu: ImuSegment, noise: ImuNoise, first_estimates: bool
-) -> tuple[Float, Float, Float]:
-    """What standing still says: mean gyro = bias, mean accelerometer = -g + bias, velocity = 0.
-
-    Returns H (9, 15) over the body's error state, the residual (9,) and its variances (9,). The readings serve as
-    measurements here and so must not also propagate the pose.
-    """
     R = state.first[0] if first_estimates else state.R_WB
-    duration = max(imu.duration_s, 1.0 / noise.rate_hz)
     H = np.zeros((9, IMU))
     H[0:3, DBG] = np.eye(3)
     H[3:6, DTHETA], H[3:6, DBA] = so3.hat(-R.T @ g_W), np.eye(3)
@@ -59,12 +67,12 @@ def standstill_measurement(
             -state.v_WB,
         ]
     )
-    variance = np.repeat(
-        [
-            (_SHAKING * noise.gyro_density) ** 2 / duration,
-            (_SHAKING * noise.accel_density) ** 2 / duration,
-            _VELOCITY_SIGMA_M_S**2,
-        ],
-        3,
-    )
-    return H, residual, variance
+    density = _SHAKING * np.array([noise.gyro_density, noise.accel_density])
+    sigma = np.append(density / np.sqrt(imu.duration_s), _VELOCITY_SIGMA_M_S)
+    variance = np.repeat(sigma**2, 3)
+    S = H @ state.cov[:IMU, :IMU] @ H.T + np.diag(variance)
+    if residual @ np.linalg.solve(S, residual) > _GATE:
+        return False
+    state.drift_biases(imu.duration_s, noise)
+    state.update(H, residual, slice(0, IMU), variance)
+    return True

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg.lapack import dgeqrf, dpotrf, dtrtrs
+
 from vioframe.geometry import kernels, so3
 from vioframe.inertial.propagation import propagate, yaw_consistent_transition
 from vioframe.types import DBA, DBG, DP, DTHETA, DV, Calibration, Float, ImuNoise, ImuSegment, NavState
@@ -62,7 +63,9 @@ class Poses:
 class FilterState:
     """Mean, first estimates and covariance of the error-state filter."""
 
-    def __init__(self, initial: NavState, calibration: Calibration, *, extrinsics: bool, offset: bool, intrinsics: bool):
+    def __init__(
+        self, initial: NavState, calibration: Calibration, *, extrinsics: bool, offset: bool, intrinsics: bool
+    ):
         assert initial.cov is not None
         self.R_WB, self.p_WB, self.v_WB = initial.R_WB.copy(), initial.p_WB.copy(), initial.v_WB.copy()
         self.bias_gyro_B, self.bias_accel_B = initial.bias_gyro_B.copy(), initial.bias_accel_B.copy()

@@ -6,17 +6,16 @@ import numpy as np
 from numba import njit
 
 MIN_DEPTH_M, MAX_DEPTH_M = 0.1, 60.0
-_MAX_CONDITION = 1e6
-_MAX_BASELINE_RATIO = 300.0
 _ITERATIONS = 5
 
 
 @njit(cache=True)
-def triangulate(R_WC, p_WC, xy):
+def triangulate(R_WC, p_WC, xy, sigma):
     """(m, 3, 3), (m, 3) camera poses and (m, 2) points on their z = 1 planes -> (whether it can be trusted, (3,) p_WF).
 
-    It cannot where the rays are nearly parallel, the depth is outside 0.1-60 m in any camera, or the depth is far larger
-    than the widest baseline across the line of sight. Inverse depth in the first camera: Montiel, Civera, Davison (2006).
+    ``sigma`` is the standard deviation of the points. A position is trusted where the depth lies within 0.1-60 m and the
+    inverse depth exceeds its own standard deviation, a test that holds whatever the scale. Inverse depth in the first camera: Montiel, Civera,
+    Davison (2006).
     """
     m = len(xy)
     A = np.zeros((3, 3))
@@ -34,7 +33,7 @@ def triangulate(R_WC, p_WC, xy):
             A[r, r] += 1.0
     p = np.zeros(3)
     eigenvalues = np.linalg.eigvalsh(A)
-    if eigenvalues[0] <= 0.0 or eigenvalues[2] / eigenvalues[0] > _MAX_CONDITION:
+    if eigenvalues[0] <= 1e-12 * eigenvalues[2]:
         return False, p
     p = np.linalg.solve(A, b)
 
@@ -70,17 +69,10 @@ def triangulate(R_WC, p_WC, xy):
     if not (theta[2] > 1.0 / MAX_DEPTH_M and theta[2] < 1.0 / MIN_DEPTH_M):
         return False, p
     first = np.array([theta[0], theta[1], 1.0]) / theta[2]
-    distance = math.sqrt(first[0] ** 2 + first[1] ** 2 + first[2] ** 2)
-    baseline = 0.0
     for i in range(1, m):
-        q = R[i] @ first + t[i]
-        if q[2] < MIN_DEPTH_M:
+        if R[i, 2, 0] * first[0] + R[i, 2, 1] * first[1] + R[i, 2, 2] * first[2] + t[i, 2] < MIN_DEPTH_M:
             return False, p
-        c = -R[i].T @ t[i]  # this camera's centre in the first camera's frame
-        along = (c[0] * first[0] + c[1] * first[1] + c[2] * first[2]) / distance
-        across2 = c[0] * c[0] + c[1] * c[1] + c[2] * c[2] - along * along
-        baseline = max(baseline, math.sqrt(max(across2, 0.0)))
-    if distance > _MAX_BASELINE_RATIO * baseline:
+    if theta[2] < sigma * math.sqrt(np.linalg.inv(N)[2, 2]):
         return False, p
     return True, R_WC[0] @ first + p_WC[0]
 

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+
 from vioframe.types import Float, FrameTracks, Int
 from vioframe_msckf.measurement import (
     ACCEPTED,
-    NOT_TRIANGULATED,
     Window,
     landmark_rows,
     mahalanobis,
@@ -113,7 +113,9 @@ def promote_tracks(
     for row in rows:
         # Every promotion updates the state, so each is linearised at the estimate the last one left.
         window = Window.of(state, options.first_estimate_jacobians)
-        track = track_rows(window, observations.xy[row], observations.xy_normalised[row], observations.seen[row])
+        track = track_rows(
+            window, observations.xy[row], observations.xy_normalised[row], observations.seen[row], options.pixel_sigma
+        )
         if track is None:
             continue
         used.append(row)
