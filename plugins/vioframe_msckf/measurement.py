@@ -1,8 +1,8 @@
 """Residuals and Jacobians of the image measurements, in pixels, with distortion.
 
 A landmark seen from a cloned body pose: ``p_B = R_WB^T (p_WF - p_WB)``, ``p_C = R_BC^T (p_B - p_BC)``, pixel =
-distort(p_C). Residuals are evaluated at the estimate, Jacobians at the first estimates of pose and landmark. Derivation:
-``docs/derivations/msckf.md``.
+distort(p_C). Residuals are evaluated at the estimate, Jacobians at the first estimates of pose and landmark.
+Derivation: ``docs/derivations/msckf.md``.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ class Window:
 
 @dataclass(frozen=True, slots=True)
 class FeatureUpdate:
-    """The stacked, landmark-free measurement of many tracks over [calibration, clones], and what became of each track."""
+    """The stacked, landmark-free measurement of many tracks over [calibration, clones], and each track's verdict."""
 
     H: Float
     residual: Float
@@ -192,7 +192,7 @@ def _track_rows(R, p, R_first, p_first, R_BC, p_BC, model, k, xy, xy_normalised,
 def reduce_landmark(H, H_f, residual):
     """Rotate the rows by the orthogonal Q with Q H_f = [T; 0], T (3, 3) upper triangular, in place.
 
-    Householder reflections. The rows below the third are free of the landmark: eq. (22)-(24) of Mourikis and Roumeliotis.
+    Householder reflections. The rows below the third are free of the landmark: Mourikis and Roumeliotis, eq. (22)-(24).
     """
     m, n = H.shape
     v = np.empty(m)

@@ -32,7 +32,7 @@ class MsckfOptions:
     standstill_disparity_px: float = 0.7
     """Median image motion over half a second below which the camera may be standing still."""
     max_blind_s: float = 4.0
-    """Seconds without an accepted visual or standstill update after which the filter calls itself lost and starts again."""
+    """Seconds without an accepted update after which the filter calls itself lost and starts again."""
 
     def __post_init__(self) -> None:
         if self.max_clones < 3 or self.max_features < 1 or self.min_track_length < 2 or self.max_slam_features < 0:

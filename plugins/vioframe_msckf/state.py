@@ -130,8 +130,8 @@ class FilterState:
     def augment_clone(self, gyro_B: Float) -> None:
         """Clone the body's pose at the moment the image was taken, ``offset_s`` after its stamp.
 
-        ``gyro_B`` (3,) is the rate there, free of bias. The clone depends on the offset through the body's motion, as in
-        Li and Mourikis (2014), so the offset is estimated with no term of its own in the measurement.
+        ``gyro_B`` (3,) is the rate there, free of bias. The clone depends on the offset through the body's motion, as
+        in Li and Mourikis (2014), so the offset is estimated with no term of its own in the measurement.
         """
         R = self.R_WB @ so3.exp(gyro_B * self.offset_s)
         p = self.p_WB + self.v_WB * self.offset_s

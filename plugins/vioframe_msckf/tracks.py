@@ -9,7 +9,7 @@ from vioframe.types import Float, FrameTracks, Int
 
 
 class ObservationTable:
-    """``ids`` (S,) ascending, ``xy`` (S, C, 2) px, ``xy_normalised`` (S, C, 2) and ``seen`` (S, C), oldest clone first."""
+    """``ids`` (S,) ascending; ``xy`` (S, C, 2) px, ``xy_normalised`` (S, C, 2), ``seen`` (S, C), oldest clone first."""
 
     def __init__(self) -> None:
         self.ids: Int = np.empty(0, np.int64)

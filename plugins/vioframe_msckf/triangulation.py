@@ -13,9 +13,9 @@ _ITERATIONS = 5
 def triangulate(R_WC, p_WC, xy, sigma):
     """(m, 3, 3), (m, 3) camera poses and (m, 2) points on their z = 1 planes -> (whether it can be trusted, (3,) p_WF).
 
-    ``sigma`` is the standard deviation of the points. A position is trusted where the depth lies within 0.1-60 m and the
-    inverse depth exceeds its own standard deviation, a test that holds whatever the scale. Inverse depth in the first camera: Montiel, Civera,
-    Davison (2006).
+    ``sigma`` is the standard deviation of the points. A position is trusted where the depth lies within 0.1-60 m and
+    the inverse depth exceeds its own standard deviation, a test that holds whatever the scale. Inverse depth in the
+    first camera: Montiel, Civera, Davison (2006).
     """
     m = len(xy)
     A = np.zeros((3, 3))

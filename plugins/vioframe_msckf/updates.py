@@ -103,10 +103,10 @@ def update_from_landmarks(state: FilterState, tracks: FrameTracks, options: Msck
 def promote_tracks(
     state: FilterState, observations: ObservationTable, rows: NDArray[np.intp], options: MsckfOptions, gate: Float
 ) -> NDArray[np.intp]:
-    """Take the tracks ``rows`` into the state as landmarks; returns the rows that were used up, promoted or implausible.
+    """Take the tracks ``rows`` into the state as landmarks; returns the rows used up, promoted or implausible.
 
-    Delayed initialisation (Li, "Visual-inertial odometry on resource-constrained systems", 2014): the three rows that an
-    orthogonal transformation leaves to the landmark initialise it, the others update the state.
+    Delayed initialisation (Li, "Visual-inertial odometry on resource-constrained systems", 2014): the three rows that
+    an orthogonal transformation leaves to the landmark initialise it, the others update the state.
     """
     used = []
     variance = options.pixel_sigma**2

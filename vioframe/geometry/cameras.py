@@ -11,7 +11,7 @@ from functools import cached_property
 from typing import Literal
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from vioframe.errors import CalibrationError
 from vioframe.types import Float
@@ -66,7 +66,7 @@ class Camera:
         return self._distort(np.asarray(xy_normalised, dtype=np.float64)) * self._focal + self._centre
 
     def undistort(self, xy: ArrayLike) -> Float:
-        """(N, 2) px -> (N, 2) undistorted points on the z = 1 plane: the inverse of :meth:`distort`, by Newton's method.
+        """(N, 2) px -> (N, 2) undistorted points with z = 1, by Newton's method; the inverse of :meth:`distort`.
 
         Points so far outside the image that the model cannot be inverted come back as NaN.
         """
@@ -96,12 +96,11 @@ class Camera:
         """d xy / d xy_normalised, (N, 2, 2) px."""
         return self._distort_jacobian(np.asarray(xy_normalised, dtype=np.float64)) * self._focal[:, None]
 
-    def contains(self, xy: ArrayLike, border_px: float = 0.0) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
+    def contains(self, xy: ArrayLike, border_px: float = 0.0) -> NDArray[np.bool_]:
         """(N,) whether pixels lie in the image, at least ``border_px`` from its outermost pixel centres."""
         xy = np.asarray(xy, dtype=np.float64).reshape(-1, 2)
         limit = np.array(self.resolution) - 1.0 - border_px
-        inside: np.ndarray[tuple[int], np.dtype[np.bool_]] = ((xy >= border_px) & (xy <= limit)).all(axis=1)
-        return inside
+        return np.asarray(((xy >= border_px) & (xy <= limit)).all(axis=1))
 
     def _distort(self, xy: Float) -> Float:
         x, y = xy[:, 0], xy[:, 1]

@@ -21,19 +21,19 @@ def intrinsics_of(camera: Camera) -> tuple[int, Float]:
 
 
 @njit(cache=True)
-def hat(v):
+def hat(v: Float) -> Float:
     """(3,) -> (3, 3) skew matrix."""
     return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
 
 
 @njit(cache=True)
-def cross(a, b):
+def cross(a: Float, b: Float) -> Float:
     """(3,) x (3,) -> (3,)."""
     return np.array([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
 
 
 @njit(cache=True)
-def exp(phi):
+def exp(phi: Float) -> Float:
     """(3,) rad -> (3, 3) rotation."""
     a2 = phi[0] * phi[0] + phi[1] * phi[1] + phi[2] * phi[2]
     if a2 < 1e-8:
@@ -42,11 +42,12 @@ def exp(phi):
         a = math.sqrt(a2)
         sinc, cosc = math.sin(a) / a, (1.0 - math.cos(a)) / a2
     K = hat(phi)
-    return np.eye(3) + sinc * K + cosc * (K @ K)
+    R: Float = np.eye(3) + sinc * K + cosc * (K @ K)
+    return R
 
 
 @njit(cache=True)
-def right_jacobian(phi):
+def right_jacobian(phi: Float) -> Float:
     """(3,) rad -> (3, 3), J_r with Exp(phi + d) ~ Exp(phi) Exp(J_r d)."""
     a2 = phi[0] * phi[0] + phi[1] * phi[1] + phi[2] * phi[2]
     if a2 < 1e-8:
@@ -55,11 +56,12 @@ def right_jacobian(phi):
         a = math.sqrt(a2)
         cosc, sinc3 = (1.0 - math.cos(a)) / a2, (a - math.sin(a)) / (a2 * a)
     K = hat(phi)
-    return np.eye(3) - cosc * K + sinc3 * (K @ K)
+    J: Float = np.eye(3) - cosc * K + sinc3 * (K @ K)
+    return J
 
 
 @njit(cache=True)
-def distort(model, k, x, y):
+def distort(model: int, k: Float, x: float, y: float) -> tuple[Float, Float]:
     """A point on the z = 1 plane -> pixel (2,) and its Jacobian d px / d (x, y) (2, 2)."""
     r2 = x * x + y * y
     xy = np.empty(2)
@@ -93,7 +95,7 @@ def distort(model, k, x, y):
 
 
 @njit(cache=True)
-def intrinsics_jacobian(model, k, x, y):
+def intrinsics_jacobian(model: int, k: Float, x: float, y: float) -> Float:
     """d px / d [fx fy cx cy d1 d2 d3 d4] at a point of the z = 1 plane, (2, 8)."""
     J = np.zeros((2, 8))
     r2 = x * x + y * y
@@ -121,7 +123,7 @@ def intrinsics_jacobian(model, k, x, y):
 
 
 @njit(cache=True)
-def undistort(model, k, px, py, x, y):
+def undistort(model: int, k: Float, px: float, py: float, x: float, y: float) -> tuple[float, float]:
     """The point of the z = 1 plane that is drawn at pixel (px, py), by Newton's method from the guess (x, y)."""
     for _ in range(5):
         xy, J = distort(model, k, x, y)

@@ -50,7 +50,8 @@ def log(R: ArrayLike) -> Float:
     small = norm < _SMALL
     # 2 atan2(n, w) / n, which tends to 2 + n^2 / 3.
     scale = np.where(small, 2.0 + norm**2 / 3.0, 2.0 * np.arctan2(norm, w) / np.where(small, 1.0, norm))
-    return scale[..., None] * vector
+    out: Float = scale[..., None] * vector
+    return out
 
 
 def right_jacobian(phi: ArrayLike) -> Float:
@@ -98,7 +99,8 @@ def to_quat_xyzw(R: ArrayLike) -> Float:
     best = np.argmax(Q[:, [0, 1, 2, 3], [0, 1, 2, 3]], axis=1)
     quat = Q[np.arange(len(m)), best]
     quat *= (np.where(quat[:, 3] < 0.0, -1.0, 1.0) / np.linalg.norm(quat, axis=1))[:, None]
-    return quat.reshape(*R.shape[:-2], 4)
+    out: Float = quat.reshape(*R.shape[:-2], 4)
+    return out
 
 
 def from_quat_xyzw(quat: ArrayLike) -> Float:

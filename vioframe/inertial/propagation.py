@@ -1,8 +1,8 @@
 """Strap-down integration of an inertial segment, with the error-state transition and process noise that filters need.
 
 Between two readings the angular rate and specific force are taken as linear in time. The rotation is the fourth-order
-Magnus expansion of that motion, velocity and position are Simpson's rule on it, so that the integration error is far below
-the noise even at 100 Hz. Derivation: ``docs/derivations/propagation.md``.
+Magnus expansion of that motion, velocity and position are Simpson's rule on it, so that the integration error is far
+below the noise even at 100 Hz. Derivation: ``docs/derivations/propagation.md``.
 """
 
 from __future__ import annotations
@@ -49,8 +49,8 @@ def yaw_consistent_transition(
 ) -> Float:
     """``transition`` with its orientation columns evaluated at the given (R_WB, p_WB, v_WB) of start and end.
 
-    First-estimate Jacobians (Huang, Mourikis, Roumeliotis 2010) evaluate them at the *propagated* states of both ends, so
-    that a rotation about gravity stays in the null space: Phi N(start) = N(end).
+    First-estimate Jacobians (Huang, Mourikis, Roumeliotis 2010) evaluate them at the *propagated* states of both ends,
+    so that a rotation about gravity stays in the null space: Phi N(start) = N(end).
     """
     R_0, p_0, v_0 = start
     R_1, p_1, v_1 = end
