@@ -12,7 +12,9 @@ from vioframe_msckf.options import MsckfOptions
 def msckf(calibration: Calibration, options: MsckfOptions) -> Backend:
     """Multi-state constraint Kalman filter with first-estimate Jacobians and in-state landmarks."""
     from vioframe_msckf.backend import Msckf
+    from vioframe_msckf.warm_up import warm_up
 
+    warm_up(calibration)
     return Msckf(calibration, options)
 
 

@@ -10,10 +10,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from vioframe.geometry.kernels import distort, hat, intrinsics_jacobian, undistort
+from vioframe.jit import kernel
 from vioframe.types import Float, Int
 from vioframe_msckf.state import CALIBRATION, CLONES, FilterState
 from vioframe_msckf.triangulation import triangulate
@@ -106,7 +106,7 @@ def track_rows(
     return (p_WF, H, H_f, residual) if ok else None
 
 
-@njit(cache=True)
+@kernel
 def _observe(R, p, R_first, p_first, R_BC, p_BC, model, k, p_WF, p_WF_first, xy, block, residual):
     """One observation: ``block`` (2, 24) over [calibration 15, clone 6, landmark 3] and ``residual`` (2,)."""
     p_C = R_BC.T @ (R.T @ (p_WF - p) - p_BC)
@@ -132,7 +132,7 @@ def _observe(R, p, R_first, p_first, R_BC, p_BC, model, k, p_WF, p_WF_first, xy,
     block[:, 21:24] = J_W
 
 
-@njit(cache=True)
+@kernel
 def _observations(R, p, R_first, p_first, R_BC, p_BC, model, k, clone, p_WF, p_WF_first, xy):
     m = len(clone)
     blocks = np.empty((m, 2, 24))
@@ -157,7 +157,7 @@ def _observations(R, p, R_first, p_first, R_BC, p_BC, model, k, clone, p_WF, p_W
     return blocks, residual
 
 
-@njit(cache=True)
+@kernel
 def _track_rows(R, p, R_first, p_first, R_BC, p_BC, model, k, xy, xy_normalised, seen, pixel_sigma):
     C = len(seen)
     clones = np.flatnonzero(seen)
@@ -188,7 +188,7 @@ def _track_rows(R, p, R_first, p_first, R_BC, p_BC, model, k, xy, xy_normalised,
     return ok, p_WF, H, H_f, residual
 
 
-@njit(cache=True)
+@kernel
 def reduce_landmark(H, H_f, residual):
     """Rotate the rows by the orthogonal Q with Q H_f = [T; 0], T (3, 3) upper triangular, in place.
 
@@ -227,7 +227,7 @@ def reduce_landmark(H, H_f, residual):
             residual[i] -= scale * dot * v[i]
 
 
-@njit(cache=True)
+@kernel
 def mahalanobis(H, residual, P, variance):
     """residual^T (H P H^T + variance I)^-1 residual."""
     S = H @ P @ H.T
@@ -236,7 +236,7 @@ def mahalanobis(H, residual, P, variance):
     return residual @ np.linalg.solve(S, residual)
 
 
-@njit(cache=True)
+@kernel
 def _msckf_rows(R, p, R_first, p_first, R_BC, p_BC, model, k, xy, xy_normalised, seen, P, pixel_sigma, gate):
     F, C = seen.shape
     n = 15 + 6 * C

@@ -3,13 +3,14 @@
 import math
 
 import numpy as np
-from numba import njit
+
+from vioframe.jit import kernel
 
 MIN_DEPTH_M, MAX_DEPTH_M = 0.1, 60.0
 _ITERATIONS = 5
 
 
-@njit(cache=True)
+@kernel
 def triangulate(R_WC, p_WC, xy, sigma):
     """(m, 3, 3), (m, 3) camera poses and (m, 2) points on their z = 1 planes -> (whether it can be trusted, (3,) p_WF).
 
@@ -77,7 +78,7 @@ def triangulate(R_WC, p_WC, xy, sigma):
     return True, R_WC[0] @ first + p_WC[0]
 
 
-@njit(cache=True)
+@kernel
 def _normal_equations(R, t, xy, theta):
     """Squared reprojection error on the z = 1 planes, its Gauss-Newton matrix and gradient over [a b rho]."""
     N = np.zeros((3, 3))

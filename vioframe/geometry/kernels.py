@@ -6,9 +6,9 @@ Importing this module loads numba; only back-ends do. Tests hold every function 
 import math
 
 import numpy as np
-from numba import njit
 
 from vioframe.geometry.cameras import Camera
+from vioframe.jit import kernel
 from vioframe.types import Float
 
 RADTAN, EQUIDISTANT = 0, 1
@@ -20,19 +20,19 @@ def intrinsics_of(camera: Camera) -> tuple[int, Float]:
     return number, np.array([camera.fx, camera.fy, camera.cx, camera.cy, *camera.distortion])
 
 
-@njit(cache=True)
+@kernel
 def hat(v: Float) -> Float:
     """(3,) -> (3, 3) skew matrix."""
     return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
 
 
-@njit(cache=True)
+@kernel
 def cross(a: Float, b: Float) -> Float:
     """(3,) x (3,) -> (3,)."""
     return np.array([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
 
 
-@njit(cache=True)
+@kernel
 def exp(phi: Float) -> Float:
     """(3,) rad -> (3, 3) rotation."""
     a2 = phi[0] * phi[0] + phi[1] * phi[1] + phi[2] * phi[2]
@@ -46,7 +46,7 @@ def exp(phi: Float) -> Float:
     return R
 
 
-@njit(cache=True)
+@kernel
 def right_jacobian(phi: Float) -> Float:
     """(3,) rad -> (3, 3), J_r with Exp(phi + d) ~ Exp(phi) Exp(J_r d)."""
     a2 = phi[0] * phi[0] + phi[1] * phi[1] + phi[2] * phi[2]
@@ -60,7 +60,7 @@ def right_jacobian(phi: Float) -> Float:
     return J
 
 
-@njit(cache=True)
+@kernel
 def distort(model: int, k: Float, x: float, y: float) -> tuple[Float, Float]:
     """A point on the z = 1 plane -> pixel (2,) and its Jacobian d px / d (x, y) (2, 2)."""
     r2 = x * x + y * y
@@ -94,7 +94,7 @@ def distort(model: int, k: Float, x: float, y: float) -> tuple[Float, Float]:
     return xy, J
 
 
-@njit(cache=True)
+@kernel
 def intrinsics_jacobian(model: int, k: Float, x: float, y: float) -> Float:
     """d px / d [fx fy cx cy d1 d2 d3 d4] at a point of the z = 1 plane, (2, 8)."""
     J = np.zeros((2, 8))
@@ -122,7 +122,7 @@ def intrinsics_jacobian(model: int, k: Float, x: float, y: float) -> Float:
     return J
 
 
-@njit(cache=True)
+@kernel
 def undistort(model: int, k: Float, px: float, py: float, x: float, y: float) -> tuple[float, float]:
     """The point of the z = 1 plane that is drawn at pixel (px, py), by Newton's method from the guess (x, y)."""
     for _ in range(5):

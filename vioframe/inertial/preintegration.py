@@ -11,10 +11,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 
 from vioframe.geometry import so3
 from vioframe.geometry.kernels import exp, hat, right_jacobian
+from vioframe.jit import kernel
 from vioframe.types import DP, DTHETA, DV, Float, ImuNoise, ImuSegment, NavState, g_W
 
 
@@ -82,8 +82,8 @@ def join_segments(segments: Sequence[ImuSegment]) -> ImuSegment:
     )
 
 
-@njit(cache=True)
-def _integrate(dt, gyro, accel, variance):  # type: ignore[no-untyped-def]
+@kernel
+def _integrate(dt: Float, gyro: Float, accel: Float, variance: Float) -> tuple[Float, Float, Float, Float, Float]:
     """Readings free of bias (N, 3); ``variance`` (4,) = squared densities of gyro, accel, gyro walk, accel walk.
 
     White noise averaged over an interval of h seconds has the variance density^2 / h. Taking the two readings of an

@@ -10,9 +10,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 
 from vioframe.geometry.kernels import cross, exp, hat, right_jacobian
+from vioframe.jit import kernel
 from vioframe.types import Float, ImuNoise, ImuSegment, g_W
 
 
@@ -61,8 +61,10 @@ def yaw_consistent_transition(
     return out
 
 
-@njit(cache=True)
-def _integrate(dt, gyro, accel, R, p, v, g, variance):  # type: ignore[no-untyped-def]
+@kernel
+def _integrate(
+    dt: Float, gyro: Float, accel: Float, R: Float, p: Float, v: Float, g: Float, variance: Float
+) -> tuple[Float, Float, Float, Float, Float]:
     """Readings already free of bias; ``variance`` (4,) = squared densities of gyro, accel, gyro walk, accel walk."""
     R, p, v = R.copy(), p.copy(), v.copy()
     Phi = np.eye(15)

@@ -1,0 +1,59 @@
+"""Compiling hot loops: :func:`kernel` is numba's ``njit`` with a cache on disk that may be trusted.
+
+numba's own cache looks at the file of the function alone. Where a kernel calls one of another file, and only that one
+changed, it runs the old code or fails to link. Here the cache lies in a folder named after the text of *all* kernels,
+so that any change begins a new one.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import tempfile
+from collections.abc import Callable
+from contextlib import suppress
+from functools import cache
+from getpass import getuser
+from pathlib import Path
+from typing import Any, TypeVar, cast
+
+import numba
+
+FunctionT = TypeVar("FunctionT", bound=Callable[..., object])
+
+_PACKAGE = Path(__file__).parent
+
+
+def kernel(function: FunctionT) -> FunctionT:
+    """Compile ``function`` in nopython mode at its first call, or load it from the cache."""
+    source = Path(function.__code__.co_filename)
+    in_package = (source.parent / "__init__.py").exists()
+    settings: Any = numba.config
+    before = settings.CACHE_DIR
+    settings.CACHE_DIR = str(_folder(before) / _fingerprint(source.parent if in_package else source))
+    try:
+        return cast(FunctionT, numba.njit(cache=True)(function))
+    finally:
+        settings.CACHE_DIR = before
+
+
+def _folder(chosen: str) -> Path:
+    """Where caches go: what the user told numba, or the user's cache folder, or a temporary one that can be written."""
+    if chosen:
+        return Path(chosen)
+    home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "vioframe" / "kernels"
+    with suppress(OSError):
+        home.mkdir(parents=True, exist_ok=True)
+    return home if os.access(home, os.W_OK) else Path(tempfile.gettempdir()) / f"vioframe-kernels-{getuser()}"
+
+
+@cache
+def _fingerprint(own: Path) -> str:
+    """A hash of every source that has kernels: vioframe's, and those of the plug-in at ``own``."""
+    texts = set()
+    for folder in {_PACKAGE, own}:
+        for path in [folder] if folder.is_file() else folder.rglob("*.py"):
+            text = path.read_bytes()
+            if b"vioframe.jit" in text:
+                texts.add(text)
+    return hashlib.sha256(b"\0".join(sorted(texts))).hexdigest()[:16]
