@@ -1,0 +1,76 @@
+"""Filter states to test with, and how far they are from the truth."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from vioframe_msckf.state import FilterState
+
+from vioframe.calibration import packaged_calibration
+from vioframe.geometry import so3
+from vioframe.simulation import TrackSequence
+from vioframe.types import Float, NavState
+
+SIGMA = np.repeat([0.005, 0.001, 0.02, 0.005, 0.05], 3)
+"""How well a drawn start is known: rad, m, m/s, rad/s, m/s^2."""
+
+
+def random_covariance(rng: np.random.Generator, n: int) -> Float:
+    """(n, n), well conditioned, with correlations between everything."""
+    A = rng.normal(size=(n, 2 * n))
+    sigma = rng.uniform(0.5, 2.0, n)
+    return A @ A.T / (2 * n) * np.outer(sigma, sigma)
+
+
+def random_state(
+    seed: int = 0, clones: int = 4, landmarks: int = 3, *, calibrate: bool = True, scale: float = 1.0
+) -> FilterState:
+    """A filter in the midst of a flight; ``scale`` is that of its standard deviations."""
+    rng = np.random.default_rng(seed)
+    nav = NavState(0, so3.exp(rng.normal(size=3)), *(rng.normal(size=3) for _ in range(4)), np.eye(15))
+    state = FilterState(
+        nav, packaged_calibration("euroc"), extrinsics=calibrate, offset=calibrate, intrinsics=calibrate
+    )
+    for _ in range(clones):
+        state.R_WB, state.p_WB = state.R_WB @ so3.exp(0.1 * rng.normal(size=3)), state.p_WB + 0.3 * rng.normal(size=3)
+        state.augment_clone(rng.normal(size=3))
+    for k in range(landmarks):
+        n = len(state.cov)
+        state.add_landmark(10 + k, 5.0 * rng.normal(size=3), np.zeros((3, n)), np.eye(3))
+    if calibrate:
+        state.cov = scale**2 * random_covariance(rng, len(state.cov))
+    return state
+
+
+def drawn_start(sequence: TrackSequence, frame: int, seed: int, sigma: Float = SIGMA) -> NavState:
+    """The true state at ``frame``, off by an error drawn from the covariance it states."""
+    d = np.random.default_rng(seed).normal(size=15) * sigma
+    truth = sequence.true_states[frame]
+    return NavState(
+        truth.t_ns,
+        truth.R_WB @ so3.exp(d[0:3]),
+        truth.p_WB + d[3:6],
+        truth.v_WB + d[6:9],
+        truth.bias_gyro_B + d[9:12],
+        truth.bias_accel_B + d[12:15],
+        np.diag(sigma**2),
+    )
+
+
+def after(sequence: TrackSequence, frame: int) -> TrackSequence:
+    """The packets that follow ``frame``."""
+    return replace(sequence, packets=sequence.packets[frame + 1 :])
+
+
+def pose_nees(states: tuple[NavState, ...], truth: dict[int, NavState]) -> tuple[float, float]:
+    """Mean normalised estimation error squared of orientation and of position, three degrees of freedom each."""
+    values = []
+    for state in states:
+        true = truth[state.t_ns]
+        assert state.cov is not None
+        dtheta, dp = so3.log(state.R_WB.T @ true.R_WB), true.p_WB - state.p_WB
+        P = state.cov
+        values.append([dtheta @ np.linalg.solve(P[:3, :3], dtheta), dp @ np.linalg.solve(P[3:6, 3:6], dp)])
+    orientation, position = np.mean(values, axis=0)
+    return float(orientation), float(position)
