@@ -74,5 +74,5 @@ def hold_still(state: FilterState, imu: ImuSegment, noise: ImuNoise, first_estim
     if residual @ np.linalg.solve(S, residual) > _GATE:
         return False
     state.drift_biases(imu.duration_s, noise)
-    state.update(H, residual, slice(0, IMU), variance)
+    state.update_joseph(H, residual, variance)
     return True

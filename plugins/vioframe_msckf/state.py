@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from filterpy.kalman import KalmanFilter
 from numpy.typing import NDArray
 from scipy.linalg.lapack import dgeqrf, dpotrf, dtrtrs
 
@@ -183,6 +184,18 @@ class FilterState:
         self.cov += self.cov.T
         self.cov *= 0.5
         self._correct(dx)
+
+    def update_joseph(self, H: Float, residual: Float, variances: Float) -> None:
+        """The same for measurements of the body alone, ``H`` (m, 15): by filterpy, in Joseph's form.
+
+        The error state is the filter's x = 0. It takes O(n^3), which a frame without visual updates can spare.
+        """
+        n = len(self.cov)
+        kalman = KalmanFilter(dim_x=n, dim_z=len(residual))
+        kalman.P = self.cov
+        kalman.update(residual[:, None], R=np.diag(variances), H=np.hstack([H, np.zeros((len(H), n - IMU))]))
+        self.cov = 0.5 * (kalman.P + kalman.P.T)
+        self._correct(kalman.x[:, 0])
 
     def _correct(self, dx: Float) -> None:
         self.R_WB = self.R_WB @ so3.exp(dx[DTHETA])
