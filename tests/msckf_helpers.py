@@ -12,7 +12,7 @@ from vioframe.geometry import so3
 from vioframe.simulation import TrackSequence
 from vioframe.types import Float, NavState
 
-SIGMA = np.repeat([0.005, 0.001, 0.02, 0.005, 0.05], 3)
+START_COV = np.diag(np.repeat([0.005, 0.001, 0.02, 0.005, 0.05], 3) ** 2)
 """How well a drawn start is known: rad, m, m/s, rad/s, m/s^2."""
 
 
@@ -37,15 +37,16 @@ def random_state(
         state.augment_clone(rng.normal(size=3))
     for k in range(landmarks):
         n = len(state.cov)
-        state.add_landmark(10 + k, 5.0 * rng.normal(size=3), np.zeros((3, n)), np.eye(3))
+        p_WF = 5.0 * rng.normal(size=3)
+        state.add_landmark(10 + k, p_WF, p_WF, np.zeros((3, n)), np.eye(3))
     if calibrate:
         state.cov = scale**2 * random_covariance(rng, len(state.cov))
     return state
 
 
-def drawn_start(sequence: TrackSequence, frame: int, seed: int, sigma: Float = SIGMA) -> NavState:
+def drawn_start(sequence: TrackSequence, frame: int, seed: int, cov: Float = START_COV) -> NavState:
     """The true state at ``frame``, off by an error drawn from the covariance it states."""
-    d = np.random.default_rng(seed).normal(size=15) * sigma
+    d = np.random.default_rng(seed).multivariate_normal(np.zeros(15), cov, method="eigh")
     truth = sequence.true_states[frame]
     return NavState(
         truth.t_ns,
@@ -54,7 +55,7 @@ def drawn_start(sequence: TrackSequence, frame: int, seed: int, sigma: Float = S
         truth.v_WB + d[6:9],
         truth.bias_gyro_B + d[9:12],
         truth.bias_accel_B + d[12:15],
-        np.diag(sigma**2),
+        cov,
     )
 
 

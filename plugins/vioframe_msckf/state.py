@@ -134,11 +134,13 @@ class FilterState:
         ``gyro_B`` (3,) is the rate there, free of bias. The clone depends on the offset through the body's motion, as
         in Li and Mourikis (2014), so the offset is estimated with no term of its own in the measurement.
         """
-        R = self.R_WB @ so3.exp(gyro_B * self.offset_s)
+        turn = so3.exp(gyro_B * self.offset_s)
+        R = self.R_WB @ turn
         p = self.p_WB + self.v_WB * self.offset_s
         n = len(self.cov)
         J = np.zeros((6, n))
-        J[0:3, DTHETA], J[0:3, DBG], J[0:3, OFFSET] = np.eye(3), -self.offset_s * np.eye(3), gyro_B[:, None]
+        J[0:3, DTHETA], J[0:3, OFFSET] = turn.T, gyro_B[:, None]
+        J[0:3, DBG] = -self.offset_s * so3.right_jacobian(gyro_B * self.offset_s)
         J[3:6, DP], J[3:6, DV], J[3:6, OFFSET] = np.eye(3), self.offset_s * np.eye(3), self.v_WB[:, None]
         JP = J @ self.cov
         at = self.landmarks_begin
@@ -150,12 +152,15 @@ class FilterState:
         self._delete(np.arange(CLONES, CLONES + 6))
         self.clones = self.clones.without_oldest()
 
-    def add_landmark(self, landmark_id: int, p_WF: Float, cross: Float, cov: Float) -> None:
-        """Append a landmark (3,) with its cross-covariance (3, n) to the state and its covariance (3, 3)."""
+    def add_landmark(self, landmark_id: int, p_WF: Float, p_WF_first: Float, cross: Float, cov: Float) -> None:
+        """Append a landmark (3,) with its cross-covariance (3, n) to the state and its covariance (3, 3).
+
+        ``p_WF_first`` (3,) is where the measurements that initialised it were linearised.
+        """
         self.cov = _insert(self.cov, len(self.cov), cross, cov)
         self.landmark_ids = np.append(self.landmark_ids, landmark_id)
         self.p_WF = np.concatenate([self.p_WF, p_WF[None]])
-        self.p_WF_first = np.concatenate([self.p_WF_first, p_WF[None]])
+        self.p_WF_first = np.concatenate([self.p_WF_first, p_WF_first[None]])
 
     def keep_landmarks(self, keep: NDArray[np.bool_]) -> None:
         """Marginalise the landmarks for which ``keep`` (M,) is False."""

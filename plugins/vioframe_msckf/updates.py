@@ -129,6 +129,6 @@ def promote_tracks(
         gain = -T_inverse @ H[:3]
         cross = gain @ state.cov[columns]
         cov = gain @ P @ gain.T + variance * T_inverse @ T_inverse.T
-        state.add_landmark(int(observations.ids[row]), p_WF + T_inverse @ residual[:3], cross, cov)
+        state.add_landmark(int(observations.ids[row]), p_WF + T_inverse @ residual[:3], p_WF, cross, cov)
         state.update(H[3:], residual[3:], columns, variance)
     return np.array(used, dtype=np.intp)
