@@ -6,10 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 from vioframe_msckf.state import FilterState
+from vioframe_msckf.tracks import ObservationTable
 
 from vioframe.calibration import packaged_calibration
 from vioframe.geometry import so3
-from vioframe.simulation import TrackSequence
+from vioframe.simulation import TrackSequence, simulated_sequence
 from vioframe.types import Float, NavState
 
 START_COV = np.diag(np.repeat([0.005, 0.001, 0.02, 0.005, 0.05], 3) ** 2)
@@ -42,6 +43,23 @@ def random_state(
     if calibrate:
         state.cov = scale**2 * random_covariance(rng, len(state.cov))
     return state
+
+
+def seeing_state(seed: int = 0, clones: int = 6) -> tuple[FilterState, ObservationTable]:
+    """A filter that knows to a centimetre where it has been on a simulated flight, and what it saw from there."""
+    sequence = simulated_sequence("figure_eight", seed=seed, duration_s=2.0)
+    start = sequence.true_states[0]
+    state = FilterState(
+        replace(start, cov=np.eye(15)), sequence.calibration, extrinsics=True, offset=True, intrinsics=True
+    )
+    observations = ObservationTable()
+    for k in range(0, 3 * clones, 3):
+        true = sequence.true_states[k]
+        state.R_WB, state.p_WB, state.v_WB = true.R_WB, true.p_WB, true.v_WB
+        state.augment_clone(np.zeros(3))
+        observations.add_frame(sequence.packets[k][1])
+    state.cov = 0.01**2 * random_covariance(np.random.default_rng(seed), len(state.cov))
+    return state, observations
 
 
 def drawn_start(sequence: TrackSequence, frame: int, seed: int, cov: Float = START_COV) -> NavState:

@@ -1,12 +1,19 @@
 """The filter's analytic Jacobians against numeric ones on the manifold."""
 
+import copy
+
 import numpy as np
 import pytest
+from msckf_helpers import random_covariance, seeing_state
+from scipy.stats import chi2
+from vioframe_msckf import measurement
+from vioframe_msckf.measurement import Window, landmark_rows, mahalanobis, reduce_landmark, track_rows
+from vioframe_msckf.options import MsckfOptions
+from vioframe_msckf.state import CALIBRATION, OFFSET
+from vioframe_msckf.updates import promote_tracks
 
 from vioframe.geometry import kernels, so3
 from vioframe.geometry.cameras import Camera
-
-measurement = pytest.importorskip("vioframe_msckf.measurement")
 
 CAMERAS = {
     "radtan": Camera(458.654, 457.296, 367.215, 248.375, (-0.283, 0.0740, 0.00019, 1.76e-05), (752, 480), "radtan"),
@@ -49,3 +56,108 @@ def test_observation_jacobian_is_the_derivative_on_the_manifold(camera):
     numeric = np.stack([(predicted(eps * e) - predicted(-eps * e)) / (2 * eps) for e in np.eye(24)], axis=1)
     np.testing.assert_allclose(residual[0], [0.3, -0.2], atol=1e-9)
     np.testing.assert_allclose(blocks[0], numeric, rtol=1e-6, atol=1e-5)
+
+
+def test_rows_of_landmarks_predict_how_residuals_change_with_the_state():
+    """Column by column, through the filter's own correction; only the offset acts through the clones alone."""
+    state, observations = seeing_state()
+    full = np.flatnonzero(observations.seen.all(axis=1))[:4]
+    for row in full:
+        track = track_rows(Window.of(state, False), observations.xy[row], observations.xy_normalised[row],
+                           observations.seen[row], 1.0)  # fmt: skip
+        assert track is not None
+        state.add_landmark(row, track[0], track[0], np.zeros((3, len(state.cov))), np.eye(3))
+    clone, rows, xy = 3, np.array([3, 0, 2]), observations.xy[full[[3, 0, 2]], 3]
+
+    def residual(dx):
+        moved = copy.deepcopy(state)
+        moved._correct(dx)
+        return landmark_rows(moved, Window.of(moved, False), clone, xy, rows, False)[1]
+
+    H, _ = landmark_rows(state, Window.of(state, False), clone, xy, rows, False)
+    eps, n = 1e-6, len(state.cov)
+    numeric = np.stack([(residual(-eps * e) - residual(eps * e)) / (2 * eps) for e in np.eye(n)], axis=1)
+    np.testing.assert_allclose(H, numeric, rtol=1e-6, atol=2e-4)
+    assert (H[:, OFFSET] == 0.0).all()
+
+
+def test_first_estimates_hold_the_jacobian_and_not_the_residual():
+    state, observations = seeing_state()
+    row = np.flatnonzero(observations.seen.all(axis=1))[0]
+    p_WF, *_ = track_rows(Window.of(state, True), observations.xy[row], observations.xy_normalised[row],
+                          observations.seen[row], 1.0)  # fmt: skip
+    state.add_landmark(row, p_WF, p_WF, np.zeros((3, len(state.cov))), np.eye(3))
+    moved, dx = copy.deepcopy(state), 0.01 * np.random.default_rng(0).normal(size=len(state.cov))
+    dx[CALIBRATION] = 0.0
+    moved._correct(dx)
+
+    def rows(of, first_estimates):
+        window = Window.of(of, first_estimates)
+        return landmark_rows(of, window, 2, observations.xy[[row], 2], np.array([0]), first_estimates)
+
+    H, residual = rows(state, True)
+    np.testing.assert_array_equal(rows(moved, True)[0], H)
+    assert np.abs(rows(moved, False)[0] - H).max() > 0.1
+    np.testing.assert_array_equal(rows(moved, True)[1], rows(moved, False)[1])
+    np.testing.assert_allclose(rows(moved, True)[1], residual - H @ dx, atol=0.5)
+    assert np.abs(residual - rows(moved, True)[1]).max() > 1.0
+
+
+@pytest.mark.parametrize("views", [2, 5, 11])
+def test_reduction_is_orthogonal_and_frees_the_rows_below_the_third(views):
+    rng = np.random.default_rng(views)
+    H, H_f, residual = rng.normal(size=(2 * views, 20)), rng.normal(size=(2 * views, 3)), rng.normal(size=2 * views)
+    before = np.column_stack([H, H_f, residual])
+    reduce_landmark(H, H_f, residual)
+    after = np.column_stack([H, H_f, residual])
+    # An orthogonal transformation of the rows is one that leaves all inner products of columns as they are.
+    np.testing.assert_allclose(after.T @ after, before.T @ before, atol=1e-12)
+    assert np.abs(H_f[3:]).max() < 1e-14
+    assert np.abs(np.tril(H_f[:3], -1)).max() < 1e-14
+    assert np.abs(np.diag(H_f)).min() > 0.1
+
+
+def test_mahalanobis_distance():
+    rng = np.random.default_rng(1)
+    H, P, residual = rng.normal(size=(7, 12)), random_covariance(rng, 12), rng.normal(size=7)
+    expected = residual @ np.linalg.inv(H @ P @ H.T + 0.3 * np.eye(7)) @ residual
+    assert mahalanobis(H, residual, P, 0.3) == pytest.approx(expected, rel=1e-12)
+
+
+def test_delayed_initialisation_is_the_joint_update_with_nothing_known_of_the_landmark():
+    state, observations = seeing_state()
+    options = MsckfOptions(pixel_sigma=0.7)
+    row = np.flatnonzero(observations.seen.all(axis=1))[0]
+    p_WF, H, H_f, residual = track_rows(
+        Window.of(state, True), observations.xy[row], observations.xy_normalised[row], observations.seen[row], 0.7
+    )
+    # In information form the landmark's prior is exactly nothing.
+    n = len(state.cov)
+    joint = np.zeros((len(residual), n + 3))
+    joint[:, CALIBRATION.start : n], joint[:, n:] = H, H_f
+    information = joint.T @ joint / 0.7**2
+    information[:n, :n] += np.linalg.inv(state.cov)
+    cov = np.linalg.inv(information)
+    dx = cov @ joint.T @ residual / 0.7**2
+
+    before = copy.deepcopy(state)
+    gate = chi2.ppf(0.999999, np.arange(1, 40))
+    assert promote_tracks(state, observations, np.array([row]), options, np.r_[0.0, gate]).tolist() == [row]
+    np.testing.assert_allclose(state.cov, cov, rtol=1e-6, atol=1e-9 * np.abs(cov).max())
+    np.testing.assert_allclose(state.p_WF[0], p_WF + dx[n:], atol=1e-9)
+    np.testing.assert_allclose(state.p_WF_first[0], p_WF, atol=0.0)
+    np.testing.assert_allclose(state.p_WB, before.p_WB + dx[3:6], atol=1e-9)
+    np.testing.assert_allclose(so3.log(before.R_WB.T @ state.R_WB), dx[:3], atol=1e-9)
+    np.testing.assert_allclose(state.clones.p_WB, before.clones.p_WB + dx[30:n].reshape(-1, 6)[:, 3:], atol=1e-9)
+    assert state.landmark_ids.tolist() == [observations.ids[row]]
+
+
+def test_an_implausible_track_is_used_up_and_changes_nothing():
+    state, observations = seeing_state()
+    row = np.flatnonzero(observations.seen.all(axis=1))[0]
+    observations.xy[row, 2] += 60.0
+    cov = state.cov.copy()
+    gate = np.r_[0.0, chi2.ppf(0.95, np.arange(1, 40))]
+    assert promote_tracks(state, observations, np.array([row]), MsckfOptions(), gate).tolist() == [row]
+    assert not len(state.landmark_ids)
+    np.testing.assert_array_equal(state.cov, cov)
