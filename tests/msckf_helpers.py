@@ -5,13 +5,13 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from vioframe_msckf.state import FilterState
-from vioframe_msckf.tracks import ObservationTable
 
 from vioframe.calibration import packaged_calibration
 from vioframe.geometry import so3
 from vioframe.simulation import TrackSequence, simulated_sequence
 from vioframe.types import Float, NavState
+from vioframe_msckf.state import FilterState
+from vioframe_msckf.tracks import ObservationTable
 
 START_COV = np.diag(np.repeat([0.005, 0.001, 0.02, 0.005, 0.05], 3) ** 2)
 """How well a drawn start is known: rad, m, m/s, rad/s, m/s^2."""

@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 from msckf_helpers import random_covariance, seeing_state
 from scipy.stats import chi2
+
+from vioframe.geometry import kernels, so3
+from vioframe.geometry.cameras import Camera
 from vioframe_msckf import measurement
 from vioframe_msckf.measurement import Window, landmark_rows, mahalanobis, reduce_landmark, track_rows
 from vioframe_msckf.options import MsckfOptions
 from vioframe_msckf.state import CALIBRATION, OFFSET
 from vioframe_msckf.updates import promote_tracks
-
-from vioframe.geometry import kernels, so3
-from vioframe.geometry.cameras import Camera
 
 CAMERAS = {
     "radtan": Camera(458.654, 457.296, 367.215, 248.375, (-0.283, 0.0740, 0.00019, 1.76e-05), (752, 480), "radtan"),

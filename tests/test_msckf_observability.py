@@ -12,15 +12,15 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import pytest
-import vioframe_msckf.updates as updates
 from msckf_helpers import after, drawn_start
-from vioframe_msckf.backend import Msckf
-from vioframe_msckf.options import MsckfOptions
-from vioframe_msckf.state import CLONES, IMU, FilterState
 
+import vioframe_msckf.updates as updates
 from vioframe.bench import run_backend
 from vioframe.simulation import simulated_sequence
 from vioframe.types import DP, DTHETA, DV, Float, NavState
+from vioframe_msckf.backend import Msckf
+from vioframe_msckf.options import MsckfOptions
+from vioframe_msckf.state import CLONES, IMU, FilterState
 
 UP = np.array([0.0, 0.0, 1.0])
 FLIGHTS = ("figure_eight", "aggressive", "stop_and_go")

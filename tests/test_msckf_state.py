@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from filterpy.kalman import KalmanFilter
 from msckf_helpers import random_covariance, random_state
-from vioframe_msckf.state import CALIBRATION, CLONES, IMU, OFFSET, FilterDivergedError, FilterState, compress
 
 from vioframe.geometry import so3
 from vioframe.types import DBA, DBG, DP, DTHETA, DV, NS_PER_S, Float, ImuNoise, ImuSegment
+from vioframe_msckf.state import CALIBRATION, CLONES, IMU, OFFSET, FilterDivergedError, FilterState, compress
 
 NOISE = ImuNoise(gyro_density=2e-3, accel_density=2e-2, gyro_walk=2e-3, accel_walk=3e-2, rate_hz=200.0)
 

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
-from vioframe_msckf.triangulation import MAX_DEPTH_M, triangulate
 
 from vioframe.geometry import so3
 from vioframe.types import Float
+from vioframe_msckf.triangulation import MAX_DEPTH_M, triangulate
 
 PIXEL = 1.0 / 458.0
 
@@ -57,6 +57,13 @@ def test_points_behind_a_camera_are_refused():
     R_turned[-1] = R_WC[-1] @ so3.exp([0.0, np.pi, 0.0])
     assert triangulate(R_WC, p_WC, project(R_WC, p_WC, ahead), PIXEL)[0]
     assert not triangulate(R_turned, p_WC, project(R_turned, p_WC, ahead), PIXEL)[0]
+
+
+def test_rays_that_cross_behind_a_later_camera_are_refused():
+    """Half a metre ahead of the first camera, but the second has already flown past that."""
+    R_WC, p_WC = np.tile(np.eye(3), (2, 1, 1)), np.array([[0.0, 0.0, 0.0], [0.15, 0.0, 0.8]])
+    ok, _ = triangulate(R_WC, p_WC, np.array([[0.2, 0.0], [0.167, 0.0]]), PIXEL)
+    assert not ok
 
 
 def test_points_too_near_or_too_far_are_refused():

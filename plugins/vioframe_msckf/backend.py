@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from vioframe.geometry import so3
 from vioframe.initialization import Initializer
 from vioframe.stopwatch import Stopwatch
+from vioframe.trajectory.alignment import rotation_z, yaw_of
 from vioframe.types import Calibration, Estimate, FrameTracks, ImuSegment, NavState, Status
 from vioframe_msckf.options import MsckfOptions
 from vioframe_msckf.standstill import StandstillDetector, hold_still
@@ -151,9 +151,7 @@ class Msckf:
 
 def _moved_to(last: NavState, initial: NavState) -> NavState:
     """``initial``, which begins at a world origin of its own, placed at the position and yaw where ``last`` ended."""
-    forward, target = initial.R_WB[:2, 0], last.R_WB[:2, 0]
-    yaw = np.arctan2(target[1], target[0]) - np.arctan2(forward[1], forward[0])
-    R = so3.exp(np.array([0.0, 0.0, yaw]))
+    R = rotation_z(float(yaw_of(last.R_WB @ initial.R_WB.T)))
     cov = initial.cov
     if cov is not None:
         G = np.eye(15)

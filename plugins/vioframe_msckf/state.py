@@ -111,6 +111,8 @@ class FilterState:
     def propagate(self, imu: ImuSegment, noise: ImuNoise, first_estimates: bool) -> None:
         """Move the body's state along ``imu``; eq. (10)-(11) of Mourikis and Roumeliotis (2007), block by block."""
         step = propagate(imu, self.R_WB, self.p_WB, self.v_WB, self.bias_gyro_B, self.bias_accel_B, noise)
+        if not np.isfinite([step.p_WB, step.v_WB]).all():
+            raise FilterDivergedError("the inertial readings lead nowhere finite")
         Phi = step.transition
         end = (step.R_WB, step.p_WB, step.v_WB)
         if first_estimates:

@@ -51,6 +51,8 @@ def triangulate(R_WC, p_WC, xy, sigma):
         t[i] = R_WC[i].T @ (p_WC[0] - p_WC[i])
     damping = 1e-3
     cost, N, g = _normal_equations(R, t, xy, theta)
+    if cost == np.inf:  # behind one of the cameras: nothing to start from
+        return False, p
     for _ in range(_ITERATIONS):
         damped = N.copy()
         for k in range(3):

@@ -1,0 +1,128 @@
+"""How accurate it is on real recordings: what the project promises, from the bag to the trajectory.
+
+Real images (EuRoC), real corners (an AprilGrid), and simulated landmarks along real motion with the readings of the
+real IMU. Everything goes through the same doors as the command line and the benchmarks.
+"""
+
+from __future__ import annotations
+
+import json
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from threadpoolctl import threadpool_limits
+
+from vioframe import registry
+from vioframe.bench import Row, backend_row, run_backend
+from vioframe.bench.april import april_sequence
+from vioframe.config import Config, DatasetConfig, PartConfig
+from vioframe.convert import convert
+from vioframe.experiment import prepare, record
+from vioframe.report.run_folder import RunFolder
+from vioframe.simulation import REAL_MOTION_SEQUENCES, TrackSequence, real_motion_sequence
+from vioframe.trajectory import TrajectoryErrors, evaluate
+
+TRUTH = "mav0/state_groundtruth_estimate0/data.csv"
+
+
+@cache
+def installed() -> registry.Registry:
+    return registry.load()
+
+
+def fly(recording: Path, clip: Path, folder: Path, detector: str = "shi_tomasi") -> tuple[Row, TrajectoryErrors]:
+    """The whole pipeline into ``folder``; the summary and the errors against the clip's ground truth."""
+    config = Config(
+        dataset=DatasetConfig(path=recording), detector=PartConfig(name=detector), ground_truth=clip / TRUTH
+    )
+    record(prepare(config, installed()), folder)
+    done = RunFolder.open(folder)
+    estimate, truth = done.trajectory(), done.ground_truth()
+    assert estimate is not None
+    assert truth is not None
+    return json.loads((folder / "summary.json").read_text()), evaluate(estimate, truth)
+
+
+def fly_tracks(sequence: TrackSequence) -> Row:
+    with threadpool_limits(1):
+        return backend_row(
+            sequence, run_backend(sequence, installed().create_backend("msckf", sequence.calibration, {}))
+        )
+
+
+@pytest.fixture(scope="module")
+def machine_hall(shared_data: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """The clip that begins in motion, and a ROS 1 bag made of it."""
+    clip = shared_data / "euroc/MH_01_easy_15s"
+    bag = tmp_path_factory.mktemp("bags") / "MH_01_easy_15s.bag"
+    source = installed().open_dataset(clip)
+    convert(source.measurements(), source.calibration, bag)
+    return clip, bag
+
+
+@pytest.mark.parametrize(
+    ("detector", "limit_m"), [("shi_tomasi", 0.015), ("fast", 0.025), ("orb", 0.025), ("sift", 0.025)]
+)
+def test_machine_hall_from_a_bag(machine_hall, tmp_path, detector, limit_m):
+    clip, bag = machine_hall
+    summary, errors = fly(bag, clip, tmp_path / "run", detector)
+    assert summary["finished"]
+    assert summary["frames"] == 300
+    assert summary["initialised_after_s"] <= 3.0
+    assert summary["completion"] == 1.0
+    assert summary["resets"] == 0
+    assert errors.coverage > 0.8
+    assert errors.truth.path_length_m > 3.0
+    assert errors.ate_m.rmse <= limit_m
+    assert errors.scale == pytest.approx(1.0, abs=0.02)
+
+
+def test_two_runs_on_one_bag_are_the_same_byte_for_byte(machine_hall, tmp_path):
+    clip, bag = machine_hall
+    for name in ("first", "second"):
+        fly(bag, clip, tmp_path / name)
+    for file in ("trajectory.tum", "states.csv", "pose_cov.csv", "tracks.csv", "map.ply"):
+        first, second = ((tmp_path / name / file).read_bytes() for name in ("first", "second"))
+        assert len(first) > 1000
+        assert first == second, file
+
+
+def test_vicon_room_at_rest(shared_data, tmp_path):
+    clip = shared_data / "euroc/V1_01_easy_rest"
+    summary, errors = fly(clip, clip, tmp_path / "run")
+    drift_m = np.linalg.norm(errors.estimate.p_WB - errors.estimate.p_WB[0], axis=1).max()
+    assert "initialised (static)" in [event["event"] for event in summary["events"]]
+    assert summary["completion"] == 1.0
+    assert summary["initialised_after_s"] <= 3.0
+    assert drift_m <= 0.010
+
+
+def test_april_grid_under_strong_motion(shared_data):
+    row = fly_tracks(april_sequence(shared_data / "euroc_imu_april"))
+    assert row["completion"] == 1.0
+    assert row["resets"] == 0
+    assert row["initialised_s"] < 3.0
+    assert row["path_m"] > 10.0
+    assert row["ate_m"] <= 0.040
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", REAL_MOTION_SEQUENCES)
+def test_real_motion(shared_data, name):
+    _check_real_motion(real_motion_sequence(shared_data / "euroc_imu_gt" / name), least_path_m=55.0)
+
+
+def test_twenty_seconds_of_real_motion(shared_data):
+    """Part of the above for everyday: the liveliest flight's middle."""
+    folder = shared_data / "euroc_imu_gt/V1_02_medium"
+    _check_real_motion(real_motion_sequence(folder, start_s=15.0, duration_s=30.0), least_path_m=20.0)
+
+
+def _check_real_motion(sequence: TrackSequence, least_path_m: float) -> None:
+    row = fly_tracks(sequence)
+    assert row["completion"] == 1.0
+    assert row["resets"] == 0
+    assert row["path_m"] > least_path_m
+    assert row["percent"] <= 0.5

@@ -1,0 +1,157 @@
+"""Is the filter as good as it says? Gate rates, error against covariance over many flights, outliers, calibration."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from msckf_helpers import after, drawn_start, pose_nees
+from scipy.stats import chi2
+
+from vioframe.bench import BackendRun, run_backend
+from vioframe.calibration import packaged_calibration
+from vioframe.geometry import so3
+from vioframe.simulation import TrackSequence, simulated_sequence
+from vioframe_msckf import backend as backend_module
+from vioframe_msckf import updates
+from vioframe_msckf.backend import Msckf
+from vioframe_msckf.measurement import ACCEPTED, GATED
+from vioframe_msckf.options import MsckfOptions
+
+CALIBRATED = MsckfOptions(calibrate_extrinsics=False, calibrate_time_offset=False, calibrate_intrinsics=False)
+
+
+class GateCounts:
+    """Counts what the gates say: ``tracks`` by verdict, ``landmarks`` (used, offered)."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, wrong: frozenset[tuple[float, float]] = frozenset()) -> None:
+        self.tracks: Counter[int] = Counter()
+        self.wrong_tracks: Counter[int] = Counter()
+        self.landmarks = np.zeros(2, int)
+        self.wrong = wrong
+        measure, update = updates.msckf_measurement, updates.update_from_landmarks
+
+        def measured(state, window, xy, xy_normalised, seen, *arguments):
+            result = measure(state, window, xy, xy_normalised, seen, *arguments)
+            for points, mask, verdict in zip(xy, seen, result.verdict.tolist(), strict=True):
+                spoilt = any(tuple(point) in self.wrong for point in points[mask].tolist())
+                (self.wrong_tracks if spoilt else self.tracks)[verdict] += 1
+            return result
+
+        def updated(state, tracks, *arguments):
+            offered = int(np.isin(state.landmark_ids, tracks.ids).sum())
+            used = update(state, tracks, *arguments)
+            self.landmarks += used, offered
+            return used
+
+        monkeypatch.setattr(updates, "msckf_measurement", measured)
+        monkeypatch.setattr(backend_module, "update_from_landmarks", updated)
+
+
+def fly(sequence: TrackSequence, options: MsckfOptions, seed: int) -> BackendRun:
+    start = drawn_start(sequence, 1, 1000 + seed)
+    return run_backend(after(sequence, 1), Msckf(sequence.calibration, options, start))
+
+
+def spoilt(sequence: TrackSequence, ratio: float, seed: int) -> tuple[TrackSequence, frozenset[tuple[float, float]]]:
+    """Observations moved by 15 px in a random direction, and which."""
+    rng, wrong, packets = np.random.default_rng(seed), set(), []
+    for imu, tracks in sequence.packets:
+        bad, angle = rng.random(len(tracks.ids)) < ratio, rng.uniform(0.0, 2.0 * np.pi, len(tracks.ids))
+        xy = tracks.xy + bad[:, None] * 15.0 * np.column_stack([np.cos(angle), np.sin(angle)])
+        wrong |= set(map(tuple, xy[bad].tolist()))
+        packets.append((imu, replace(tracks, xy=xy, xy_normalised=sequence.calibration.camera.undistort(xy))))
+    return replace(sequence, packets=tuple(packets)), frozenset(wrong)
+
+
+@pytest.mark.parametrize("flight", ["figure_eight", "aggressive"])
+def test_gates_accept_inliers_at_their_nominal_rate(flight, monkeypatch):
+    counts = GateCounts(monkeypatch)
+    fly(simulated_sequence(flight, seed=1, duration_s=20.0), CALIBRATED, 1)
+    tracks, landmarks = counts.tracks, counts.landmarks
+    assert tracks[ACCEPTED] + tracks[GATED] > 2000
+    assert landmarks[1] > 5000
+    assert 0.92 < tracks[ACCEPTED] / (tracks[ACCEPTED] + tracks[GATED]) < 0.985
+    assert 0.92 < landmarks[0] / landmarks[1] < 0.985
+
+
+def test_the_gate_follows_its_quantile(monkeypatch):
+    counts = GateCounts(monkeypatch)
+    options = replace(CALIBRATED, gate_quantile=0.7)
+    fly(simulated_sequence("figure_eight", seed=1, duration_s=10.0), options, 1)
+    tracks = counts.tracks
+    assert 0.62 < tracks[ACCEPTED] / (tracks[ACCEPTED] + tracks[GATED]) < 0.78
+
+
+def test_outliers_are_rejected_and_do_no_harm(monkeypatch):
+    clean = simulated_sequence("figure_eight", seed=2, duration_s=15.0)
+    sequence, wrong = spoilt(clean, 0.03, 2)
+    counts = GateCounts(monkeypatch, wrong)
+    run = fly(sequence, CALIBRATED, 2)
+    assert run.completion == 1.0
+    assert counts.wrong_tracks.total() > 300
+    assert counts.wrong_tracks[ACCEPTED] < 0.02 * counts.wrong_tracks.total()
+    assert 0.92 < counts.tracks[ACCEPTED] / (counts.tracks[ACCEPTED] + counts.tracks[GATED]) < 0.985
+    errors = [np.linalg.norm(s.p_WB - t.p_WB) for s, t in zip(run.states, clean.true_states[2:], strict=True)]
+    assert max(errors) < 0.15
+
+
+def mean_nees(flight: str, seeds: int, duration_s: float, options: MsckfOptions) -> tuple[float, float]:
+    values = []
+    for seed in range(seeds):
+        sequence = simulated_sequence(flight, seed=seed, duration_s=duration_s)
+        run = fly(sequence, options, seed)
+        assert run.completion == 1.0
+        values.append(pose_nees(run.states, {s.t_ns: s for s in sequence.true_states}))
+    orientation, position = np.mean(values, axis=0)
+    return float(orientation), float(position)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("flight", ["figure_eight", "aggressive"])
+def test_errors_are_as_large_as_the_covariance_says(flight):
+    """Three degrees of freedom over twelve flights; errors within a flight hang together, so each counts as one."""
+    flights = 12
+    low, high = chi2.ppf([0.025, 0.975], 3 * flights) / flights
+    orientation, position = mean_nees(flight, flights, 15.0, MsckfOptions())
+    assert low < orientation < high
+    assert low < position < high
+
+
+def test_without_first_estimates_the_covariance_is_far_too_small():
+    sure, _ = mean_nees("figure_eight", 2, 20.0, MsckfOptions(first_estimate_jacobians=False))
+    honest, _ = mean_nees("figure_eight", 2, 20.0, MsckfOptions())
+    assert honest < chi2.ppf(0.975, 6) / 2
+    assert sure > 4.0 * honest
+
+
+def test_calibration_converges_to_the_truth_within_its_own_uncertainty():
+    """The camera sits and sees otherwise than the filter was told, as far off as its prior allows."""
+    told = packaged_calibration("euroc")
+    camera = replace(told.camera, fx=told.camera.fx + 1.0, fy=told.camera.fy - 1.2, cx=told.camera.cx - 0.8)
+    true = replace(
+        told, camera=camera, R_BC=told.R_BC @ so3.exp([0.004, -0.006, 0.005]), p_BC=told.p_BC + [0.012, -0.015, 0.01]
+    )
+    sequence = simulated_sequence("aggressive", seed=3, duration_s=20.0, calibration=true, pixel_sigma=1.0)
+    packets = tuple((imu, replace(t, xy_normalised=told.camera.undistort(t.xy))) for imu, t in sequence.packets)
+    sequence = replace(sequence, packets=packets, calibration=told)
+    filter_ = Msckf(told, None, drawn_start(sequence, 1, 3))
+    run_backend(after(sequence, 1), filter_)
+    state = filter_.state
+    assert state is not None
+    error = np.concatenate(
+        [
+            so3.log(state.R_BC.T @ true.R_BC),
+            true.p_BC - state.p_BC,
+            [camera.fx, camera.fy, camera.cx] - state.intrinsics[:3],
+        ]
+    )
+    before = np.concatenate([so3.log(told.R_BC.T @ true.R_BC), true.p_BC - told.p_BC, [1.0, -1.2, -0.8]])
+    index = np.r_[15:21, 22:25]
+    sigma = np.sqrt(np.diag(state.cov))[index]
+    assert np.abs(error / sigma).max() < 3.5
+    for part in (slice(0, 3), slice(3, 6), slice(6, 9)):
+        assert np.linalg.norm(error[part]) < 0.4 * np.linalg.norm(before[part])
+    assert (sigma < 0.5 * np.repeat([0.005, 0.015, 1.0], 3)).all()

@@ -1,0 +1,155 @@
+"""Standing still: nothing drifts or grows, and slow motion is not taken for it."""
+
+import copy
+
+import numpy as np
+import pytest
+from msckf_helpers import after, drawn_start, random_state
+
+from vioframe.bench import run_backend
+from vioframe.geometry import so3
+from vioframe.simulation import FLIGHTS, simulated_sequence
+from vioframe.types import DBA, DBG, DTHETA, DV, Estimate, FrameTracks, ImuNoise, ImuSegment, Status, g_W
+from vioframe_msckf.backend import Msckf
+from vioframe_msckf.standstill import StandstillDetector, hold_still, median_disparity_px
+from vioframe_msckf.state import IMU
+
+NOISE = ImuNoise(gyro_density=1.7e-4, accel_density=2e-3, gyro_walk=2e-5, accel_walk=3e-3, rate_hz=200.0)
+
+
+def held(estimate: Estimate) -> bool:
+    """Whether the frame was answered by a zero-velocity update alone."""
+    return estimate.status is Status.TRACKING and set(estimate.stage_seconds) == {"standstill"}
+
+
+def frame(t_s: float, xy, ids=None) -> FrameTracks:
+    xy = np.asarray(xy, dtype=np.float64)
+    return FrameTracks(round(t_s * 1e9), np.arange(len(xy)) if ids is None else np.asarray(ids), xy, 0.001 * xy)
+
+
+def test_standstill_does_not_drift_and_nothing_grows():
+    """Tracks that never end leave the filter as it is, for ten seconds."""
+    sequence = simulated_sequence("standstill", pixel_sigma=0.1, duration_s=12.0)
+    backend = Msckf(sequence.calibration)
+    sizes = []
+    estimates = []
+    for packet in sequence.packets:
+        estimates.append(backend.process(*packet))
+        if backend.state is not None:
+            sizes.append((len(backend.state.cov), len(backend._observations.ids)))
+    states = [e.state for e in estimates if e.state is not None]
+    assert (states[-1].t_ns - states[0].t_ns) * 1e-9 > 10.0
+    assert any(event == "initialised (static)" for e in estimates for event in e.events)
+    assert {e.status for e in estimates[-len(states) :]} == {Status.TRACKING}
+    p_WB = np.array([s.p_WB for s in states])
+    assert np.linalg.norm(p_WB - p_WB[0], axis=1).max() < 2e-3
+    assert max(np.linalg.norm(s.v_WB) for s in states[1:]) < 0.01
+    assert max(sizes) == sizes[-1] == sizes[len(sizes) // 2]
+    # Each state tells its own uncertainty, and it neither explodes nor vanishes.
+    sigma = np.sqrt(np.diag(states[-1].cov))
+    assert sigma[3:6].min() > 1e-6
+    assert sigma[3:6].max() < 0.01
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+@pytest.mark.parametrize("speed", [0.05, 0.1])
+def test_slow_motion_is_not_taken_for_standstill(axis, speed, monkeypatch):
+    """Creeping ahead, aside and up, seen almost without noise."""
+    still = FLIGHTS["standstill"][1]
+    monkeypatch.setitem(FLIGHTS, "creep", (lambda t_s: np.outer(t_s, speed * np.eye(3)[axis]), still))
+    sequence = simulated_sequence("creep", pixel_sigma=0.1, duration_s=6.0)
+    run = run_backend(after(sequence, 1), Msckf(sequence.calibration, None, drawn_start(sequence, 1, 0)))
+    assert not any(map(held, run.estimates))
+
+
+def test_hover_is_not_taken_for_standstill():
+    """A few centimetres to and fro, and images that are good to a tenth of a pixel."""
+    sequence = simulated_sequence("hover", pixel_sigma=0.1, duration_s=10.0)
+    run = run_backend(after(sequence, 1), Msckf(sequence.calibration, None, drawn_start(sequence, 1, 0)))
+    assert not any(map(held, run.estimates))
+    speed = np.linalg.norm([s.v_WB for s in sequence.true_states], axis=1)
+    assert 0.03 < np.median(speed) < 0.3
+
+
+def test_stop_and_go_is_held_at_every_stop_only():
+    sequence = simulated_sequence("stop_and_go", pixel_sigma=0.1, duration_s=26.0)
+    run = run_backend(after(sequence, 1), Msckf(sequence.calibration, None, drawn_start(sequence, 1, 0)))
+    speed = np.linalg.norm([s.v_WB for s in sequence.true_states[2:]], axis=1)
+    is_held = np.array(list(map(held, run.estimates)))
+    assert speed[is_held].max() < 0.03
+    # Half a second of each stop goes by before it is seen to be one.
+    assert is_held[speed < 1e-3].mean() > 0.7
+    errors = [np.linalg.norm(s.p_WB - t.p_WB) for s, t in zip(run.states, sequence.true_states[2:], strict=True)]
+    assert max(errors) < 0.2
+
+
+def test_disparity_is_the_median_over_common_tracks():
+    before = frame(0.0, np.zeros((12, 2)), ids=np.arange(12))
+    now = frame(0.5, [[3.0, 4.0]] * 9 + [[50.0, 0.0]] * 4, ids=[*range(11, 2, -1), 20, 21, 2, 1])
+    assert median_disparity_px(before, now) == 5.0
+    assert median_disparity_px(before, frame(0.5, np.zeros((9, 2)))) == np.inf
+
+
+def test_detector_looks_half_a_second_back():
+    rng = np.random.default_rng(0)
+    xy = rng.uniform(0.0, 700.0, (30, 2))
+    detector = StandstillDetector(0.7)
+    # 0.1 px a frame, which no two neighbours show, is 1 px in half a second.
+    assert not any(detector.sees_standstill(frame(0.05 * k, xy + 0.1 * k)) for k in range(40))
+    detector = StandstillDetector(0.7)
+    seen = [detector.sees_standstill(frame(0.05 * k, xy)) for k in range(20)]
+    assert seen == [False] * 10 + [True] * 10
+    # After a gap the last half second is not known.
+    assert detector.sees_standstill(frame(5.0, xy + 3.0)) is False
+
+
+def still_readings(state, rng, rate=0.0, shake=0.0):
+    t_ns = 5_000_000 * np.arange(11, dtype=np.int64)
+    white = rng.normal(size=(2, 11, 3)) * np.array([1.7e-4, 2e-3])[:, None, None] * np.sqrt(200.0)
+    force = -state.R_WB.T @ g_W + state.bias_accel_B
+    return ImuSegment(t_ns, state.bias_gyro_B + rate + white[0], force + shake + white[1])
+
+
+@pytest.mark.parametrize(("v", "rate", "shake", "held"), [
+    (0.0, 0.0, 0.0, True), (0.002, 0.0, 0.0, True), (0.3, 0.0, 0.0, False), (0.0, 0.2, 0.0, False), (0.0, 0.0, 1.0, False),
+])  # fmt: skip
+def test_is_held_only_where_the_imu_agrees(v, rate, shake, held):
+    state, rng = random_state(1, scale=0.005), np.random.default_rng(1)
+    state.v_WB = np.array([v, 0.0, 0.0])
+    before = copy.deepcopy(state)
+    assert hold_still(state, still_readings(state, rng, rate, shake), NOISE, True) is held
+    if held:
+        assert np.linalg.norm(state.v_WB) < max(v, 5e-4)
+        assert (np.diag(state.cov)[DV] < np.diag(before.cov)[DV]).all()
+    else:
+        np.testing.assert_array_equal(state.cov, before.cov)
+        np.testing.assert_array_equal(state.v_WB, before.v_WB)
+
+
+def test_holding_still_is_the_kalman_update_with_numeric_jacobians():
+    """Expected readings as a function of the state, differentiated on the manifold."""
+    state, rng = random_state(2, scale=0.005), np.random.default_rng(2)
+    state.v_WB = np.array([0.003, -0.002, 0.001])
+    imu = still_readings(state, rng)
+    before = copy.deepcopy(state)
+
+    def expected(d):
+        force = -(before.R_WB @ so3.exp(d[DTHETA])).T @ g_W + before.bias_accel_B + d[DBA]
+        return np.concatenate([before.bias_gyro_B + d[DBG], force, before.v_WB + d[DV]])
+
+    eps = 1e-6
+    H = np.zeros((9, len(state.cov)))
+    H[:, :IMU] = np.stack([(expected(eps * e) - expected(-eps * e)) / (2 * eps) for e in np.eye(IMU)], axis=1)
+    residual = np.concatenate([imu.gyro_B.mean(axis=0), imu.accel_B.mean(axis=0), np.zeros(3)]) - expected(np.zeros(15))
+    P = before.cov.copy()
+    P[DBG, DBG] += np.eye(3) * NOISE.gyro_walk**2 * imu.duration_s
+    P[DBA, DBA] += np.eye(3) * NOISE.accel_walk**2 * imu.duration_s
+    assert hold_still(state, imu, NOISE, first_estimates=False)
+    # The noise of the sensors ten times over, for a body that stands but shakes, and a velocity of a centimetre a second.
+    sigma = np.repeat([10 * NOISE.gyro_density / np.sqrt(0.05), 10 * NOISE.accel_density / np.sqrt(0.05), 0.01], 3)
+    K = P @ H.T @ np.linalg.inv(H @ P @ H.T + np.diag(sigma**2))
+    dx = K @ residual
+    np.testing.assert_allclose(state.cov, P - K @ H @ P, atol=1e-9 * np.abs(P).max())
+    np.testing.assert_allclose(so3.log(before.R_WB.T @ state.R_WB), dx[DTHETA], atol=1e-9)
+    np.testing.assert_allclose(state.v_WB - before.v_WB, dx[DV], atol=1e-9)
+    np.testing.assert_allclose(state.bias_accel_B - before.bias_accel_B, dx[DBA], atol=1e-9)
