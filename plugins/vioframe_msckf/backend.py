@@ -6,6 +6,8 @@ first-estimate Jacobians (Li and Mourikis, IJRR 2013) and long-lived landmarks k
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
@@ -13,13 +15,15 @@ from scipy.stats import chi2
 from vioframe.initialization import Initializer
 from vioframe.stopwatch import Stopwatch
 from vioframe.trajectory.alignment import rotation_z, yaw_of
-from vioframe.types import Calibration, Estimate, FrameTracks, ImuSegment, NavState, Status
+from vioframe.types import Calibration, Estimate, FrameTracks, ImuNoise, ImuSegment, NavState, Status
 from vioframe_msckf.options import MsckfOptions
 from vioframe_msckf.standstill import StandstillDetector, hold_still
 from vioframe_msckf.state import FilterDivergedError, FilterState
 from vioframe_msckf.tracks import ObservationTable
 from vioframe_msckf.updates import promote_tracks, select_tracks, update_from_landmarks, update_from_tracks
 
+# What a body may do unseen while readings are missing, rad/s and m/s^2, and how long that can be bridged.
+_UNSEEN_TURN, _UNSEEN_ACCELERATION, _MAX_IMU_GAP_S = 0.5, 2.0, 0.5
 # Beyond these an estimate is not merely inaccurate but wrong, whatever the covariance says.
 _MAX_SPEED_M_S, _MAX_BIAS_GYRO, _MAX_BIAS_ACCEL = 30.0, 1.0, 2.5
 
@@ -71,7 +75,7 @@ class Msckf:
             return Estimate(Status.TRACKING, state.nav_state(tracks.t_ns), stage_seconds=watch.seconds)
         watch.lap("standstill")
 
-        state.propagate(imu, self._calibration.imu, options.first_estimate_jacobians)
+        state.propagate(imu, _noise_over(imu, self._calibration.imu), options.first_estimate_jacobians)
         state.augment_clone(imu.gyro_B[-1] - state.bias_gyro_B)
         observations.add_frame(_without(tracks, state.landmark_ids))
         watch.lap("propagate")
@@ -147,6 +151,23 @@ class Msckf:
         self._state = None
         self._initializer.reset()
         return Estimate(Status.LOST, events=(f"lost: {why}",))
+
+
+def _noise_over(imu: ImuSegment, noise: ImuNoise) -> ImuNoise:
+    """``noise``, raised where readings are missing: the straight line drawn over a gap is only a guess.
+
+    A rate that is off by w for a gap of T turns the body by w T, as white noise of density w sqrt(T) would.
+    """
+    gap_s = imu.largest_gap_s
+    if gap_s > _MAX_IMU_GAP_S:
+        raise FilterDivergedError(f"no inertial readings for {gap_s:.2f} s")
+    if gap_s < 5.0 / noise.rate_hz:
+        return noise
+    return replace(
+        noise,
+        gyro_density=noise.gyro_density + _UNSEEN_TURN * gap_s**0.5,
+        accel_density=noise.accel_density + _UNSEEN_ACCELERATION * gap_s**0.5,
+    )
 
 
 def _moved_to(last: NavState, initial: NavState) -> NavState:
