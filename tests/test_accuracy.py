@@ -63,7 +63,8 @@ def machine_hall(shared_data: Path, tmp_path_factory: pytest.TempPathFactory) ->
 
 
 @pytest.mark.parametrize(
-    ("detector", "limit_m"), [("shi_tomasi", 0.015), ("fast", 0.025), ("orb", 0.025), ("sift", 0.025)]
+    ("detector", "limit_m"),
+    [("shi_tomasi", 0.015), ("fast", 0.025), ("orb", 0.025), pytest.param("sift", 0.025, marks=pytest.mark.slow)],
 )
 def test_machine_hall_from_a_bag(machine_hall, tmp_path, detector, limit_m):
     clip, bag = machine_hall
@@ -114,7 +115,7 @@ def test_real_motion(shared_data, name):
     _check_real_motion(real_motion_sequence(shared_data / "euroc_imu_gt" / name), least_path_m=55.0)
 
 
-def test_twenty_seconds_of_real_motion(shared_data):
+def test_half_a_minute_of_real_motion(shared_data):
     """Part of the above for everyday: the liveliest flight's middle."""
     folder = shared_data / "euroc_imu_gt/V1_02_medium"
     _check_real_motion(real_motion_sequence(folder, start_s=15.0, duration_s=30.0), least_path_m=20.0)

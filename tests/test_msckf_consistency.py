@@ -132,7 +132,10 @@ def test_calibration_converges_to_the_truth_within_its_own_uncertainty():
     told = packaged_calibration("euroc")
     camera = replace(told.camera, fx=told.camera.fx + 1.0, fy=told.camera.fy - 1.2, cx=told.camera.cx - 0.8)
     true = replace(
-        told, camera=camera, R_BC=told.R_BC @ so3.exp([0.004, -0.006, 0.005]), p_BC=told.p_BC + [0.012, -0.015, 0.01]
+        told,
+        camera=camera,
+        R_BC=told.R_BC @ so3.exp([0.004, -0.006, 0.005]),
+        p_BC=told.p_BC + np.array([0.012, -0.015, 0.01]),
     )
     sequence = simulated_sequence("aggressive", seed=3, duration_s=20.0, calibration=true, pixel_sigma=1.0)
     packets = tuple((imu, replace(t, xy_normalised=told.camera.undistort(t.xy))) for imu, t in sequence.packets)

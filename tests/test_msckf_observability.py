@@ -98,7 +98,7 @@ class Recorder:
 
 
 def fly(flight: str, options: MsckfOptions, monkeypatch: pytest.MonkeyPatch, seed: int = 0) -> Recorder:
-    sequence = simulated_sequence(flight, seed=seed, duration_s=8.0)
+    sequence = simulated_sequence(flight, seed=seed, duration_s=6.0)
     recorder = Recorder()
     recorder.attach(monkeypatch)
     backend = Msckf(sequence.calibration, options, drawn_start(sequence, 1, seed))
@@ -142,7 +142,7 @@ def start_with_free_yaw(true: NavState) -> Float:
 @pytest.mark.parametrize(("flight", "first_estimates"), [(f, True) for f in FLIGHTS] + [("figure_eight", False)])
 def test_yaw_never_becomes_better_known_than_it_was(flight, first_estimates):
     """Without first estimates it does, from nothing."""
-    sequence = simulated_sequence(flight, seed=3, duration_s=20.0)
+    sequence = simulated_sequence(flight, seed=3, duration_s=12.0)
     start = drawn_start(sequence, 1, 3, start_with_free_yaw(sequence.true_states[1]))
     options = MsckfOptions(first_estimate_jacobians=first_estimates)
     run = run_backend(after(sequence, 1), Msckf(sequence.calibration, options, start))

@@ -110,9 +110,16 @@ def still_readings(state, rng, rate=0.0, shake=0.0):
     return ImuSegment(t_ns, state.bias_gyro_B + rate + white[0], force + shake + white[1])
 
 
-@pytest.mark.parametrize(("v", "rate", "shake", "held"), [
-    (0.0, 0.0, 0.0, True), (0.002, 0.0, 0.0, True), (0.3, 0.0, 0.0, False), (0.0, 0.2, 0.0, False), (0.0, 0.0, 1.0, False),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("v", "rate", "shake", "held"),
+    [
+        (0.0, 0.0, 0.0, True),
+        (0.002, 0.0, 0.0, True),
+        (0.3, 0.0, 0.0, False),
+        (0.0, 0.2, 0.0, False),
+        (0.0, 0.0, 1.0, False),
+    ],
+)
 def test_is_held_only_where_the_imu_agrees(v, rate, shake, held):
     state, rng = random_state(1, scale=0.005), np.random.default_rng(1)
     state.v_WB = np.array([v, 0.0, 0.0])
@@ -145,7 +152,7 @@ def test_holding_still_is_the_kalman_update_with_numeric_jacobians():
     P[DBG, DBG] += np.eye(3) * NOISE.gyro_walk**2 * imu.duration_s
     P[DBA, DBA] += np.eye(3) * NOISE.accel_walk**2 * imu.duration_s
     assert hold_still(state, imu, NOISE, first_estimates=False)
-    # The noise of the sensors ten times over, for a body that stands but shakes, and a velocity of a centimetre a second.
+    # The noise of the sensors ten times over, for a body that stands but shakes, and a velocity of 1 cm/s.
     sigma = np.repeat([10 * NOISE.gyro_density / np.sqrt(0.05), 10 * NOISE.accel_density / np.sqrt(0.05), 0.01], 3)
     K = P @ H.T @ np.linalg.inv(H @ P @ H.T + np.diag(sigma**2))
     dx = K @ residual
