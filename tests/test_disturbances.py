@@ -130,3 +130,14 @@ def test_an_interrupted_run_leaves_what_it_had(shared_data, tmp_path, how, code)
     assert len(RunFolder.open(folder).trajectory()) >= 20
     if how is signal.SIGINT:
         assert json.loads((folder / "summary.json").read_text())["finished"] is False
+
+
+def test_ctrl_c_within_compiled_code_is_an_interruption(shared_data, tmp_path):
+    class Interrupted:
+        def process(self, imu, tracks):
+            raise SystemError("a result with an exception set") from KeyboardInterrupt()
+
+    config = parse({"dataset": {"path": str(shared_data / "euroc/MH_01_easy_15s")}}, "test")
+    experiment = replace(prepare(config, registry.load()), backend=Interrupted())
+    with pytest.raises(KeyboardInterrupt):
+        record(experiment, tmp_path / "run")

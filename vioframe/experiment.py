@@ -64,6 +64,9 @@ class Experiment:
             except VioframeError:
                 raise
             except Exception as error:
+                if isinstance(error.__cause__, KeyboardInterrupt):
+                    # Ctrl-C within compiled code comes out as a SystemError.
+                    raise KeyboardInterrupt from error
                 source = self.registry.blame(error.__traceback__)
                 if source is None:
                     raise
