@@ -30,7 +30,7 @@ def run(
 ) -> Iterator[Step]:
     """Estimate motion along ``dataset``, yielding one :class:`Step` a frame.
 
-    ``start_s`` skips the beginning and ``duration_s`` ends the run, both counted from the first frame's stamp.
+    ``start_s`` seconds are skipped, counted from the first frame's stamp; ``duration_s`` is how much is then played.
     ``incidents`` collects what was handled on the way (dropped samples, unusable images, failing detectors).
     """
     incidents = Incidents() if incidents is None else incidents
