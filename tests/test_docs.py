@@ -1,14 +1,18 @@
 """The documentation keeps its promises: links lead somewhere, and what can be counted is all there."""
 
 import re
+import runpy
 import tomllib
 from pathlib import Path
+from typing import Any
 
 import pytest
 from click.testing import CliRunner
+from ruamel.yaml import YAML
 
 from vioframe import hookspecs
 from vioframe.cli import main
+from vioframe.testing import check_detector
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md"), *(ROOT / "benchmarks").glob("*.md")])
@@ -45,6 +49,32 @@ def test_commands_of_the_readme_exist():
     assert {"run", "evaluate", "plot"} <= commands
     for command in commands:
         assert CliRunner().invoke(main, [command, "--help"]).exit_code == 0
+
+
+def test_the_command_line_reference_is_up_to_date():
+    write = runpy.run_path(str(ROOT / "docs" / "make_cli_reference.py"))["page"]
+    assert (ROOT / "docs" / "cli.md").read_text() == write(), "run python docs/make_cli_reference.py"
+
+
+def test_every_part_that_ships_is_explained():
+    entries = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["entry-points"]["vioframe"]
+    explained = re.findall(r"^### \w+ `(\w+)`$", (ROOT / "docs" / "cli.md").read_text(), re.MULTILINE)
+    assert sorted(explained) == sorted(entries)
+
+
+def test_the_detector_of_the_readme_works():
+    (code,) = re.findall(
+        r"^```python\n(# mine\.py.*?)^```$", (ROOT / "README.md").read_text(), re.MULTILINE | re.DOTALL
+    )
+    names: dict[str, Any] = {}
+    exec(code, names)
+    check_detector(names["vioframe_detectors"]()["agast"])
+
+
+def test_every_page_is_in_the_site():
+    nav = YAML(typ="safe", pure=True).load(ROOT / "mkdocs.yml")["nav"]
+    pages = {str(page.relative_to(ROOT / "docs")) for page in (ROOT / "docs").rglob("*.md")}
+    assert sorted(re.findall(r"[\w/]+\.md", str(nav))) == sorted(pages)
 
 
 def test_the_changelog_is_of_this_version():
