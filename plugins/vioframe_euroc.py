@@ -41,8 +41,9 @@ class EurocDataset:
         self._bit_depth = bit_depth
         for folder in (self._camera_folder, self._mav0 / imu):
             if not (folder / "data.csv").is_file():
-                there = ", ".join(sorted(file.parent.name for file in self._mav0.glob("*/data.csv"))) or "nothing"
-                raise DatasetError(f"{folder / 'data.csv'} is missing; choose camera and imu among: {there}")
+                there = ", ".join(sorted(file.parent.name for file in self._mav0.glob("*/data.csv")))
+                remedy = f"choose camera and imu among: {there}" if there else "no sensor is there; copy it again"
+                raise DatasetError(f"{folder / 'data.csv'} is missing; {remedy}")
         files = calibration or [self._mav0 / name / "sensor.yaml" for name in (camera, imu)]
         self.calibration: Calibration = load_calibration(*as_paths(files), camera=camera)
         self._frames = list(_frame_rows(self._camera_folder / "data.csv"))

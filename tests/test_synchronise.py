@@ -125,6 +125,26 @@ def test_readings_that_are_not_finite_are_dropped(bad: float) -> None:
     assert_same(packets, play(recording())[0])
 
 
+@pytest.mark.parametrize(
+    ("gyro_B", "accel_B"), [([0.0, -101.0, 0.0], [0.0, 0.0, 9.81]), ([0.0, 0.0, 0.0], [1e200, 0.0, 0.0])]
+)
+def test_readings_that_no_imu_can_measure_are_dropped(gyro_B: list[float], accel_B: list[float]) -> None:
+    measurements = recording()
+    measurements.insert(60, ImuSample(measurements[60].t_ns - 1, np.array(gyro_B), np.array(accel_B)))
+    packets, counts = play(measurements)
+    assert counts == {"imu_out_of_range": 1}
+    assert_same(packets, play(recording())[0])
+
+
+def test_the_strongest_readings_that_an_imu_can_measure_are_kept() -> None:
+    measurements = recording()
+    t_ns = measurements[60].t_ns - 1
+    measurements.insert(60, ImuSample(t_ns, np.full(3, 70.0), np.full(3, -1960.0)))
+    packets, counts = play(measurements)
+    assert counts == {}
+    assert t_ns in np.concatenate([imu.t_ns for imu, _ in packets])
+
+
 def test_a_late_sample_is_dropped_once_its_frame_is_gone() -> None:
     measurements = recording()
     late = next(i for i, m in enumerate(measurements) if m.t_ns == 20 * IMU_PERIOD_NS)

@@ -63,7 +63,7 @@ class Experiment:
                 )
             except VioframeError:
                 raise
-            except Exception as error:
+            except (Exception, SystemExit) as error:
                 if isinstance(error.__cause__, KeyboardInterrupt):
                     # Ctrl-C within compiled code comes out as a SystemError.
                     raise KeyboardInterrupt from error

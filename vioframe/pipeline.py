@@ -11,11 +11,12 @@ from __future__ import annotations
 from collections.abc import Iterator
 from time import perf_counter
 
+from vioframe.errors import PluginError
 from vioframe.frontend import Frontend, FrontendOptions
 from vioframe.incidents import Incidents
 from vioframe.interfaces import Backend, Dataset, Detector
 from vioframe.synchronise import synchronise
-from vioframe.types import Step
+from vioframe.types import Estimate, Step
 
 
 def run(
@@ -47,5 +48,7 @@ def run(
         begin = perf_counter()
         estimate = backend.process(imu, tracks)
         backend_s = perf_counter() - begin
+        if not isinstance(estimate, Estimate):
+            raise PluginError(f"the back-end returned a {type(estimate).__name__}, not an Estimate; repair the plug-in")
         within = {f"backend.{stage}": seconds for stage, seconds in estimate.stage_seconds.items()}
         yield Step(frame, tracks, estimate, {**frontend.stage_seconds, "backend": backend_s, **within})

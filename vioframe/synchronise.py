@@ -24,6 +24,8 @@ from vioframe.types import NS_PER_S, Frame, ImuSample, ImuSegment, Measurement
 _REORDER_SAMPLES = 10
 # Frames waiting for an IMU that has fallen silent; bounds the memory that they take.
 _MAX_WAITING_FRAMES = 200
+# Beyond the range of any IMU that flies or is worn (4000 deg/s, 200 g): a fault of the sensor or of its bus.
+_MAX_RATE_RAD_S, _MAX_FORCE_M_S2 = 100.0, 2000.0
 _IMU_GAP_PERIODS = 5.0
 _CAMERA_GAP_PERIODS = 2.5
 _PERIOD_SAMPLES = 51
@@ -43,8 +45,9 @@ def synchronise(
     linearly onto the frame stamps; the first packet's segment is a single reading. ``start_s`` seconds of frames are
     skipped at the beginning, counted from the first frame, and ``duration_s`` is how much is played after that.
 
-    ``incidents`` counts ``imu_nan``, ``imu_duplicate``, ``imu_out_of_order``, ``imu_gap``, ``frame_duplicate``,
-    ``frame_out_of_order``, ``frame_before_imu``, ``frame_after_imu``, ``frame_without_imu`` and ``camera_gap``.
+    ``incidents`` counts ``imu_nan``, ``imu_out_of_range``, ``imu_duplicate``, ``imu_out_of_order``, ``imu_gap``,
+    ``frame_duplicate``, ``frame_out_of_order``, ``frame_before_imu``, ``frame_after_imu``, ``frame_without_imu`` and
+    ``camera_gap``.
     """
     imu = _ImuBuffer(time_offset_ns, incidents)
     frames = _FrameBuffer(incidents)
@@ -146,8 +149,12 @@ class _ImuBuffer:
 
     def add(self, sample: ImuSample) -> None:
         t_ns = sample.t_ns - self._offset_ns
-        if not isfinite(sum(sample.gyro_B.tolist()) + sum(sample.accel_B.tolist())):
+        gyro, accel = sample.gyro_B.tolist(), sample.accel_B.tolist()
+        if not all(map(isfinite, (*gyro, *accel))):
             self._incidents.add("imu_nan", t_ns, "dropped: a reading is not finite")
+            return
+        if max(map(abs, gyro)) > _MAX_RATE_RAD_S or max(map(abs, accel)) > _MAX_FORCE_M_S2:
+            self._incidents.add("imu_out_of_range", t_ns, "dropped: no IMU can measure such a reading")
             return
         previous_ns, self._previous_arrival_ns = self._previous_arrival_ns, t_ns
         place = bisect_left(self._times, t_ns)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import logging
 from importlib import import_module
 
@@ -47,6 +48,13 @@ class _LazyGroup(click.Group):
             if ctx.params["debug"]:
                 raise
             _say(f"error: {error}", error)
+            ctx.exit(EXIT_BAD_INPUT)
+        except OSError as error:
+            # A reader that closed its end of the pipe, as `head` does, has all it wants: click ends quietly.
+            if error.errno == errno.EPIPE or ctx.params["debug"]:
+                raise
+            where = f" {error.filename}" if error.filename else " the output"
+            _say(f"error: cannot read or write{where}: {error.strerror}; check permissions and free space", error)
             ctx.exit(EXIT_BAD_INPUT)
         except KeyboardInterrupt as error:
             _say("interrupted", error)

@@ -39,9 +39,6 @@ def command(runs: tuple[Path, ...], ground_truth: Path | None, alignment: str, f
     from vioframe.report.tables import to_csv, to_json, to_markdown, to_rich
 
     evaluated = evaluate_paths(runs, ground_truth, alignment)
-    for run in evaluated:
-        if run.folder is not None:
-            write_json(run.folder.path / "evaluation.json", run.to_dict())
     if format_ == "table":
         from rich.console import Console
 
@@ -52,3 +49,7 @@ def command(runs: tuple[Path, ...], ground_truth: Path | None, alignment: str, f
         click.echo({"json": to_json, "csv": to_csv, "markdown": to_markdown}[format_](evaluated))
     for note in notes(evaluated):
         click.echo(f"note: {note}", err=True)
+    # Last: what is read from a full or read-only disk is shown all the same.
+    for run in evaluated:
+        if run.folder is not None:
+            write_json(run.folder.path / "evaluation.json", run.to_dict())

@@ -34,7 +34,7 @@ class CandidateSource:
             xy = np.asarray(self._detector.detect(image, max_points).xy, dtype=np.float64)
             if xy.ndim != 2 or xy.shape[1] != 2:
                 raise ValueError(f"keypoints must be (N, 2), got {xy.shape}")
-        except Exception as error:  # a plug-in may raise anything
+        except (Exception, SystemExit) as error:  # a plug-in may raise anything
             self._failed(error, t_ns)
             return np.empty((0, 2))
         self._has_worked = True
@@ -51,10 +51,10 @@ class CandidateSource:
             self._incidents.add("detector_found_nothing", t_ns)
         return xy[finite & self._camera.contains(xy, self._border_px)]
 
-    def _failed(self, error: Exception, t_ns: int) -> None:
+    def _failed(self, error: BaseException, t_ns: int) -> None:
         self._failures += 1
         name = type(self._detector).__name__
-        reason = f"{type(error).__name__}: {error}".splitlines()[0]
+        reason = " ".join(f"{type(error).__name__}: {error}".split())
         self._incidents.add("detector_failed", t_ns, f"{name}: {reason}")
         if not self._has_worked and self._failures >= _FAILURES_BEFORE_GIVING_UP:
             raise PluginError(

@@ -143,7 +143,7 @@ def _split(name: str, text: str) -> _Table:
                 f"{name}, line {number}: {len(rows[-1])} columns where line {lines[0]} has {len(rows[0])}"
             )
     if not rows:
-        raise TrajectoryError(f"{name}: holds no poses")
+        raise TrajectoryError(f"{name}: holds no poses; give a TUM or EuRoC trajectory")
     return _Table(name, header, comma_separated, lines, rows)
 
 
