@@ -76,7 +76,8 @@ def parse(tree: Mapping[str, Any], origin: str = "configuration") -> Config:
     try:
         return Config.model_validate(tree)
     except ValidationError as error:
-        first = error.errors()[0]
+        # A misspelt key first: what is missing because of it is found when that is put right.
+        first = min(error.errors(), key=lambda one: one["type"] != "extra_forbidden")
         where = ".".join(map(str, first["loc"]))
         if first["type"] == "extra_forbidden":
             known = _keys_beside(first["loc"])

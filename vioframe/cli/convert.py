@@ -53,9 +53,13 @@ def command(
     format = format or format_of(destination)
     chosen = _parse(options) | ({"calibration": list(calibration)} if calibration else {})
     dataset = registry.load().open_dataset(source, reader, chosen)
-    with _progress() as progress:
+    progress = _progress()
+    try:
         measurements = _watched(dataset, progress)
         done = convert(measurements, dataset.calibration, destination, format=format, compression=compression)
+    finally:
+        if progress.tasks:
+            progress.stop()
     click.echo(f"{destination}: {FORMATS[format].description}, {done.frames} frames, {done.imu_samples} IMU samples")
     if done.unreadable:
         click.echo(f"left out: {done.unreadable} frames or samples of {source} that could not be read")
@@ -76,8 +80,12 @@ def _progress() -> Progress:
 
 def _watched(dataset: Dataset, progress: Progress) -> Iterator[Measurement]:
     """The measurements themselves, the progress bar moving with each frame."""
-    task = progress.add_task(dataset.name, total=dataset.frame_count)
+    task = None
     for measurement in dataset.measurements():
+        if task is None:
+            # Not before: an error ahead of the first measurement is then one line and nothing else.
+            task = progress.add_task(dataset.name, total=dataset.frame_count)
+            progress.start()
         yield measurement
         if isinstance(measurement, Frame):
             progress.advance(task)
