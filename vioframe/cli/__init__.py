@@ -54,7 +54,7 @@ class _LazyGroup(click.Group):
             if error.errno == errno.EPIPE or ctx.params["debug"]:
                 raise
             where = f" {error.filename}" if error.filename else " the output"
-            _say(f"error: cannot read or write{where}: {error.strerror}; check permissions and free space", error)
+            _say(f"error: cannot read or write{where}: {error.strerror or error}; check permissions and free space", error)
             ctx.exit(EXIT_BAD_INPUT)
         except KeyboardInterrupt as error:
             _say("interrupted", error)
