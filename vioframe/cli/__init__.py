@@ -53,8 +53,8 @@ class _LazyGroup(click.Group):
             # A reader that closed its end of the pipe, as `head` does, has all it wants: click ends quietly.
             if error.errno == errno.EPIPE or ctx.params["debug"]:
                 raise
-            where = f" {error.filename}" if error.filename else " the output"
-            _say(f"error: cannot read or write{where}: {error.strerror or error}; check permissions and free space", error)
+            what = f"{error.filename or 'the output'}: {error.strerror or error}"
+            _say(f"error: cannot read or write {what}; check permissions and free space", error)
             ctx.exit(EXIT_BAD_INPUT)
         except KeyboardInterrupt as error:
             _say("interrupted", error)
