@@ -11,7 +11,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import astuple, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -24,9 +24,12 @@ from vioframe.hookspecs import hookimpl
 from vioframe.images import check_bit_depth, check_size, decode_image, to_gray8
 from vioframe.interfaces import DatasetFactory
 from vioframe.types import NS_PER_S, Calibration, Frame, Image, ImuSample, Measurement, Unreadable
+from vioframe.writers import GROUND_TRUTH_TOPIC
 
 if TYPE_CHECKING:
     from rosbags.highlevel import AnyReader
+
+    from vioframe.trajectory import Trajectory
 
 _log = logging.getLogger("vioframe.rosbag")
 
@@ -41,10 +44,6 @@ _EUROC_SHAPE = (480, 752)
 
 class RosbagDataset:
     """One camera and one IMU of a ROS 1 or ROS 2 recording."""
-
-    ground_truth: None = (
-        None  # Motion capture topics are not aligned in time: ground truth comes from a file of its own.
-    )
 
     def __init__(
         self,
@@ -81,6 +80,22 @@ class RosbagDataset:
         path = self._path.resolve()
         return path.name if path.is_dir() else path.stem
 
+    @property
+    def ground_truth(self) -> Trajectory | None:
+        """That of a simulated recording. Motion capture is not aligned in time: other truth comes from a file."""
+        from vioframe.trajectory import Trajectory
+
+        with _opened(self._path) as reader:
+            connections = [connection for connection in reader.connections if connection.topic == GROUND_TRUTH_TOPIC]
+            poses = [
+                (_stamp_ns(message), astuple(message.pose.position), astuple(message.pose.orientation))
+                for message in _deserialized(reader, connections, self._path)
+            ]
+        if not poses:
+            return None
+        t_ns, p_WB, quat_xyzw = (np.array(part) for part in zip(*poses, strict=True))
+        return Trajectory.from_quat_xyzw(t_ns, p_WB[:, :3], quat_xyzw[:, :4])
+
     def measurements(self) -> Iterator[Measurement]:
         """IMU samples and frames in the order in which they were recorded."""
         with _opened(self._path) as reader:
@@ -95,14 +110,8 @@ class RosbagDataset:
 
     def _messages(self, reader: AnyReader, *topics: str) -> Iterator[Measurement]:
         connections = [connection for connection in reader.connections if connection.topic in topics]
-        try:
-            for connection, _, data in reader.messages(connections):
-                message: Any = reader.deserialize(data, connection.msgtype)
-                yield _imu_sample(message) if connection.msgtype == _IMU else self._frame(message)
-        except DatasetError:
-            raise
-        except Exception as err:
-            raise _damaged(self._path, err) from err
+        for message in _deserialized(reader, connections, self._path):
+            yield _imu_sample(message) if hasattr(message, "angular_velocity") else self._frame(message)
 
     def _frame(self, message: Any) -> Frame | Unreadable:
         t_ns = _stamp_ns(message)
@@ -151,6 +160,17 @@ def _opened(path: Path) -> Iterator[AnyReader]:
         yield reader
     finally:
         reader.close()
+
+
+def _deserialized(reader: AnyReader, connections: list[Any], path: Path) -> Iterator[Any]:
+    """The messages of these connections in the order of recording; raises :class:`DatasetError` for damage."""
+    if not connections:
+        return  # rosbags takes no connections for all of them
+    try:
+        for connection, _, data in reader.messages(connections):
+            yield reader.deserialize(data, connection.msgtype)
+    except Exception as err:
+        raise _damaged(path, err) from err
 
 
 def _check_sqlite_size(file: Path) -> None:

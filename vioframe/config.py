@@ -7,10 +7,10 @@ second description. :func:`complete` fills in every default: the configuration k
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from io import StringIO
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from pydantic_core import to_jsonable_python
@@ -22,12 +22,16 @@ from vioframe.frontend import FrontendOptions
 from vioframe.options import Option, did_you_mean, options_of, validate_options
 from vioframe.registry import BACKEND, DETECTOR, Registry
 
+SectionT = TypeVar("SectionT", bound="Section")
 
-class _Section(BaseModel):
+
+class Section(BaseModel):
+    """A part of a configuration: frozen, and an unknown key is an error."""
+
     model_config = ConfigDict(frozen=True, extra="forbid")
 
 
-class DatasetConfig(_Section):
+class DatasetConfig(Section):
     """What to read. ``reader`` None means: the one that accepts the path."""
 
     path: Path | None = None
@@ -35,14 +39,14 @@ class DatasetConfig(_Section):
     options: dict[str, Any] = {}
 
 
-class PartConfig(_Section):
+class PartConfig(Section):
     """A detector or back-end by name, and its options."""
 
     name: str
     options: dict[str, Any] = {}
 
 
-class Config(_Section):
+class Config(Section):
     """Everything that determines a run."""
 
     dataset: DatasetConfig = DatasetConfig()
@@ -60,6 +64,11 @@ class Config(_Section):
 
 def read(path: str | Path) -> Config:
     """Read a configuration file; raises :class:`ConfigError` naming the key that is wrong."""
+    return parse(read_tree(path), str(path))
+
+
+def read_tree(path: str | Path) -> dict[str, Any]:
+    """The keys and values of a YAML file; raises :class:`ConfigError` where it holds none."""
     try:
         tree = YAML(typ="safe", pure=True).load(Path(path).read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError) as error:
@@ -68,22 +77,30 @@ def read(path: str | Path) -> Config:
         raise ConfigError(f"{path} is not valid YAML: {' '.join(str(error).split())}") from error
     if not isinstance(tree, dict | None):
         raise ConfigError(f"{path} must hold keys and values; `vioframe config` prints an example")
-    return parse(tree or {}, str(path))
+    return tree or {}
 
 
 def parse(tree: Mapping[str, Any], origin: str = "configuration") -> Config:
     """Validate a tree of plain values; ``origin`` names it in errors."""
+    return validate(Config, tree, origin)
+
+
+def validate(model: type[SectionT], tree: Mapping[str, Any], origin: str) -> SectionT:
+    """``tree`` as a ``model``; raises :class:`ConfigError` naming the key that is wrong, and ``origin``."""
     try:
-        return Config.model_validate(tree)
+        return model.model_validate(tree)
     except ValidationError as error:
         # A misspelt key first: what is missing because of it is found when that is put right.
         first = min(error.errors(), key=lambda one: one["type"] != "extra_forbidden")
         where = ".".join(map(str, first["loc"]))
         if first["type"] == "extra_forbidden":
-            known = _keys_beside(first["loc"])
+            known = _keys_beside(model, first["loc"])
             hint = did_you_mean(str(first["loc"][-1]), known)
             raise ConfigError(f"{origin}: unknown key {where!r}{hint}; keys here: {', '.join(known)}") from error
-        raise ConfigError(f"{origin}: {where}: {first['msg']}, got {first['input']!r}") from error
+        problem = first["msg"].removeprefix("Value error, ")
+        if not first["loc"]:  # values that do not go together
+            raise ConfigError(f"{origin}: {problem}") from error
+        raise ConfigError(f"{origin}: {where}: {problem}, got {first['input']!r}") from error
 
 
 def override(config: Config, registry: Registry, assignments: Iterable[str]) -> Config:
@@ -93,14 +110,22 @@ def override(config: Config, registry: Registry, assignments: Iterable[str]) -> 
     """
     options = _options_by_section(config, registry)
     tree = config.model_dump()
+    for section, name, value in parse_assignments(assignments, options):
+        values = tree[section] if section == "frontend" else tree[section]["options"]
+        values[name] = value
+    return parse(tree)
+
+
+def parse_assignments(
+    assignments: Iterable[str], options: Mapping[str, list[Option]]
+) -> Iterator[tuple[str, str, Any]]:
+    """Section, option and value of each ``key=value``, for the ``options`` by section; see :func:`override`."""
     for assignment in assignments:
         key, equals, text = assignment.partition("=")
         if not key or not equals:
             raise ConfigError(f"-o takes key=value, got {assignment!r}")
         section, option = _find_option(key.strip(), options)
-        values = tree[section] if section == "frontend" else tree[section]["options"]
-        values[option.name] = _parse_value(option, text.strip())
-    return parse(tree)
+        yield section, option.name, _parse_value(option, text.strip())
 
 
 def complete(config: Config, registry: Registry) -> Config:
@@ -187,8 +212,7 @@ def _parse_value(option: Option, text: str) -> Any:
     return value
 
 
-def _keys_beside(location: tuple[int | str, ...]) -> list[str]:
-    model: Any = Config
+def _keys_beside(model: Any, location: tuple[int | str, ...]) -> list[str]:
     for key in location[:-1]:
         model = model.model_fields[key].annotation
     return list(model.model_fields)

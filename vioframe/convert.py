@@ -77,7 +77,7 @@ def convert(
     offered = FORMATS[format].compressions
     if compression is not None and compression not in offered:
         raise DatasetError(f"{format} offers no compression {compression!r}; it has: {', '.join(offered) or 'none'}")
-    with _appearing(destination) as unfinished:
+    with appearing(destination) as unfinished:
         counts = _write(measurements, FORMATS[format].open(unfinished, compression))
         if not counts.frames or not counts.imu_samples:
             raise DatasetError(f"nothing to write to {destination}: the source has no readable frame or no IMU sample")
@@ -104,7 +104,7 @@ def _write(measurements: Iterable[Measurement], writer: RecordingWriter) -> Conv
 
 
 @contextmanager
-def _appearing(destination: Path) -> Iterator[Path]:
+def appearing(destination: Path) -> Iterator[Path]:
     """A place of the same name to write to, moved to ``destination`` if all goes well and removed if not."""
     if destination.exists():
         raise DatasetError(f"{destination} exists already; remove it or choose another name")
@@ -124,5 +124,5 @@ def _replace_sidecar(calibration: Calibration, destination: Path) -> None:
     """Written before the recording appears, so that none ever stands without its calibration."""
     sidecar = sidecar_folder(destination)
     shutil.rmtree(sidecar, ignore_errors=True)
-    with _appearing(sidecar) as unfinished:
+    with appearing(sidecar) as unfinished:
         write_calibration(calibration, unfinished)

@@ -1,4 +1,4 @@
-"""Writers of recordings, one a format, all with the same three methods; see :mod:`vioframe.convert`."""
+"""Writers of recordings, one a format, all with the same methods; see :mod:`vioframe.convert`."""
 
 from __future__ import annotations
 
@@ -10,20 +10,32 @@ from typing import Any, Protocol, Self
 import numpy as np
 
 from vioframe.errors import DatasetError
-from vioframe.types import NS_PER_S, Float, Frame, ImuSample
+from vioframe.geometry import so3
+from vioframe.types import NS_PER_S, Float, Frame, ImuSample, NavState
 
 CAMERA_TOPIC = "/cam0/image_raw"
 IMU_TOPIC = "/imu0"
+GROUND_TRUTH_TOPIC = "/vioframe/ground_truth"
+"""Poses of the body in W, exact and on the camera's clock: of simulated recordings only."""
 
 # ROS 2 keeps seconds in 32 bits with a sign.
 _ROS_STAMP_LIMIT_NS = 2**31 * NS_PER_S
 
 _IMAGE = "sensor_msgs/msg/Image"
 _IMU = "sensor_msgs/msg/Imu"
+_POSE = "geometry_msgs/msg/PoseStamped"
 _FRAME_HEADING = "#timestamp [ns],filename\n"
 _IMU_HEADING = (
     "#timestamp [ns],w_RS_S_x [rad s^-1],w_RS_S_y [rad s^-1],w_RS_S_z [rad s^-1],"
     "a_RS_S_x [m s^-2],a_RS_S_y [m s^-2],a_RS_S_z [m s^-2]\n"
+)
+_TRUTH_HEADING = (
+    "#timestamp",
+    *(f" p_RS_R_{axis} [m]" for axis in "xyz"),
+    *(f" q_RS_{part} []" for part in "wxyz"),
+    *(f" v_RS_R_{axis} [m s^-1]" for axis in "xyz"),
+    *(f" b_w_RS_S_{axis} [rad s^-1]" for axis in "xyz"),
+    *(f" b_a_RS_S_{axis} [m s^-2]" for axis in "xyz"),
 )
 
 
@@ -40,11 +52,36 @@ class RecordingWriter(Protocol):
 
     def write_imu(self, sample: ImuSample) -> None: ...
 
+    def write_truth(self, state: NavState) -> None: ...
+
+
+class TruthFile:
+    """A ground-truth file of EuRoC's: pose, and velocity and biases as far as the states know them (are not NaN)."""
+
+    def __init__(self, path: Path) -> None:
+        self._file = path.open("w", encoding="utf-8")
+        self._columns = 0
+
+    def write(self, state: NavState) -> None:
+        x, y, z, w = so3.to_quat_xyzw(state.R_WB).tolist()
+        known = np.concatenate([state.v_WB, state.bias_gyro_B, state.bias_accel_B])
+        if not self._columns:
+            self._columns = 8 + int(np.isfinite(known).sum())
+            self._file.write(",".join(_TRUTH_HEADING[: self._columns]) + "\n")
+        values = [*state.p_WB.tolist(), w, x, y, z, *known.tolist()][: self._columns - 1]
+        self._file.write(",".join([str(state.t_ns), *map(repr, values)]) + "\n")
+
+    def close(self) -> None:
+        self._file.close()
+
 
 class AslWriter:
-    """An ASL folder: ``mav0/cam0`` with lossless images and ``mav0/imu0``, numbers written so as to read back equal."""
+    """An ASL folder: ``mav0/cam0`` with lossless images, ``mav0/imu0``, and ``mav0/state_groundtruth_estimate0`` where
+    the truth is known; numbers are written so as to read back equal."""
 
     def __init__(self, folder: Path) -> None:
+        self._truth_folder = folder / "mav0" / "state_groundtruth_estimate0"
+        self._truth: TruthFile | None = None
         self._images = folder / "mav0" / "cam0" / "data"
         self._images.mkdir(parents=True)
         (folder / "mav0" / "imu0").mkdir()
@@ -61,6 +98,8 @@ class AslWriter:
     ) -> None:
         self._frames.close()
         self._imu.close()
+        if self._truth is not None:
+            self._truth.close()
 
     def write_frame(self, frame: Frame) -> None:
         import cv2
@@ -74,12 +113,19 @@ class AslWriter:
         readings = [*sample.gyro_B.tolist(), *sample.accel_B.tolist()]
         self._imu.write(",".join([str(sample.t_ns), *map(repr, readings)]) + "\n")
 
+    def write_truth(self, state: NavState) -> None:
+        if self._truth is None:
+            self._truth_folder.mkdir()
+            self._truth = TruthFile(self._truth_folder / "data.csv")
+        self._truth.write(state)
+
 
 class _RosWriter:
     """What ROS 1 and ROS 2 have in common: messages, and a time of recording that keeps them in the order they came."""
 
     def __init__(self, bag: Any, store: Any, serialize: Any, header_extra: dict[str, int]) -> None:
         self._bag = bag
+        self._store = store
         self._types = store.types
         self._serialize = serialize
         self._header_extra = header_extra
@@ -88,6 +134,7 @@ class _RosWriter:
         # rosbags reads messages of the same time in the order of their topics: the IMU first, as from an ASL folder.
         self._imu = bag.add_connection(IMU_TOPIC, _IMU, typestore=store)
         self._camera = bag.add_connection(CAMERA_TOPIC, _IMAGE, typestore=store)
+        self._truth: Any = None
 
     def __enter__(self) -> Self:
         return self
@@ -124,6 +171,17 @@ class _RosWriter:
             linear_acceleration_covariance=np.zeros(9),
         )
         self._write(self._imu, _IMU, sample.t_ns, message)
+
+    def write_truth(self, state: NavState) -> None:
+        if self._truth is None:
+            self._truth = self._bag.add_connection(GROUND_TRUTH_TOPIC, _POSE, typestore=self._store)
+        position, quat = state.p_WB.tolist(), so3.to_quat_xyzw(state.R_WB).tolist()
+        pose = self._types["geometry_msgs/msg/Pose"](
+            position=self._types["geometry_msgs/msg/Point"](**dict(zip("xyz", position, strict=True))),
+            orientation=self._types["geometry_msgs/msg/Quaternion"](**dict(zip("xyzw", quat, strict=True))),
+        )
+        message = self._types[_POSE](header=self._header(state.t_ns, "world"), pose=pose)
+        self._write(self._truth, _POSE, state.t_ns, message)
 
     def _write(self, connection: Any, message_type: str, t_ns: int, message: Any) -> None:
         self._recorded_ns = max(self._recorded_ns, t_ns)
