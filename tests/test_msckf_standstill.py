@@ -7,8 +7,10 @@ import pytest
 from msckf_helpers import after, drawn_start, random_state
 
 from vioframe.bench import run_backend
+from vioframe.calibration import packaged_calibration
 from vioframe.geometry import so3
-from vioframe.simulation import FLIGHTS, simulated_sequence
+from vioframe.simulation import simulated_sequence
+from vioframe.simulation.flights import ShapedFlight, levelled
 from vioframe.types import DBA, DBG, DTHETA, DV, Estimate, FrameTracks, ImuNoise, ImuSegment, Status, g_W
 from vioframe_msckf.backend import Msckf
 from vioframe_msckf.standstill import StandstillDetector, hold_still, median_disparity_px
@@ -53,11 +55,13 @@ def test_standstill_does_not_drift_and_nothing_grows():
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
 @pytest.mark.parametrize("speed", [0.05, 0.1])
-def test_slow_motion_is_not_taken_for_standstill(axis, speed, monkeypatch):
+def test_slow_motion_is_not_taken_for_standstill(axis, speed):
     """Creeping ahead, aside and up, seen almost without noise."""
-    still = FLIGHTS["standstill"][1]
-    monkeypatch.setitem(FLIGHTS, "creep", (lambda t_s: np.outer(t_s, speed * np.eye(3)[axis]), still))
-    sequence = simulated_sequence("creep", pixel_sigma=0.1, duration_s=6.0)
+    R_LB = levelled(packaged_calibration("euroc").R_BC)
+    creep = ShapedFlight(
+        6.0, lambda t_s: np.outer(t_s, speed * np.eye(3)[axis]), lambda t_s: np.zeros((len(t_s), 3)), R_LB
+    )
+    sequence = simulated_sequence(creep, pixel_sigma=0.1, duration_s=6.0)
     run = run_backend(after(sequence, 1), Msckf(sequence.calibration, None, drawn_start(sequence, 1, 0)))
     assert not any(map(held, run.estimates))
 

@@ -54,10 +54,11 @@ def test_every_built_in_comes_in_through_the_entry_points():
     assert {"shi_tomasi", "fast", "orb", "sift"} <= set(loaded.names(registry.DETECTOR))
     assert "msckf" in loaded.names(registry.BACKEND)
     assert {"euroc", "rosbag"} <= set(loaded.names(registry.DATASET))
+    assert {"hover", "figure_eight", "standstill"} <= set(loaded.names(registry.FLIGHT))
 
 
 def test_without_entry_points_there_is_nothing():
-    assert registry.load([]).parts == {"detector": {}, "backend": {}, "dataset": {}}
+    assert registry.load([]).parts == {kind.name: {} for kind in registry.KINDS}
 
 
 def test_every_hook_has_a_kind():

@@ -3,14 +3,16 @@
 import numpy as np
 import pytest
 
+from vioframe import registry
 from vioframe.calibration import packaged_calibration
-from vioframe.errors import ConfigError
+from vioframe.errors import PluginError
 from vioframe.geometry import so3
-from vioframe.simulation import FLIGHTS, simulated_sequence
+from vioframe.simulation import simulated_sequence
 from vioframe.simulation.flights import flight
 from vioframe.simulation.imu import read_imu
 from vioframe.types import ImuNoise, g_W
 
+FLIGHTS = registry.load().names(registry.FLIGHT)
 R_BC = packaged_calibration("euroc").R_BC
 TIMES_S = np.random.default_rng(3).uniform(0.1, 19.9, 200)
 
@@ -68,7 +70,7 @@ def test_flights_are_what_their_names_say():
 
 
 def test_an_unknown_flight_lists_those_there_are():
-    with pytest.raises(ConfigError, match="figure_eight"):
+    with pytest.raises(PluginError, match="figure_eight"):
         simulated_sequence("loop_the_loop")
 
 

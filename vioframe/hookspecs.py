@@ -1,4 +1,4 @@
-"""The hooks through which every detector, back-end and reader comes in, the built-in ones included.
+"""The hooks through which every detector, back-end, reader, flight and world comes in, the built-in ones included.
 
 A plug-in is a module that implements any of these with :data:`hookimpl` and is named in the ``vioframe`` entry-point
 group of its distribution. Factories should import heavy libraries inside, so that listing plug-ins stays quick.
@@ -8,7 +8,7 @@ from collections.abc import Mapping
 
 import pluggy
 
-from vioframe.interfaces import BackendFactory, DatasetFactory, DetectorFactory
+from vioframe.interfaces import BackendFactory, DatasetFactory, DetectorFactory, FlightFactory, WorldFactory
 
 PROJECT = "vioframe"
 hookspec = pluggy.HookspecMarker(PROJECT)
@@ -28,3 +28,20 @@ def vioframe_backends() -> Mapping[str, BackendFactory]:  # type: ignore[empty-b
 @hookspec
 def vioframe_datasets() -> Mapping[str, DatasetFactory]:  # type: ignore[empty-body]
     """Map names to factories: ``factory(path, **options) -> Dataset``."""
+
+
+@hookspec
+def vioframe_flights() -> Mapping[str, FlightFactory]:  # type: ignore[empty-body]
+    """Map names to factories: ``factory(duration_s, R_LB, **options) -> Flight``.
+
+    ``R_LB`` (3, 3) is the body's attitude in the levelled frame L (x ahead, y left, z up) whose x axis the camera looks
+    along.
+    """
+
+
+@hookspec
+def vioframe_worlds() -> Mapping[str, WorldFactory]:  # type: ignore[empty-body]
+    """Map names to factories: ``factory(p_WB, rng, **options) -> World``.
+
+    ``p_WB`` (N, 3) m is the path that the world must leave free, ``rng`` a numpy Generator.
+    """

@@ -6,9 +6,11 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
-from vioframe.types import Calibration, Estimate, FrameTracks, Image, ImuSegment, Keypoints, Measurement
+from vioframe.types import Calibration, Estimate, Float, FrameTracks, Image, ImuSegment, Keypoints, Measurement
 
 if TYPE_CHECKING:
+    from vioframe.simulation.flights import Motion
+    from vioframe.simulation.world import Mesh
     from vioframe.trajectory import Trajectory
 
 
@@ -71,5 +73,36 @@ class DatasetFactory(Protocol):
         ...
 
 
+@runtime_checkable
+class Flight(Protocol):
+    """A motion known exactly, for simulation."""
+
+    @property
+    def duration_s(self) -> float:
+        """How long it lasts: the motion is known from 0 to ``duration_s``."""
+        ...
+
+    def at(self, t_s: Float) -> Motion:
+        """Pose, velocity, acceleration and angular rate of the body at times ``t_s`` (N,)."""
+        ...
+
+
+@runtime_checkable
+class World(Protocol):
+    """What a simulated camera sees."""
+
+    @property
+    def mesh(self) -> Mesh:
+        """Its surfaces, in W."""
+        ...
+
+    @property
+    def textures(self) -> tuple[Image, ...]:
+        """The images on its surfaces, which the mesh refers to by their place here."""
+        ...
+
+
 DetectorFactory = Callable[..., Detector]
 BackendFactory = Callable[..., Backend]
+FlightFactory = Callable[..., Flight]
+WorldFactory = Callable[..., World]

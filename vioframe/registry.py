@@ -1,4 +1,4 @@
-"""Finds the parts: every detector, back-end and data-set reader comes in by name through the ``vioframe`` entry points.
+"""Finds the parts: detectors, back-ends, readers, flights and worlds come in by name through ``vioframe`` entry points.
 
 pluggy finds the parts once and checks the hooks; after that the names are looked up in plain tables and the parts are
 called directly. A plug-in that cannot be loaded never takes the others down: it is skipped with a warning and listed
@@ -16,13 +16,14 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, cast
 
+import numpy as np
 import pluggy
 
 from vioframe import hookspecs
 from vioframe.errors import DatasetError, PluginError, VioframeError
-from vioframe.interfaces import Backend, Dataset, Detector
+from vioframe.interfaces import Backend, Dataset, Detector, Flight, World
 from vioframe.options import Option, did_you_mean, options_of, plugin_factory, validate_options
-from vioframe.types import Calibration
+from vioframe.types import Calibration, Float
 
 __all__ = ["KINDS", "Failure", "Kind", "Option", "Part", "Registry", "load", "options_of", "plugin_factory"]
 
@@ -44,7 +45,9 @@ class Kind:
 DETECTOR = Kind("detector", "vioframe_detectors", Detector, 0)
 BACKEND = Kind("backend", "vioframe_backends", Backend, 1)
 DATASET = Kind("dataset", "vioframe_datasets", Dataset, 1)
-KINDS = (DETECTOR, BACKEND, DATASET)
+FLIGHT = Kind("flight", "vioframe_flights", Flight, 2)
+WORLD = Kind("world", "vioframe_worlds", World, 2)
+KINDS = (DETECTOR, BACKEND, DATASET, FLIGHT, WORLD)
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,7 +65,7 @@ class Source:
 
 @dataclass(frozen=True, slots=True)
 class Part:
-    """A named detector, back-end or reader, and where it comes from."""
+    """A named part, and where it comes from."""
 
     kind: Kind
     name: str
@@ -133,6 +136,16 @@ class Registry:
 
     def create_backend(self, name: str, calibration: Calibration, options: Mapping[str, Any] | None = None) -> Backend:
         return cast(Backend, self.find(BACKEND, name).create(calibration, options=options or {}))
+
+    def create_flight(
+        self, name: str, duration_s: float, R_LB: Float, options: Mapping[str, Any] | None = None
+    ) -> Flight:
+        return cast(Flight, self.find(FLIGHT, name).create(duration_s, R_LB, options=options or {}))
+
+    def create_world(
+        self, name: str, p_WB: Float, rng: np.random.Generator, options: Mapping[str, Any] | None = None
+    ) -> World:
+        return cast(World, self.find(WORLD, name).create(p_WB, rng, options=options or {}))
 
     def open_dataset(
         self, path: str | Path, reader: str | None = None, options: Mapping[str, Any] | None = None

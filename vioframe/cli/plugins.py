@@ -17,7 +17,7 @@ from vioframe.options import REQUIRED, did_you_mean
 @click.command("plugins")
 @click.argument("name", required=False)
 def command(name: str | None) -> None:
-    """List every detector, back-end and data-set reader; with NAME, show the options of that part."""
+    """List every detector, back-end, data-set reader, flight and world; with NAME, show the options of that part."""
     installed = registry.load()
     console = Console()
     if name is None:

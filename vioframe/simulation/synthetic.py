@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from vioframe.calibration import packaged_calibration
+from vioframe.interfaces import Flight
 from vioframe.simulation.flights import flight as named_flight
 from vioframe.simulation.imu import read_imu
 from vioframe.simulation.segments import cut_segments
@@ -22,11 +23,11 @@ _START_NS = NS_PER_S  # Time zero is a trap for code that takes 0 for "none".
 
 
 def simulated_sequence(
-    flight: str,
+    flight: str | Flight,
     noise: ImuNoise | None = EUROC_NOISE,
     pixel_sigma: float = 1.0,
     seed: int = 0,
-    duration_s: float = 30.0,
+    duration_s: float | None = None,
     *,
     outlier_ratio: float = 0.0,
     max_points: int = 150,
@@ -35,8 +36,9 @@ def simulated_sequence(
     bias_gyro_B: Float | None = None,
     bias_accel_B: Float | None = None,
 ) -> TrackSequence:
-    """Fly the ``flight`` of that name for ``duration_s`` seconds.
+    """Fly ``flight``, an installed one of that name or one's own, for ``duration_s`` seconds.
 
+    Left out, that is 30 s, or as long as one's own flight lasts.
     ``noise`` None gives exact readings at the calibration's rate, and ``calibration`` None is EuRoC's. The first biases
     (3,) are zero unless given. The same arguments give the same sequence to the last bit. Readings at the frames'
     stamps are interpolated as those of a recording would be, unless the frame rate divides the IMU's.
@@ -44,7 +46,12 @@ def simulated_sequence(
     calibration = calibration or packaged_calibration("euroc")
     imu_rng, track_rng = (np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(2))
     rate_hz = (noise or calibration.imu).rate_hz
-    path = named_flight(flight, duration_s, calibration.R_BC)
+    if isinstance(flight, str):
+        duration_s = 30.0 if duration_s is None else duration_s
+        path = named_flight(flight, duration_s, calibration.R_BC)
+    else:
+        duration_s = flight.duration_s if duration_s is None else min(duration_s, flight.duration_s)
+        path = flight
 
     frames_s = np.arange(int(duration_s * frame_rate_hz) + 1) / frame_rate_hz
     imu_s = np.arange(int(np.ceil(frames_s[-1] * rate_hz)) + 1) / rate_hz
@@ -64,4 +71,5 @@ def simulated_sequence(
         for t, R, p, v, b in zip(frames_ns, motion.R_WB, motion.p_WB, motion.v_WB, biases, strict=True)
     )
     truth = Trajectory(frames_ns, motion.R_WB, motion.p_WB)
-    return TrackSequence(flight, calibration, tuple(zip(segments, tracks, strict=True)), truth, states)
+    name = flight if isinstance(flight, str) else type(flight).__name__
+    return TrackSequence(name, calibration, tuple(zip(segments, tracks, strict=True)), truth, states)
