@@ -57,7 +57,7 @@ def rendered_flight() -> RenderedFlight:
     frames_s = np.arange(round(DURATION_S * FRAME_RATE_HZ) + 1) / FRAME_RATE_HZ
     # Readings go on beyond the last frame, as in a recording.
     imu_s = np.arange(round(DURATION_S * 200) + 21) / 200
-    readings = read_imu(path.at(_BEGIN_S + imu_s), CALIBRATION.imu, rng)
+    readings = read_imu(path.at(_BEGIN_S + imu_s), CALIBRATION.imu, rng, 200.0)
     motion = path.at(_BEGIN_S + frames_s)
     p_WF = rng.uniform(-_WALL_M, _WALL_M, (_DOTS, 3))
     wall = rng.integers(0, 3, _DOTS)

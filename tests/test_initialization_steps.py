@@ -24,7 +24,7 @@ from vioframe.initialization.options import InitializationOptions
 from vioframe.initialization.structure import solve_structure
 from vioframe.initialization.window import Window, build_window, spread_indices
 from vioframe.simulation.flights import flight
-from vioframe.simulation.imu import read_imu
+from vioframe.simulation.imu import ImuErrors, read_imu
 from vioframe.simulation.segments import cut_segments
 from vioframe.simulation.synthetic import simulated_sequence
 from vioframe.types import DBA, DTHETA, GRAVITY_M_S2, Float, FrameTracks, ImuNoise, ImuSegment
@@ -71,7 +71,8 @@ def scene(
     path = flight("figure_eight", 4.0, CALIBRATION.R_BC)
     rate = noise.rate_hz if noise else 1000.0
     imu_s, frames_s = 1.0 + np.arange(round(2.0 * rate) + 1) / rate, 1.0 + 0.2 * np.arange(11)
-    readings = read_imu(path.at(imu_s), noise, rng, BIAS_GYRO, bias_accel)
+    errors = ImuErrors(bias_gyro_B=tuple(BIAS_GYRO), bias_accel_B=tuple(bias_accel))
+    readings = read_imu(path.at(imu_s), noise, rng, rate, errors)
     imu_ns, frames_ns = (np.round(t * 1e9).astype(np.int64) for t in (imu_s, frames_s))
     segments = tuple(cut_segments(imu_ns, readings.gyro_B, readings.accel_B, frames_ns)[1:])
     at = np.searchsorted(imu_ns, frames_ns)

@@ -33,7 +33,7 @@ def test_exact_readings_integrate_back_to_the_flight(name):
     rate = 1000.0
     t_s = np.arange(int(10 * rate) + 1) / rate
     motion = flight(name, 10.0, R_BC).at(t_s)
-    readings = read_imu(motion, None, np.random.default_rng(0))
+    readings = read_imu(motion, None, np.random.default_rng(0), rate)
     dt = 1.0 / rate
     turns = so3.exp(0.5 * (readings.gyro_B[1:] + readings.gyro_B[:-1]) * dt)
     R, p, v = motion.R_WB[0], motion.p_WB[0], motion.v_WB[0]
@@ -79,8 +79,8 @@ def test_noise_has_the_densities_asked_for():
     noise = ImuNoise(gyro_density=2e-4, accel_density=3e-3, gyro_walk=4e-5, accel_walk=5e-3, rate_hz=100.0)
     count, rate = 200_000, 100
     motion = flight("standstill", 1.0, R_BC).at(np.zeros(count))
-    exact = read_imu(motion, None, np.random.default_rng(1))
-    noisy = read_imu(motion, noise, np.random.default_rng(1))
+    exact = read_imu(motion, None, np.random.default_rng(1), rate)
+    noisy = read_imu(motion, noise, np.random.default_rng(1), rate)
     for read, true, bias, density, walk in (
         (noisy.gyro_B, exact.gyro_B, noisy.bias_gyro_B, noise.gyro_density, noise.gyro_walk),
         (noisy.accel_B, exact.accel_B, noisy.bias_accel_B, noise.accel_density, noise.accel_walk),

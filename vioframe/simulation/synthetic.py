@@ -7,7 +7,7 @@ import numpy as np
 from vioframe.calibration import packaged_calibration
 from vioframe.interfaces import Flight
 from vioframe.simulation.flights import flight as named_flight
-from vioframe.simulation.imu import read_imu
+from vioframe.simulation.imu import ImuErrors, Vector, read_imu
 from vioframe.simulation.segments import cut_segments
 from vioframe.simulation.sequence import TrackSequence
 from vioframe.simulation.tracks import TrackOptions, TrackSimulator
@@ -38,10 +38,10 @@ def simulated_sequence(
 ) -> TrackSequence:
     """Fly ``flight``, an installed one of that name or one's own, for ``duration_s`` seconds.
 
-    Left out, that is 30 s, or as long as one's own flight lasts.
-    ``noise`` None gives exact readings at the calibration's rate, and ``calibration`` None is EuRoC's. The first biases
-    (3,) are zero unless given. The same arguments give the same sequence to the last bit. Readings at the frames'
-    stamps are interpolated as those of a recording would be, unless the frame rate divides the IMU's.
+    Left out, that is 30 s, or as long as one's own flight lasts. ``noise`` None gives exact readings at the
+    calibration's rate, and ``calibration`` None is EuRoC's. The first biases (3,) are zero unless given. The same
+    arguments give the same sequence to the last bit. Readings at the frames' stamps are interpolated as those of a
+    recording would be, unless the frame rate divides the IMU's.
     """
     calibration = calibration or packaged_calibration("euroc")
     imu_rng, track_rng = (np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(2))
@@ -56,7 +56,8 @@ def simulated_sequence(
     frames_s = np.arange(int(duration_s * frame_rate_hz) + 1) / frame_rate_hz
     imu_s = np.arange(int(np.ceil(frames_s[-1] * rate_hz)) + 1) / rate_hz
     frames_ns, imu_ns = ((_START_NS + np.round(t * NS_PER_S)).astype(np.int64) for t in (frames_s, imu_s))
-    readings = read_imu(path.at(imu_s), noise, imu_rng, bias_gyro_B, bias_accel_B)
+    errors = ImuErrors(bias_gyro_B=_vector(bias_gyro_B), bias_accel_B=_vector(bias_accel_B))
+    readings = read_imu(path.at(imu_s), noise, imu_rng, rate_hz, errors)
     segments = cut_segments(imu_ns, readings.gyro_B, readings.accel_B, frames_ns)
 
     motion = path.at(frames_s)
@@ -73,3 +74,8 @@ def simulated_sequence(
     truth = Trajectory(frames_ns, motion.R_WB, motion.p_WB)
     name = flight if isinstance(flight, str) else type(flight).__name__
     return TrackSequence(name, calibration, tuple(zip(segments, tracks, strict=True)), truth, states)
+
+
+def _vector(bias_B: Float | None) -> Vector:
+    x, y, z = (0.0, 0.0, 0.0) if bias_B is None else bias_B
+    return float(x), float(y), float(z)
