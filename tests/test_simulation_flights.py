@@ -1,48 +1,49 @@
-"""A flight's velocities and accelerations are the derivatives of its pose, and its readings lead back to it."""
+"""Flights are what their names say, and exact readings of an IMU lead back to them."""
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
+from plugin_helpers import install
+from simulated_imu import dead_reckoning_error_m
 
 from vioframe import registry
 from vioframe.calibration import packaged_calibration
-from vioframe.errors import PluginError
+from vioframe.errors import ConfigError, PluginError
 from vioframe.geometry import so3
 from vioframe.simulation import simulated_sequence
-from vioframe.simulation.flights import flight
-from vioframe.simulation.imu import read_imu
-from vioframe.types import ImuNoise, g_W
+from vioframe.simulation.flights import ShapedFlight, flight, levelled
+from vioframe.testing import check_flight
+from vioframe.types import g_W
 
-FLIGHTS = registry.load().names(registry.FLIGHT)
+INSTALLED = registry.load()
+FLIGHTS = INSTALLED.names(registry.FLIGHT)
 R_BC = packaged_calibration("euroc").R_BC
-TIMES_S = np.random.default_rng(3).uniform(0.1, 19.9, 200)
+
+
+def still(t_s):
+    return np.zeros((len(t_s), 3))
 
 
 @pytest.mark.parametrize("name", FLIGHTS)
-def test_derivatives_are_those_of_the_pose(name):
-    path, h = flight(name, 20.0, R_BC), 1e-4
-    before, here, after = (path.at(TIMES_S + d) for d in (-h, 0.0, h))
-    np.testing.assert_allclose(here.v_WB, (after.p_WB - before.p_WB) / (2 * h), atol=1e-5)
-    np.testing.assert_allclose(here.a_WB, (after.v_WB - before.v_WB) / (2 * h), atol=1e-5)
-    turned = np.swapaxes(before.R_WB, 1, 2) @ after.R_WB
-    np.testing.assert_allclose(here.omega_B, so3.log(turned) / (2 * h), atol=1e-5)
+def test_every_flight_conforms(name):
+    part = INSTALLED.find(registry.FLIGHT, name)
+    check_flight(part.factory)
+    if "speed" in {option.name for option in part.options}:
+        check_flight(part.factory, speed=0.5)
 
 
 @pytest.mark.parametrize("name", FLIGHTS)
 def test_exact_readings_integrate_back_to_the_flight(name):
-    """10 s of dead reckoning by the trapezoidal rule at 1 kHz; the rule's own error falls as the square of the rate."""
-    rate = 1000.0
-    t_s = np.arange(int(10 * rate) + 1) / rate
-    motion = flight(name, 10.0, R_BC).at(t_s)
-    readings = read_imu(motion, None, np.random.default_rng(0), rate)
-    dt = 1.0 / rate
-    turns = so3.exp(0.5 * (readings.gyro_B[1:] + readings.gyro_B[:-1]) * dt)
-    R, p, v = motion.R_WB[0], motion.p_WB[0], motion.v_WB[0]
-    for k, turn in enumerate(turns):
-        R_next = R @ turn
-        a = 0.5 * (R @ readings.accel_B[k] + R_next @ readings.accel_B[k + 1]) + g_W
-        R, p, v = R_next, p + v * dt + 0.5 * a * dt**2, v + a * dt
-        assert np.linalg.norm(p - motion.p_WB[k + 1]) < 1e-3
-    assert np.linalg.norm(so3.log(R.T @ motion.R_WB[-1])) < 1e-5
+    assert dead_reckoning_error_m(flight(name, 10.0, R_BC)) < 1e-3
+
+
+@pytest.mark.parametrize("name", FLIGHTS)
+def test_flights_are_what_a_vehicle_can_do(name):
+    motion = flight(name, 30.0, R_BC).at(np.linspace(0.0, 30.0, 3000))
+    assert np.linalg.norm(motion.v_WB, axis=1).max() < 8.0
+    assert np.linalg.norm(motion.a_WB - g_W, axis=1).max() < 2.5 * 9.81
+    assert np.linalg.norm(motion.omega_B, axis=1).max() < 5.0
 
 
 def test_rest_is_exact_and_between_two_rests_there_is_motion():
@@ -69,27 +70,136 @@ def test_flights_are_what_their_names_say():
     np.testing.assert_allclose(R_WC, [[0, 0, 1], [-1, 0, 0], [0, -1, 0]], atol=1e-12)
 
 
+class TestInspection:
+    T_S = np.linspace(0.0, 30.0, 3001)
+    MOTION = flight("inspection", 30.0, R_BC).at(T_S)
+
+    def test_rests_then_takes_off(self):
+        resting = self.T_S <= 1.25
+        assert not self.MOTION.v_WB[resting].any()
+        assert not self.MOTION.omega_B[resting].any()
+        assert np.linalg.norm(self.MOTION.v_WB[self.T_S > 2.5], axis=1).min() > 0.0
+        assert self.MOTION.p_WB[self.T_S < 6.0, 2].max() > 1.1
+
+    def test_stops_and_looks(self):
+        speed = np.linalg.norm(self.MOTION.v_WB, axis=1)
+        flying = self.T_S > 5.0
+        assert 0.2 < (speed[flying] < 0.15).mean() < 0.6
+        assert speed.max() > 1.5
+
+    def test_the_camera_faces_the_tank(self):
+        to_axis = np.array([4.0, 0.0]) - self.MOTION.p_WB[:, :2]
+        distance = np.linalg.norm(to_axis, axis=1)
+        assert 3.8 < distance.min() < distance.max() < 4.2
+        looks = (self.MOTION.R_WB @ R_BC)[:, :2, 2]
+        ahead = (looks * to_axis).sum(axis=1) / (np.linalg.norm(looks, axis=1) * distance)
+        assert np.rad2deg(np.arccos(ahead.min())) < 3.0
+
+    def test_leans_as_a_multirotor_does(self):
+        """Thrust is along the body's own vertical, so the specific force is, in the levelled frame."""
+        force_B = np.einsum("nji,nj->ni", self.MOTION.R_WB, self.MOTION.a_WB - g_W)
+        force_L = force_B @ levelled(R_BC).T
+        leaning = np.rad2deg(np.arccos(force_L[:, 2] / np.linalg.norm(force_L, axis=1)))
+        upright = np.rad2deg(np.arccos(self.MOTION.R_WB @ levelled(R_BC).T @ [0, 0, 1.0])[:, 2])
+        assert leaning.max() < 3.0
+        assert upright.max() > 8.0
+
+
+def test_size_and_speed_scale_a_flight():
+    """Twice the size at three times the speed is the same path, doubled and sooner, for every derivative."""
+    t_s = np.linspace(0.2, 9.8, 100)
+    R_LB = levelled(R_BC)
+    for name in ("figure_eight", "stop_and_go", "hover"):
+        plain = INSTALLED.create_flight(name, 30.0, R_LB).at(3.0 * t_s)
+        scaled = INSTALLED.create_flight(name, 10.0, R_LB, {"size": 2.0, "speed": 3.0}).at(t_s)
+        for power, field in enumerate(("p_WB", "v_WB", "a_WB")):
+            expected = 2.0 * 3.0**power * getattr(plain, field)
+            np.testing.assert_allclose(getattr(scaled, field), expected, atol=1e-9)
+        np.testing.assert_allclose(scaled.omega_B, 3.0 * plain.omega_B, atol=1e-12)
+
+
+@pytest.mark.parametrize("duration_s", [0.0, -1.0, np.nan, np.inf])
+def test_a_flight_without_duration_is_refused(duration_s):
+    with pytest.raises(ConfigError, match="must last longer than 0 s"):
+        ShapedFlight(duration_s, still, still, np.eye(3))
+
+
+@pytest.mark.parametrize("options", [{"speed": 0.0}, {"size": -1.0}, {"speed": np.nan}, {"speed": 1e9}])
+def test_options_out_of_range_are_refused(options):
+    with pytest.raises(ConfigError, match="Input should be"):
+        INSTALLED.create_flight("hover", 10.0, np.eye(3), options)
+
+
 def test_an_unknown_flight_lists_those_there_are():
     with pytest.raises(PluginError, match="figure_eight"):
         simulated_sequence("loop_the_loop")
 
 
-def test_noise_has_the_densities_asked_for():
-    """White noise by the variance of differences over one sample, diffusion by that over 1 s, each within 5 sigma."""
-    noise = ImuNoise(gyro_density=2e-4, accel_density=3e-3, gyro_walk=4e-5, accel_walk=5e-3, rate_hz=100.0)
-    count, rate = 200_000, 100
-    motion = flight("standstill", 1.0, R_BC).at(np.zeros(count))
-    exact = read_imu(motion, None, np.random.default_rng(1), rate)
-    noisy = read_imu(motion, noise, np.random.default_rng(1), rate)
-    for read, true, bias, density, walk in (
-        (noisy.gyro_B, exact.gyro_B, noisy.bias_gyro_B, noise.gyro_density, noise.gyro_walk),
-        (noisy.accel_B, exact.accel_B, noisy.bias_accel_B, noise.accel_density, noise.accel_walk),
-    ):
-        white = read - true - bias
-        assert white.std() == pytest.approx(density * np.sqrt(rate), rel=5 / np.sqrt(2 * white.size))
-        steps = bias[rate::rate] - bias[:-rate:rate]
-        assert steps.std() == pytest.approx(walk, rel=5 / np.sqrt(2 * steps.size))
-        assert np.array_equal(bias[0], np.zeros(3))
-    # Fresh at every sample: neighbours are uncorrelated.
-    white = (noisy.gyro_B - exact.gyro_B - noisy.bias_gyro_B)[:, 0]
-    assert abs(np.corrcoef(white[1:], white[:-1])[0, 1]) < 5 / np.sqrt(count)
+def test_ones_own_flight_is_flown_to_its_end():
+    own = ShapedFlight(2.0, lambda t_s: np.outer(t_s, [0.0, 0.5, 0.0]), still, levelled(R_BC))
+    sequence = simulated_sequence(own, None, duration_s=30.0)
+    assert sequence.name == "ShapedFlight"
+    assert sequence.ground_truth.duration_s == pytest.approx(2.0)
+    np.testing.assert_allclose(sequence.true_states[-1].p_WB, [0.0, 1.0, 0.0], atol=1e-9)
+
+
+def test_flights_and_worlds_of_third_parties_come_in_by_name(tmp_path, monkeypatch):
+    code = """
+    from dataclasses import dataclass
+    import numpy as np
+    from vioframe.simulation.flights import ShapedFlight
+    def climb(duration_s, R_LB, *, rate: float = 0.5):
+        still = lambda t_s: np.zeros((len(t_s), 3))
+        return ShapedFlight(duration_s, lambda t_s: np.outer(t_s, [0, 0, rate]), still, R_LB)
+    @dataclass
+    class Void:
+        mesh: object
+        textures: tuple
+    @hookimpl
+    def vioframe_flights(): return {"climb": climb, "nothing": lambda duration_s, R_LB: {}}
+    @hookimpl
+    def vioframe_worlds(): return {"void": lambda p_WB, rng, depth=3: Void(None, (len(p_WB), rng.integers(9), depth))}
+    """
+    install(tmp_path, monkeypatch, distribution="climbers", module="climbers", code=code)
+    loaded = registry.load()
+    assert not loaded.failures
+    climbing = loaded.create_flight("climb", 4.0, np.eye(3), {"rate": "2"})
+    np.testing.assert_allclose(climbing.at(np.array([3.0])).p_WB, [[0.0, 0.0, 6.0]], atol=1e-9)
+    check_flight(loaded.find(registry.FLIGHT, "climb").factory)
+    world = loaded.create_world("void", np.zeros((5, 3)), np.random.default_rng(0), {"depth": 8})
+    assert world.textures[::2] == (5, 8)
+    with pytest.raises(PluginError, match=r"'nothing' \(climbers 1.0\) made a dict, which has no duration_s, at"):
+        loaded.create_flight("nothing", 4.0, np.eye(3))
+
+
+@pytest.mark.parametrize(
+    ("spoil", "why"),
+    [
+        (lambda m: {"v_WB": 1.001 * m.v_WB}, "v_WB is off"),
+        (lambda m: {"a_WB": -m.a_WB}, "a_WB is off"),
+        (lambda m: {"omega_B": m.omega_B[:, ::-1]}, "omega_B is off"),
+        (lambda m: {"R_WB": 1.01 * m.R_WB}, "R_WB is not a rotation"),
+        (lambda m: {"p_WB": m.p_WB[:, :2]}, "p_WB has the shape"),
+        (lambda m: {"p_WB": np.nan * m.p_WB}, "p_WB is not finite"),
+    ],
+)
+def test_a_flight_that_is_not_one_motion_fails_the_kit(spoil, why):
+    class Spoilt(ShapedFlight):
+        def at(self, t_s):
+            motion = super().at(t_s)
+            return replace(motion, **spoil(motion))
+
+    def factory(duration_s, R_LB):
+        return Spoilt(duration_s, waves, waves, R_LB)
+
+    with pytest.raises(AssertionError, match=why):
+        check_flight(factory)
+
+
+def waves(t_s):
+    return np.sin(np.outer(t_s, [1.0, 1.3, 0.7]))
+
+
+def test_the_kit_wants_the_mounting_kept():
+    with pytest.raises(AssertionError, match="however the body is mounted"):
+        check_flight(lambda duration_s, R_LB: ShapedFlight(duration_s, waves, waves, so3.exp(np.zeros(3))))

@@ -10,5 +10,6 @@ Each raises :class:`AssertionError` saying what is not as promised in :mod:`viof
 from vioframe.testing.backend import check_backend
 from vioframe.testing.dataset import check_dataset
 from vioframe.testing.detector import check_detector
+from vioframe.testing.flight import check_flight
 
-__all__ = ["check_backend", "check_dataset", "check_detector"]
+__all__ = ["check_backend", "check_dataset", "check_detector", "check_flight"]
