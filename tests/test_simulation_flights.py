@@ -1,6 +1,8 @@
 """Flights are what their names say, and exact readings of an IMU lead back to them."""
 
+import re
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,6 +18,7 @@ from vioframe.simulation.flights import ShapedFlight, flight, levelled
 from vioframe.testing import check_flight
 from vioframe.types import g_W
 
+ROOT = Path(__file__).resolve().parents[1]
 INSTALLED = registry.load()
 FLIGHTS = INSTALLED.names(registry.FLIGHT)
 R_BC = packaged_calibration("euroc").R_BC
@@ -203,3 +206,11 @@ def waves(t_s):
 def test_the_kit_wants_the_mounting_kept():
     with pytest.raises(AssertionError, match="however the body is mounted"):
         check_flight(lambda duration_s, R_LB: ShapedFlight(duration_s, waves, waves, so3.exp(np.zeros(3))))
+
+
+def test_the_flight_of_the_documentation_works():
+    text = (ROOT / "docs" / "flights.md").read_text()
+    (code,) = re.findall(r"^```python\n(# my_flights\.py.*?)^```$", text, re.MULTILINE | re.DOTALL)
+    names = {}
+    exec(code, names)
+    check_flight(names["vioframe_flights"]()["lawnmower"])
