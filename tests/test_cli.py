@@ -128,7 +128,7 @@ def test_a_run_from_recording_to_folder(toy):
     folder = Path("runs/toy_shi_tomasi_still")
     assert {p.name for p in folder.iterdir()} == {
         *("trajectory.tum", "states.csv", "pose_cov.csv", "tracks.csv", "timings.csv", "map.ply"),
-        *("config.yaml", "machine.json", "summary.json"),
+        *("config.yaml", "machine.json", "summary.json", "calibration"),
     }
     run = RunFolder.open(folder)
     assert run.summary["finished"] is True

@@ -14,6 +14,7 @@ from typing import Any
 
 from vioframe import config as configuration
 from vioframe import machine, pipeline
+from vioframe.calibration import write_calibration
 from vioframe.config import Config
 from vioframe.errors import DatasetError, PluginError, RunError, VioframeError
 from vioframe.incidents import Incidents
@@ -119,6 +120,7 @@ def _write(
     config, registry = experiment.config, experiment.registry
     (folder / "config.yaml").write_text(configuration.render(config, registry), encoding="utf-8")
     write_json(folder / "machine.json", machine.describe())
+    write_calibration(experiment.dataset.calibration, folder / "calibration")
     if experiment.ground_truth is not None:
         write_tum(experiment.ground_truth, folder / "ground_truth.tum")
     with Recorder(folder, _about(experiment), experiment.incidents, begin_s) as recorder:

@@ -5,6 +5,7 @@
     pose_cov.csv     pose covariance, upper triangle               summary.json     how the run went
     tracks.csv       every feature observation                     ground_truth.tum where there is one
     timings.csv      seconds, a column a stage                     map.ply          landmarks, written at the end
+    calibration/     as it was given, in EuRoC's format
 
 Each frame is flushed as it comes, so an interrupted run leaves what it had, with ``finished: false`` in its summary.
 All but the timings, the machine and the summary's clock-dependent figures are the same byte for byte in every run.

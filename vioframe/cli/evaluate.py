@@ -21,6 +21,11 @@ _WIDE = 1000
     help="How the estimate is brought into the ground truth's frame.",
 )
 @click.option(
+    "--world",
+    type=_FILE,
+    help="Mesh to measure the landmarks against.  [default: world.ply of the simulated recording]",
+)
+@click.option(
     "--format",
     "format_",
     type=click.Choice(["table", "json", "csv", "markdown"]),
@@ -28,17 +33,21 @@ _WIDE = 1000
     show_default=True,
     help="What to print.",
 )
-def command(runs: tuple[Path, ...], ground_truth: Path | None, alignment: str, format_: str) -> None:
+def command(
+    runs: tuple[Path, ...], ground_truth: Path | None, alignment: str, world: Path | None, format_: str
+) -> None:
     """Compare each RUN, a run folder or a trajectory file, with the ground truth.
 
-    The result is printed, and kept as `evaluation.json` in each run folder.
+    The landmarks of a run on a simulated recording are measured against the
+    surfaces of its world. The result is printed, and kept as `evaluation.json` in each run folder.
     """
     from vioframe.recorder import write_json
     from vioframe.report.evaluated import evaluate_paths
+    from vioframe.report.map_quality import measure_maps
     from vioframe.report.rows import notes
     from vioframe.report.tables import to_csv, to_json, to_markdown, to_rich
 
-    evaluated = evaluate_paths(runs, ground_truth, alignment)
+    evaluated, on_maps = measure_maps(evaluate_paths(runs, ground_truth, alignment), world)
     if format_ == "table":
         from rich.console import Console
 
@@ -47,7 +56,7 @@ def command(runs: tuple[Path, ...], ground_truth: Path | None, alignment: str, f
         (console if console.is_terminal else Console(width=_WIDE)).print(to_rich(evaluated))
     else:
         click.echo({"json": to_json, "csv": to_csv, "markdown": to_markdown}[format_](evaluated))
-    for note in notes(evaluated):
+    for note in (*notes(evaluated), *on_maps):
         click.echo(f"note: {note}", err=True)
     # Last: what is read from a full or read-only disk is shown all the same.
     for run in evaluated:

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from vioframe.errors import VioframeError
+from vioframe.report.map_quality import MapQuality
 from vioframe.report.run_folder import RunFolder
 from vioframe.trajectory import Trajectory, TrajectoryErrors, evaluate, load_trajectory
 
@@ -28,13 +29,17 @@ _RUN_FIGURES = (
 
 @dataclass(frozen=True)
 class Evaluated:
-    """``folder`` is None for a bare trajectory file; ``errors`` where there is no pose or no ground truth."""
+    """``folder`` is None for a bare trajectory file; ``errors`` where there is no pose or no ground truth.
+
+    ``map_quality`` is there where :func:`~vioframe.report.map_quality.measure_maps` found a world to compare with.
+    """
 
     name: str
     folder: RunFolder | None
     estimate: Trajectory | None
     ground_truth: Trajectory | None
     errors: TrajectoryErrors | None
+    map_quality: MapQuality | None = None
 
     @property
     def summary(self) -> Mapping[str, Any]:
@@ -49,7 +54,8 @@ class Evaluated:
         """Everything as plain values for JSON; what is not known is left out."""
         run = {key: self.summary[key] for key in _RUN_FIGURES if key in self.summary}
         errors = {} if self.errors is None else self.errors.to_dict()
-        return {"name": self.name, **run, **errors, "stage_ms": self.stage_ms()}
+        quality = {} if self.map_quality is None else {"map": self.map_quality.to_dict()}
+        return {"name": self.name, **run, **errors, **quality, "stage_ms": self.stage_ms()}
 
 
 def evaluate_path(path: Path, ground_truth: Trajectory | None, alignment: str = "posyaw") -> Evaluated:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 
 from vioframe.report.evaluated import Evaluated
+from vioframe.report.map_quality import WITHIN_M, MapQuality
 from vioframe.trajectory import RelativeErrors, Stats, TrajectoryErrors
 
 ALIGNED_BY = {"posyaw": "position + yaw", "se3": "SE(3)", "sim3": "Sim(3)", "first": "first pose"}
@@ -19,6 +20,7 @@ def sections(runs: Sequence[Evaluated]) -> list[Section]:
     groups = [
         ("Run", _run_rows(runs)),
         *_error_sections(runs),
+        ("Landmarks, distance from the simulated world's surfaces [m]", _map_rows(runs)),
         ("Time, ms a frame", _timing_rows(runs)),
     ]
     known = [(title, [row for row in rows if any(cell != _UNKNOWN for cell in row[1])]) for title, rows in groups]
@@ -112,6 +114,22 @@ def _nees_rows(runs: Sequence[Evaluated]) -> Rows:
     return [
         (f"{part}, ideally {dof}", [cell(run.errors, part) if run.errors else _UNKNOWN for run in runs])
         for part, dof in parts.items()
+    ]
+
+
+def _map_rows(runs: Sequence[Evaluated]) -> Rows:
+    def cells(format_: Callable[[MapQuality], str]) -> list[str]:
+        return [_UNKNOWN if run.map_quality is None else format_(run.map_quality) for run in runs]
+
+    return [
+        ("landmarks", cells(lambda m: str(m.landmarks))),
+        ("median", cells(lambda m: f"{m.median_m:.4f}")),
+        ("90 % are within", cells(lambda m: f"{m.q90_m:.4f}")),
+        ("RMSE", cells(lambda m: f"{m.rmse_m:.4f}")),
+        (
+            "within " + ", ".join(f"{100 * limit:g}" for limit in WITHIN_M) + " cm [%]",
+            cells(lambda m: ", ".join(f"{100 * part:.1f}" for _, part in m.within)),
+        ),
     ]
 
 

@@ -12,9 +12,10 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from vioframe.errors import RunError
+from vioframe.errors import ConfigError, RunError
+from vioframe.report.landmarks import Landmarks, read_landmarks
 from vioframe.trajectory import Trajectory, load_trajectory
-from vioframe.types import Float, Int
+from vioframe.types import Calibration, Float, Int
 
 _UPPER = np.triu_indices(6)
 
@@ -88,6 +89,28 @@ class RunFolder:
         """The ground truth that the run was given, if any."""
         path = self.path / "ground_truth.tum"
         return load_trajectory(path) if path.is_file() else None
+
+    def recording(self) -> Path | None:
+        """What the run was made on, which may be gone by now; None where its configuration does not say."""
+        from vioframe.config import read_tree
+
+        try:
+            path = read_tree(self.path / "config.yaml")["dataset"]["path"]
+        except (ConfigError, KeyError, TypeError):
+            return None
+        return Path(path) if isinstance(path, str) else None
+
+    def calibration(self) -> Calibration | None:
+        """The calibration that the run was given; None in run folders that were written without it."""
+        from vioframe.calibration import load_calibration
+
+        path = self.path / "calibration"
+        return load_calibration(path) if path.is_dir() else None
+
+    def landmarks(self) -> Landmarks | None:
+        """The landmarks in the world of the estimate, all of them; None where the run was cut off before its end."""
+        path = self.path / "map.ply"
+        return read_landmarks(path) if path.is_file() else None
 
     def timings(self) -> Timings | None:
         """None where there are none."""

@@ -32,8 +32,11 @@ class Alignment:
             A = np.eye(6)
             A[3:, 3:] = self.scale * self.R_GW
             cov = A @ cov @ A.T
-        p_GB = self.scale * trajectory.p_WB @ self.R_GW.T + self.p_GW
-        return Trajectory(trajectory.t_ns, self.R_GW @ trajectory.R_WB, p_GB, cov)
+        return Trajectory(trajectory.t_ns, self.R_GW @ trajectory.R_WB, self.points(trajectory.p_WB), cov)
+
+    def points(self, p_W: Float) -> Float:
+        """Points (N, 3) m seen in G."""
+        return np.asarray(self.scale * p_W @ self.R_GW.T + self.p_GW)
 
 
 def yaw_of(R: Float) -> Float:

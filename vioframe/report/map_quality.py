@@ -1,0 +1,110 @@
+"""How far a run's landmarks lie from the surfaces of the world that they were seen on.
+
+Only a simulated world is known well enough for this. Every landmark of ``map.ply`` counts, the outliers too: a metric
+that cleans first hides what it should show. Median and quantiles are not led by a few far ones; RMSE is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from vioframe.errors import ConfigError, RunError
+from vioframe.geometry.meshes import distances, read_mesh
+from vioframe.simulation.files import WORLD, simulation_folder
+from vioframe.types import Float
+
+if TYPE_CHECKING:
+    from vioframe.report.evaluated import Evaluated
+    from vioframe.report.run_folder import RunFolder
+
+WITHIN_M = (0.05, 0.10, 0.20)
+_NO_MAP = "no landmarks were recorded (map.ply)"
+
+
+@dataclass(frozen=True)
+class MapQuality:
+    """Unsigned distances of ``landmarks`` from the mesh ``world``; ``within`` is a fraction by distance in m."""
+
+    world: Path
+    landmarks: int
+    median_m: float
+    rmse_m: float
+    q90_m: float
+    within: tuple[tuple[float, float], ...]
+
+    @classmethod
+    def of(cls, p_GF: Float, corners: Float, world: Path) -> MapQuality:
+        """Of landmarks (M, 3) m, M >= 1, in the world of the triangles ``corners`` (T, 3, 3) m."""
+        distance = distances(p_GF, corners)
+        return cls(
+            world=world,
+            landmarks=len(distance),
+            median_m=float(np.median(distance)),
+            rmse_m=float(np.sqrt(np.mean(distance**2))),
+            q90_m=float(np.quantile(distance, 0.9)),
+            within=tuple((limit, float(np.mean(distance <= limit))) for limit in WITHIN_M),
+        )
+
+    def to_dict(self) -> dict[str, object]:
+        """Plain values for JSON."""
+        return {
+            "world": str(self.world),
+            "landmarks": self.landmarks,
+            "median_m": self.median_m,
+            "rmse_m": self.rmse_m,
+            "q90_m": self.q90_m,
+            "within": {f"{100 * limit:g}cm": part for limit, part in self.within},
+        }
+
+
+def simulated_world(folder: RunFolder) -> Path | None:
+    """The mesh beside the simulated recording that a run was made on; None where that is not simulated, or gone."""
+    path = folder.recording()
+    if path is None:
+        return None
+    world = simulation_folder(path.parent if path.name == "mav0" else path) / WORLD
+    return world if world.is_file() else None
+
+
+def measure_maps(runs: Sequence[Evaluated], world: Path | None = None) -> tuple[list[Evaluated], list[str]]:
+    """``runs`` with their ``map_quality`` where it can be told, and a line on each of which it cannot though it might.
+
+    The landmarks are moved with the alignment of the trajectory. ``world`` is the mesh, in the ground truth's world;
+    without it each run's own :func:`simulated_world`. Raises :class:`ConfigError` where ``world`` cannot be read, and
+    :class:`RunError` where no run can be compared with it.
+    """
+    out, notes = [], []
+    meshes: dict[Path, Float] = {}
+    for run in runs:
+        mesh = world or (simulated_world(run.folder) if run.folder else None)
+        quality: MapQuality | str | None = None
+        if mesh is not None:
+            try:
+                quality = _measure(run, mesh, meshes)
+            except ConfigError as error:
+                # Nobody asked for the world beside the recording: the rest of the evaluation stands without it.
+                if world is not None:
+                    raise
+                quality = str(error)
+        if isinstance(quality, str):
+            notes.append(f"{run.name}: its map is not compared with the world: {quality}")
+        out.append(replace(run, map_quality=quality) if isinstance(quality, MapQuality) else run)
+    if world is not None and len(notes) == len(runs):
+        raise RunError("; ".join(notes))
+    return out, notes
+
+
+def _measure(run: Evaluated, mesh: Path, meshes: dict[Path, Float]) -> MapQuality | str:
+    """Of one run, or why there is none; ``meshes`` are those read so far."""
+    landmarks = run.folder.landmarks() if run.folder else None
+    if landmarks is None or not len(landmarks):
+        return _NO_MAP
+    if run.errors is None:
+        return "there is no ground truth to align it by; pass --ground-truth"
+    corners = meshes[mesh] if mesh in meshes else meshes.setdefault(mesh, read_mesh(mesh))
+    return MapQuality.of(run.errors.alignment.points(landmarks.p_WF), corners, mesh)
