@@ -34,7 +34,7 @@ def hover(duration_s: float, R_LB: Float, *, size: Size = 1.0, speed: Speed = 1.
 
 
 def figure_eight(duration_s: float, R_LB: Float, *, size: Size = 1.0, speed: Speed = 1.0) -> ShapedFlight:
-    """A level eight of 6 x 4 m in 12 s, camera ahead."""
+    """An eight of 6 x 4 m in 12 s, up and down by half a metre, the camera ahead."""
     position = _waves((0, 3.0, 12.0, 0.0), (1, 2.0, 6.0, 0.0), (2, 0.5, 8.0, 0.0))
     attitude = _waves((0, 0.6, 12.0, 0.1), (1, 0.10, 6.0, 0.2), (2, 0.15, 6.0, 0.0))
     return _scaled(duration_s, R_LB, position, attitude, size, speed)

@@ -6,11 +6,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from click.testing import CliRunner
 from plugin_helpers import install
 from simulated_imu import dead_reckoning_error_m
 
 from vioframe import registry
+from vioframe.bench import run_backend
 from vioframe.calibration import packaged_calibration
+from vioframe.cli import main
 from vioframe.errors import ConfigError, PluginError
 from vioframe.geometry import so3
 from vioframe.simulation import simulated_sequence
@@ -106,6 +109,19 @@ class TestInspection:
         upright = np.rad2deg(np.arccos(self.MOTION.R_WB @ levelled(R_BC).T @ [0, 0, 1.0])[:, 2])
         assert leaning.max() < 3.0
         assert upright.max() > 8.0
+
+    @pytest.mark.parametrize(("first_frame", "how"), [(0, "static"), (60, "dynamic")])
+    def test_a_filter_starts_at_rest_and_in_motion(self, first_frame, how):
+        sequence = simulated_sequence("inspection", duration_s=8.0, seed=1)
+        backend = INSTALLED.create_backend("msckf", sequence.calibration)
+        run = run_backend(replace(sequence, packets=sequence.packets[first_frame:]), backend)
+        assert f"initialised ({how})" in [event for estimate in run.estimates for event in estimate.events]
+        truth = dict(zip(sequence.ground_truth.t_ns.tolist(), sequence.ground_truth.p_WB, strict=True))
+        moved = run.states[-1].p_WB - run.states[0].p_WB
+        truly = truth[run.states[-1].t_ns] - truth[run.states[0].t_ns]
+        # The estimate's own yaw is free: heights and horizontal distances compare.
+        assert abs(moved[2] - truly[2]) < 0.05
+        assert abs(np.hypot(*moved[:2]) - np.hypot(*truly[:2])) < 0.05
 
 
 def test_size_and_speed_scale_a_flight():
@@ -214,3 +230,11 @@ def test_the_flight_of_the_documentation_works():
     names = {}
     exec(code, names)
     check_flight(names["vioframe_flights"]()["lawnmower"])
+
+
+def test_flights_are_listed_with_their_options():
+    shown = CliRunner().invoke(main, ["plugins"]).output
+    rows = {tuple(line.split()[:2]) for line in shown.splitlines()}
+    assert {("flight", name) for name in FLIGHTS} <= rows
+    options = CliRunner().invoke(main, ["plugins", "hover"]).output
+    assert "how many times as large" in " ".join(options.split())

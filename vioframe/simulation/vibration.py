@@ -11,9 +11,9 @@ import numpy as np
 from vioframe.types import Float
 
 ACCEL_RMS = 3.0
-"""At level 1, m/s^2 on each axis: a small multirotor with its IMU screwed to the frame."""
+"""At level 1, m/s^2 on each axis: three times what EuRoC's vehicle shows in flight, about its smooth motion."""
 GYRO_RMS = 0.15
-"""At level 1, rad/s on each axis."""
+"""At level 1, rad/s on each axis, likewise."""
 
 _ROTORS = 4
 _ROTOR_HZ = (70.0, 90.0)
