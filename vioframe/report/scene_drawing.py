@@ -25,11 +25,11 @@ from vioframe.trajectory import Trajectory
 from vioframe.types import NS_PER_S, Calibration, Float
 
 TRUTH_RGB = (0.12, 0.12, 0.12)
-_EDGE_RGB = (0.52, 0.54, 0.58)
+_EDGE_RGB = (0.62, 0.64, 0.68)
 _WORLD_RGB = (0.87, 0.88, 0.90)
 
 # Widths in pixels.
-_PATH, _TRUTH, _EDGE, _GRID, _AXIS, _LANDMARK, _START = 5.0, 5.6, 1.9, 1.5, 4.0, 4.6, 15.0
+_PATH, _TRUTH, _EDGE, _GRID, _AXIS, _LANDMARK, _START = 5.0, 5.6, 1.7, 1.5, 4.0, 4.6, 15.0
 _DASH_PERIOD = 30.0
 _FRUSTUM = 46.0
 _FRUSTA = 22
@@ -38,8 +38,8 @@ _GAP_NS = NS_PER_S
 
 @dataclass(frozen=True, eq=False)
 class Drawing:
-    """``solid`` shapes, and the faces of the ``world``, whose outside is turned to the flight: from behind they are
-    not to be seen, so that no wall hides what happens inside. ``heights`` (2,) m are the ends of the landmarks'
+    """``solid`` shapes, and the faces of the ``world``, turned to the flight: from behind they are hardly to be seen,
+    so that nothing that stands between the eye and the flight hides it. ``heights`` m are the ends of the landmarks'
     colours, where those tell heights."""
 
     solid: Shape
@@ -56,7 +56,7 @@ def draw(scene: Scene, grid: Grid, view: View) -> Drawing:
     for flight in scene.flights:
         parts += [_path(flight, px), _landmarks(flight, heights, view)]
         if flight.calibration is not None:
-            parts.append(_cameras(flight, flight.calibration, px))
+            parts.append(cameras(flight, flight.calibration, px))
     world = Shape.join([])
     if scene.world is not None:
         world = Shape.of(facing(scene.world, scene.path.mean(axis=0)), _WORLD_RGB)
@@ -92,7 +92,7 @@ def _truth(truth: Trajectory, px: float) -> Shape:
     return dashes(thinned(truth.p_WB, _TRUTH * px), 0.5 * _TRUTH * px, _DASH_PERIOD * px, TRUTH_RGB)
 
 
-def _cameras(flight: Flight, calibration: Calibration, px: float) -> Shape:
+def cameras(flight: Flight, calibration: Calibration, px: float) -> Shape:
     """The edges of what the camera saw, at poses evenly along the path."""
     estimate, camera = flight.estimate, calibration.camera
     spacing = max(estimate.path_length_m / _FRUSTA, 1.5 * _FRUSTUM * px)

@@ -99,15 +99,11 @@ def _text(figure: Figure, view: View, p_W: Float, text: str, **look: Any) -> Non
 
 
 def _height_scale(figure: Figure, heights: tuple[float, float], scale: float) -> None:
-    from matplotlib.patches import Rectangle
-
-    figure.add_artist(Rectangle((0.915, 0.575), 0.08, 0.415, color="white", alpha=0.85, lw=0, zorder=0.5))
-    ax: Any = figure.add_axes((0.965, 0.60, 0.011, 0.32), zorder=1)
-    ax.imshow(
-        height_colours(np.linspace(0.0, 1.0, 256))[:, None], origin="lower", aspect="auto", extent=(0.0, 1.0, *heights)
-    )
-    ax.set_xticks([])
-    ax.tick_params(axis="y", labelsize=10.5 * scale, left=True, labelleft=True, colors=_TEXT)
-    ax.set_title("landmarks,\nheight [m]", fontsize=11 * scale, color=_TEXT, loc="right")
+    ax: Any = figure.add_axes((0.76, 0.042, 0.2, 0.014), zorder=1)
+    colours = height_colours(np.linspace(0.0, 1.0, 256))
+    ax.imshow(colours[None], origin="lower", aspect="auto", extent=(*heights, 0.0, 1.0))
+    ax.set_yticks([])
+    ax.tick_params(axis="x", labelsize=10.5 * scale, colors=_TEXT)
+    ax.set_title("height of the landmarks [m]", fontsize=11 * scale, color=_TEXT, pad=4 * scale)
     for spine in ax.spines.values():
         spine.set_visible(False)

@@ -13,6 +13,7 @@ from vioframe.types import Float
 AXES_RGB = {"x": (0.80, 0.18, 0.18), "y": (0.18, 0.58, 0.22), "z": (0.16, 0.36, 0.80)}
 _GRID_RGB = (0.80, 0.81, 0.83)
 _LINES = 8.0
+_LEAST_M = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,6 +36,12 @@ class Grid:
         (x0, y0), (x1, y1) = self.low, self.high
         return np.array([[x, y, self.z_m] for x in (x0, x1) for y in (y0, y1)])
 
+    @property
+    def margin(self) -> Float:
+        """(4, 3) corners of the area that labels beside the grid take."""
+        labels = 0.6 * self.step_m
+        return Grid(self.step_m, self.low - labels, self.high + labels, self.z_m).corners
+
     def nearest_corner(self, eye: Float) -> Float:
         """(3,)."""
         return np.asarray(self.corners[np.argmin(np.linalg.norm(self.corners - eye, axis=1))])
@@ -49,7 +56,10 @@ def ground_grid(scene: Scene) -> Grid:
     """On the floor of the world; without one, below what is of interest, and as far as it reaches."""
     points = scene.of_interest
     low, high = points.min(axis=0), points.max(axis=0)
-    step = _round_number(max(float(np.max((high - low)[:2])), 0.5) / _LINES)
+    # Around a body at rest there is some room, too.
+    room = 0.5 * np.maximum(_LEAST_M - (high - low), 0.0)
+    low, high = low - room * [1.0, 1.0, 0.0], high + room * [1.0, 1.0, 0.0]
+    step = _round_number(float(np.max((high - low)[:2])) / _LINES)
     if scene.world is not None:
         return Grid(step, low[:2], high[:2], float(low[2]))
     # A few landmarks below the ground do not lower it.

@@ -9,7 +9,7 @@ import numpy as np
 from vioframe.types import Float
 
 _FIELD_OF_VIEW_DEG = 32.0
-_MARGIN = 0.06
+_MARGIN = 0.04
 _THREE_QUARTERS_DEG = 25.0
 
 
@@ -55,7 +55,7 @@ class View:
 
 
 def view_of(points: Float, azimuth_deg: float, elevation_deg: float, size: tuple[int, int]) -> View:
-    """The nearest view that has ``points`` (N, 3) in the picture with a margin.
+    """The nearest view that has ``points`` (N, 3), not all in one place, in the picture with a margin.
 
     ``azimuth_deg`` is where the eye stands, counter-clockwise from x seen from above; ``elevation_deg`` how high.
     """
@@ -64,9 +64,6 @@ def view_of(points: Float, azimuth_deg: float, elevation_deg: float, size: tuple
     right = np.array([-np.sin(a), np.cos(a), 0.0])
     R_VW = np.stack([right, np.cross(ahead, right), ahead])
     low, high = points.min(axis=0), points.max(axis=0)
-    if np.max(high - low) < 0.5:  # a body at rest: half a metre around it
-        low, high = (0.5 * (low + high) + half for half in (-0.25, 0.25))
-        points = np.stack([low, high])
     q = points @ R_VW.T
     # A point is in the picture where |x - ex| <= k (z - ez): the eye lies where the tightest planes of both sides meet.
     k = (1.0 - 2.0 * _MARGIN) * 0.5 * np.array(size) / _focal_px(size)

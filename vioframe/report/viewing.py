@@ -53,7 +53,7 @@ def choose_view(
     grid = ground_grid(scene)
     if azimuth_deg is None:
         azimuth_deg = best_azimuth_deg(scene.path, scene.landmarks)
-    return grid, view_of(np.concatenate([scene.of_interest, grid.corners]), azimuth_deg, elevation_deg, size)
+    return grid, view_of(np.concatenate([scene.of_interest, grid.margin]), azimuth_deg, elevation_deg, size)
 
 
 def export_map(run: Evaluated, path: Path) -> int:
