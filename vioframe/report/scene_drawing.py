@@ -28,7 +28,7 @@ TRUTH_RGB = (0.12, 0.12, 0.12)
 _EDGE_RGB = (0.62, 0.64, 0.68)
 _WORLD_RGB = (0.87, 0.88, 0.90)
 
-# Widths in pixels.
+# Widths in pixels of a picture that is 1000 of them high.
 _PATH, _TRUTH, _EDGE, _GRID, _AXIS, _LANDMARK, _START = 5.0, 5.6, 1.7, 1.5, 4.0, 4.6, 15.0
 _DASH_PERIOD = 30.0
 _FRUSTUM = 46.0
@@ -49,7 +49,7 @@ class Drawing:
 
 def draw(scene: Scene, grid: Grid, view: View) -> Drawing:
     """All of ``scene`` as seen in ``view``."""
-    px = view.metres_per_pixel
+    px = view.width_m
     heights = _heights(scene)
     parts = [grid_shape(grid, 0.5 * _GRID * px), axes_shape(grid, 0.5 * _AXIS * px)]
     parts += [_truth(truth, px) for truth in scene.truths]
@@ -117,13 +117,13 @@ def _landmarks(flight: Flight, heights: tuple[float, float] | None, view: View) 
     p_WF = flight.landmarks.p_WF if flight.landmarks is not None else np.empty((0, 3))
     # What is right before the eye would only stand in the way.
     depth = view.depth(p_WF)
-    ahead = depth > 0.3 * view.metres_per_pixel * view.focal_px
+    ahead = depth > 0.3 * view.depth(view.target)
     p_WF, depth = p_WF[ahead], depth[ahead]
     if heights is None:
         colours = np.broadcast_to(0.25 + 0.75 * np.array(rgb(flight.number)), p_WF.shape)
     else:
         colours = height_colours((p_WF[:, 2] - heights[0]) / (heights[1] - heights[0]))
-    return balls(p_WF, 0.5 * _LANDMARK * depth / view.focal_px, colours)
+    return balls(p_WF, 0.5 * _LANDMARK * view.scale * depth / view.focal_px, colours)
 
 
 def _heights(scene: Scene) -> tuple[float, float] | None:

@@ -40,7 +40,7 @@ def _figure(scene: Scene, grid: Grid, view: View, caption: str) -> Figure:
     figure = Figure(figsize=(view.size[0] / _DPI, view.size[1] / _DPI), dpi=_DPI)
     figure.figimage(render(drawing, view), origin="upper")
     # Text grows with the picture: it is looked at as a whole.
-    scale = min(view.size) / 1000.0
+    scale = view.scale
     _tick_labels(figure, grid, view, scale)
     _legend(figure, scene, scale)
     if drawing.heights is not None:

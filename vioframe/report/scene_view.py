@@ -11,13 +11,15 @@ from vioframe.types import Float
 _FIELD_OF_VIEW_DEG = 32.0
 _MARGIN = 0.04
 _THREE_QUARTERS_DEG = 25.0
+_LEAST_SCALE = 0.6
+_CENTRING_STEPS = 10
 
 
 @dataclass(frozen=True, eq=False)
 class View:
     """A camera at ``eye`` (3,) m in W: ``R_VW`` (3, 3) maps to x right, y down, z forward; ``size`` (width, height) px.
 
-    ``target`` (3,) is the middle of what is looked at, where lines have the width in pixels that they were asked for.
+    ``target`` (3,) is the middle of what is looked at, where lines have the width that they were asked for.
     """
 
     R_VW: Float
@@ -35,12 +37,18 @@ class View:
         return 0.5 * (np.array(self.size) - 1.0)
 
     @property
-    def metres_per_pixel(self) -> float:
-        """At the distance of the target."""
-        return float((self.R_VW @ (self.target - self.eye))[2]) / self.focal_px
+    def scale(self) -> float:
+        """Pixels for each that a line or a letter is wide where the picture is 1000 pixels high; a small picture keeps
+        them large enough to see."""
+        return max(min(self.size) / 1000.0, _LEAST_SCALE)
+
+    @property
+    def width_m(self) -> float:
+        """What looks one such pixel wide at the target."""
+        return self.scale * float(self.depth(self.target)) / self.focal_px
 
     def depth(self, p_W: Float) -> Float:
-        """(N,) m along the line of sight of points (N, 3)."""
+        """(...,) m along the line of sight of points (..., 3)."""
         return np.asarray((p_W - self.eye) @ self.R_VW[2])
 
     def project(self, p_W: Float) -> Float:
@@ -71,6 +79,10 @@ def view_of(points: Float, azimuth_deg: float, elevation_deg: float, size: tuple
     left_most = np.max(-q[:, :2] - k * q[:, 2:], axis=0)
     ez = float(np.min(-(right_most + left_most) / (2.0 * k)))
     eye_V = np.array([*(0.5 * (right_most - left_most)), ez])
+    # That is the middle of the tighter direction; in the other, move until there is as much room on both sides.
+    for _ in range(_CENTRING_STEPS):
+        seen = (q[:, :2] - eye_V[:2]) / (q[:, 2:] - ez)
+        eye_V[:2] += 0.5 * (seen.min(axis=0) + seen.max(axis=0)) * (q[:, 2].mean() - ez)
     return View(R_VW, R_VW.T @ eye_V, 0.5 * (low + high), size)
 
 
