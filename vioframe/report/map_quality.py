@@ -15,7 +15,6 @@ import numpy as np
 
 from vioframe.errors import ConfigError, RunError
 from vioframe.geometry.meshes import distances, read_mesh
-from vioframe.simulation.files import WORLD, simulation_folder
 from vioframe.types import Float
 
 if TYPE_CHECKING:
@@ -64,6 +63,9 @@ class MapQuality:
 
 def simulated_world(folder: RunFolder) -> Path | None:
     """The mesh beside the simulated recording that a run was made on; None where that is not simulated, or gone."""
+    # Here, because the simulator comes along: evaluating a recorded flight has no need of it.
+    from vioframe.simulation.files import WORLD, simulation_folder
+
     path = folder.recording()
     if path is None:
         return None
