@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import groupby, pairwise
 from time import perf_counter, thread_time
 
 import numpy as np
@@ -45,13 +46,13 @@ class BackendRun:
         states = self.states
         if not states:
             raise TrajectoryError("the back-end never got past initialisation; its events say why")
-        covs = [s.cov[:_POSE, :_POSE] for s in states if s.cov is not None]
-        return Trajectory(
-            np.array([s.t_ns for s in states], np.int64),
-            np.array([s.R_WB for s in states]),
-            np.array([s.p_WB for s in states]),
-            np.array(covs) if len(covs) == len(states) else None,
-        )
+        return _trajectory(states)
+
+    @property
+    def stretches(self) -> tuple[Trajectory, ...]:
+        """The trajectory cut where tracking was lost: each piece has a position and yaw of its own to begin with."""
+        pieces = groupby(self.estimates, lambda e: e.status is Status.TRACKING and e.state is not None)
+        return tuple(_trajectory([e.state for e in piece if e.state]) for tracking, piece in pieces if tracking)
 
     @property
     def initialised_after_s(self) -> float | None:
@@ -80,6 +81,16 @@ class BackendRun:
             total.update(estimate.stage_seconds)
         per_packet = 1e3 / len(self.estimates)
         return {"total": float(self.seconds.mean()) * 1e3, **{k: v * per_packet for k, v in total.items()}}
+
+
+def _trajectory(states: Sequence[NavState]) -> Trajectory:
+    covs = [s.cov[:_POSE, :_POSE] for s in states if s.cov is not None]
+    return Trajectory(
+        np.array([s.t_ns for s in states], np.int64),
+        np.array([s.R_WB for s in states]),
+        np.array([s.p_WB for s in states]),
+        np.array(covs) if len(covs) == len(states) else None,
+    )
 
 
 def run_backend(sequence: TrackSequence, backend: Backend) -> BackendRun:

@@ -1,0 +1,191 @@
+"""Monte Carlo: back-ends on many simulated flights that differ by their noise alone, each trial with its own seed.
+
+A trial starts as a real flight does, with the back-end's own initialisation. Nothing is left out: a trial that never
+initialises, diverges or crashes is kept and says so. What the NEES of many trials tells: ``docs/montecarlo.md``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from functools import cache
+from itertools import product
+from typing import Any
+
+import numpy as np
+
+from vioframe import registry
+from vioframe.bench.consistency import PARTS, Outcome, Trial
+from vioframe.bench.processes import map_in_processes
+from vioframe.bench.results import backend_row
+from vioframe.bench.run import BackendRun, run_backend
+from vioframe.calibration import packaged_calibration
+from vioframe.errors import ConfigError, TrajectoryError
+from vioframe.simulation import TrackSequence, simulated_sequence
+from vioframe.simulation.flights import flight as named_flight
+from vioframe.trajectory import Trajectory
+from vioframe.trajectory.alignment import align_first
+from vioframe.trajectory.nees import nees
+
+SHORTEST_S = 10.0
+"""A shorter flight is over before it tells anything: initialisation alone takes one to four seconds of motion."""
+
+# An estimate this far from the truth is no longer one of the flight, whatever it says of itself.
+_DIVERGED_FRACTION, _DIVERGED_M, _DIVERGED_DEG = 0.05, 0.5, 15.0
+
+
+@dataclass(frozen=True, slots=True)
+class Setup:
+    """What every trial flies through: an installed flight, EuRoC's camera and IMU noise, and what is tracked.
+
+    ``pixel_sigma`` px is the noise of an observation, ``outlier_ratio`` the chance that one is 5 to 30 px off. Raises
+    :class:`ConfigError` for values that make no flight.
+    """
+
+    flight: str = "figure_eight"
+    duration_s: float = 60.0
+    pixel_sigma: float = 1.0
+    outlier_ratio: float = 0.0
+    max_points: int = 150
+
+    def __post_init__(self) -> None:
+        # Written so that NaN fails.
+        if not SHORTEST_S <= self.duration_s < np.inf:
+            raise ConfigError(f"a flight of {self.duration_s:g} s tells nothing; give at least {SHORTEST_S:g} s")
+        if not 0.0 <= self.pixel_sigma < np.inf:
+            raise ConfigError(f"the pixels' noise cannot be {self.pixel_sigma:g} px; give 0 or more")
+        if not 0.0 <= self.outlier_ratio < 1.0:
+            raise ConfigError(f"the part of outliers cannot be {self.outlier_ratio:g}; give 0 or more, below 1")
+        if self.max_points < 1:
+            raise ConfigError(f"{self.max_points} landmarks are none to see; give at least 1")
+
+    def sequence(self, seed: int) -> TrackSequence:
+        """The flight with the noise of ``seed``."""
+        return simulated_sequence(
+            self.flight,
+            pixel_sigma=self.pixel_sigma,
+            seed=seed,
+            duration_s=self.duration_s,
+            outlier_ratio=self.outlier_ratio,
+            max_points=self.max_points,
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Contender:
+    """A back-end by name with its options; ``label`` is what tables call it."""
+
+    backend: str
+    options: Mapping[str, Any] = field(default_factory=dict)
+    label: str = ""
+
+    @property
+    def name(self) -> str:
+        return self.label or self.backend
+
+
+@dataclass(frozen=True, slots=True)
+class _Job:
+    setup: Setup
+    contender: Contender
+    seed: int
+
+
+def run_montecarlo(
+    setups: Sequence[Setup],
+    contenders: Sequence[Contender],
+    seeds: int,
+    *,
+    workers: int = 1,
+    on_trial: Callable[[Trial], None] = lambda trial: None,
+) -> list[Outcome]:
+    """Every contender on every setup with seeds 0 to ``seeds`` - 1; the results do not depend on ``workers``.
+
+    ``on_trial`` is called with each trial as it comes. Raises :class:`ConfigError` or :class:`PluginError` before the
+    first trial where a flight, a back-end or an option does not exist.
+    """
+    if seeds < 1 or workers < 1:
+        raise ConfigError(f"needs at least one seed and one worker, got {seeds} and {workers}")
+    calibration = packaged_calibration("euroc")
+    for setup in setups:
+        named_flight(setup.flight, setup.duration_s, calibration.R_BC)
+    for contender in contenders:
+        # Creating one also compiles its kernels, which the workers would do all at once.
+        _installed().create_backend(contender.backend, calibration, contender.options)
+    cases = list(product(setups, contenders))
+    jobs = [_Job(setup, contender, seed) for setup, contender in cases for seed in range(seeds)]
+    trials = map_in_processes(_fly_job, jobs, workers, on_trial)
+    return [
+        Outcome(
+            contender.name,
+            contender.backend,
+            dict(contender.options),
+            asdict(setup),
+            tuple(trials[k * seeds : (k + 1) * seeds]),
+        )
+        for k, (setup, contender) in enumerate(cases)
+    ]
+
+
+def fly(setup: Setup, contender: Contender, seed: int) -> Trial:
+    """One trial, on one core. What the back-end raises is a failure of the trial, not of the campaign."""
+    from threadpoolctl import threadpool_limits
+
+    sequence = setup.sequence(seed)
+    backend = _installed().create_backend(contender.backend, sequence.calibration, contender.options)
+    # Small matrices; and sums in another order would be other results.
+    with threadpool_limits(1):
+        try:
+            run = run_backend(sequence, backend)
+        except Exception as error:
+            if isinstance(error.__cause__, KeyboardInterrupt):
+                raise KeyboardInterrupt from error  # Ctrl-C within compiled code
+            return Trial(seed, setup.flight, contender.name, "crashed", registry.describe(error))
+        return judge(sequence, run, seed, contender.name)
+
+
+def judge(sequence: TrackSequence, run: BackendRun, seed: int, backend: str) -> Trial:
+    """What ``run`` amounts to against the truth of ``sequence``."""
+    events = [event for estimate in run.estimates for event in estimate.events]
+    if not run.states:
+        return Trial(seed, sequence.name, backend, "never initialised", events[-1] if events else "")
+    try:
+        row = backend_row(sequence, run)
+        t_ns, values = relative_nees(run, sequence.ground_truth)
+    except (TrajectoryError, np.linalg.LinAlgError) as error:
+        return Trial(seed, sequence.name, backend, "diverged", str(error))
+    figures = {k: v for k, v in row.items() if k not in ("sequence", "nees", "stage_ms")}
+    figures["judged"] = len(t_ns) / len(run.states)
+    too_far = row["ate_m"] > max(_DIVERGED_M, _DIVERGED_FRACTION * row["path_m"])
+    if too_far or row["orientation_deg"] > _DIVERGED_DEG:
+        detail = f"ends with {row['ate_m']:.3g} m and {row['orientation_deg']:.3g} deg RMSE"
+        return Trial(seed, sequence.name, backend, "diverged", detail, figures, t_ns, values)
+    lost = [event for event in events if event.startswith("lost")]
+    return Trial(seed, sequence.name, backend, None, "; ".join(lost), figures, t_ns, values)
+
+
+def relative_nees(run: BackendRun, truth: Trajectory) -> tuple[Any, Mapping[str, Any]]:
+    """Stamps (N,) ns and NEES (N,) by part of the pose, each stretch of tracking in the gauge of its own first pose.
+
+    A filter counts its uncertainty of position and yaw from where it began, and begins anew where it was lost.
+    """
+    found = [nees(align_first(piece, true).apply(piece), true) for piece, true in _against(run, truth)]
+    pieces = [each for each in found if each]
+    t_ns = np.concatenate([[], *(each[0].t_ns for each in pieces)]).astype(np.int64)
+    return t_ns, {
+        part: np.concatenate([[], *(n.values for each in pieces for n in each if n.part == part)]) for part in PARTS
+    }
+
+
+def _against(run: BackendRun, truth: Trajectory) -> list[tuple[Trajectory, Trajectory]]:
+    return [(piece, truth.at(piece.t_ns)) for piece in run.stretches]
+
+
+def _fly_job(job: _Job) -> Trial:
+    return fly(job.setup, job.contender, job.seed)
+
+
+@cache
+def _installed() -> registry.Registry:
+    """Loaded once in each process."""
+    return registry.load()

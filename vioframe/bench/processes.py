@@ -1,0 +1,64 @@
+"""Jobs spread over processes, as parallel Python must be where each job keeps one core busy."""
+
+from __future__ import annotations
+
+import os
+import signal
+from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from multiprocessing import active_children, get_context
+from typing import TypeVar
+
+from vioframe.errors import RunError
+
+JobT = TypeVar("JobT")
+ResultT = TypeVar("ResultT")
+
+
+def usable_cores() -> int:
+    """Cores that this process may run on, which can be fewer than the machine has."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def map_in_processes(
+    function: Callable[[JobT], ResultT],
+    jobs: Sequence[JobT],
+    workers: int,
+    on_result: Callable[[ResultT], None] = lambda result: None,
+) -> list[ResultT]:
+    """``function`` of each job, in the order of ``jobs``, by at most ``workers`` processes; one worker is this process.
+
+    ``on_result`` is called here with each result as it comes. The first error of a job, and Ctrl-C, ends them all.
+    Raises :class:`RunError` where a process dies.
+    """
+    if workers == 1:
+        results = []
+        for job in jobs:
+            results.append(function(job))
+            on_result(results[-1])
+        return results
+    others = set(active_children())
+    # Spawned, not forked: a fork copies the locks of threads (BLAS, the progress bar) that do not exist in the copy.
+    pool = ProcessPoolExecutor(min(workers, len(jobs)), get_context("spawn"), initializer=_leave_interrupts_to_parent)
+    try:
+        futures = {pool.submit(function, job): i for i, job in enumerate(jobs)}
+        by_index = {}
+        for future in as_completed(futures):
+            by_index[futures[future]] = future.result()
+            on_result(by_index[futures[future]])
+        return [by_index[i] for i in range(len(jobs))]
+    except BrokenProcessPool as error:
+        raise RunError("a worker process died, killed or short of memory; try again with fewer --workers") from error
+    except BaseException:
+        pool.shutdown(wait=False, cancel_futures=True)
+        for child in set(active_children()) - others:
+            child.terminate()
+        raise
+    finally:
+        pool.shutdown()
+
+
+def _leave_interrupts_to_parent() -> None:
+    # Ctrl-C reaches every process of the terminal; one that says so is enough.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
