@@ -39,19 +39,22 @@ POSE_COV_COLUMNS = ("t_ns", *(f"c{i}{j}" for i in range(6) for j in range(i, 6))
 _UPPER = np.triu_indices(6)
 
 
-def check_run_folder(path: Path, *, overwrite: bool = False) -> None:
-    """Raise :class:`RunError` where no run may be written to ``path``: only a run is ever replaced, and on request."""
+def check_run_folder(path: Path, *, overwrite: bool = False, marker: str = "summary.json") -> None:
+    """Raise :class:`RunError` where no run may be written to ``path``: only a run is ever replaced, and on request.
+
+    ``marker`` is the file by which a folder of that kind is known.
+    """
     if not path.exists() or (path.is_dir() and not any(path.iterdir())):
         return
     if not overwrite:
         raise RunError(f"{path} exists already; choose another --out or pass --overwrite")
-    if not (path / "summary.json").is_file():
-        raise RunError(f"{path} is not a run folder and is not overwritten; choose another --out")
+    if not (path / marker).is_file():
+        raise RunError(f"{path} holds no {marker}, is not a run folder and is not overwritten; choose another --out")
 
 
-def new_run_folder(path: Path, *, overwrite: bool = False) -> None:
+def new_run_folder(path: Path, *, overwrite: bool = False, marker: str = "summary.json") -> None:
     """Create the folder ``path``, in place of the run that is there if ``overwrite``."""
-    check_run_folder(path, overwrite=overwrite)
+    check_run_folder(path, overwrite=overwrite, marker=marker)
     try:
         if path.exists():
             shutil.rmtree(path)

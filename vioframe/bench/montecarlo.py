@@ -7,15 +7,15 @@ initialises, diverges or crashes is kept and says so. What the NEES of many tria
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from functools import cache
 from itertools import product
-from typing import Any
 
 import numpy as np
 
 from vioframe import registry
 from vioframe.bench.consistency import PARTS, Outcome, Trial
+from vioframe.bench.contenders import Contender
 from vioframe.bench.processes import map_in_processes
 from vioframe.bench.results import backend_row
 from vioframe.bench.run import BackendRun, run_backend
@@ -26,6 +26,7 @@ from vioframe.simulation.flights import flight as named_flight
 from vioframe.trajectory import Trajectory
 from vioframe.trajectory.alignment import align_first
 from vioframe.trajectory.nees import nees
+from vioframe.types import Float, Int
 
 SHORTEST_S = 10.0
 """A shorter flight is over before it tells anything: initialisation alone takes one to four seconds of motion."""
@@ -72,19 +73,6 @@ class Setup:
 
 
 @dataclass(frozen=True, slots=True)
-class Contender:
-    """A back-end by name with its options; ``label`` is what tables call it."""
-
-    backend: str
-    options: Mapping[str, Any] = field(default_factory=dict)
-    label: str = ""
-
-    @property
-    def name(self) -> str:
-        return self.label or self.backend
-
-
-@dataclass(frozen=True, slots=True)
 class _Job:
     setup: Setup
     contender: Contender
@@ -101,17 +89,9 @@ def run_montecarlo(
 ) -> list[Outcome]:
     """Every contender on every setup with seeds 0 to ``seeds`` - 1; the results do not depend on ``workers``.
 
-    ``on_trial`` is called with each trial as it comes. Raises :class:`ConfigError` or :class:`PluginError` before the
-    first trial where a flight, a back-end or an option does not exist.
+    ``on_trial`` is called with each trial as it comes. Raises what :func:`check_montecarlo` does.
     """
-    if seeds < 1 or workers < 1:
-        raise ConfigError(f"needs at least one seed and one worker, got {seeds} and {workers}")
-    calibration = packaged_calibration("euroc")
-    for setup in setups:
-        named_flight(setup.flight, setup.duration_s, calibration.R_BC)
-    for contender in contenders:
-        # Creating one also compiles its kernels, which the workers would do all at once.
-        _installed().create_backend(contender.backend, calibration, contender.options)
+    check_montecarlo(setups, contenders, seeds, workers)
     cases = list(product(setups, contenders))
     jobs = [_Job(setup, contender, seed) for setup, contender in cases for seed in range(seeds)]
     trials = map_in_processes(_fly_job, jobs, workers, on_trial)
@@ -125,6 +105,18 @@ def run_montecarlo(
         )
         for k, (setup, contender) in enumerate(cases)
     ]
+
+
+def check_montecarlo(setups: Sequence[Setup], contenders: Sequence[Contender], seeds: int, workers: int) -> None:
+    """Raise :class:`ConfigError` or :class:`PluginError` for what can be told before the first trial."""
+    if seeds < 1 or workers < 1:
+        raise ConfigError(f"needs at least one seed and one worker, got {seeds} and {workers}")
+    calibration = packaged_calibration("euroc")
+    for setup in setups:
+        named_flight(setup.flight, setup.duration_s, calibration.R_BC)
+    for contender in contenders:
+        # Creating one also compiles its kernels, which the workers would do all at once.
+        _installed().create_backend(contender.backend, calibration, contender.options)
 
 
 def fly(setup: Setup, contender: Contender, seed: int) -> Trial:
@@ -151,7 +143,8 @@ def judge(sequence: TrackSequence, run: BackendRun, seed: int, backend: str) -> 
         return Trial(seed, sequence.name, backend, "never initialised", events[-1] if events else "")
     try:
         row = backend_row(sequence, run)
-        t_ns, values = relative_nees(run, sequence.ground_truth)
+        stamps, values = nees_by_stretch(run, sequence.ground_truth)
+        t_ns = stamps - run.t_ns[0]
     except (TrajectoryError, np.linalg.LinAlgError) as error:
         return Trial(seed, sequence.name, backend, "diverged", str(error))
     figures = {k: v for k, v in row.items() if k not in ("sequence", "nees", "stage_ms")}
@@ -164,7 +157,7 @@ def judge(sequence: TrackSequence, run: BackendRun, seed: int, backend: str) -> 
     return Trial(seed, sequence.name, backend, None, "; ".join(lost), figures, t_ns, values)
 
 
-def relative_nees(run: BackendRun, truth: Trajectory) -> tuple[Any, Mapping[str, Any]]:
+def nees_by_stretch(run: BackendRun, truth: Trajectory) -> tuple[Int, Mapping[str, Float]]:
     """Stamps (N,) ns and NEES (N,) by part of the pose, each stretch of tracking in the gauge of its own first pose.
 
     A filter counts its uncertainty of position and yaw from where it began, and begins anew where it was lost.
