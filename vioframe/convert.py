@@ -84,7 +84,7 @@ def convert(
         if format == "asl":
             write_calibration(calibration, unfinished / "mav0")
         else:
-            _replace_sidecar(calibration, destination)
+            write_sidecar(calibration, destination)
     return counts
 
 
@@ -104,25 +104,31 @@ def _write(measurements: Iterable[Measurement], writer: RecordingWriter) -> Conv
 
 
 @contextmanager
-def appearing(destination: Path) -> Iterator[Path]:
-    """A place of the same name to write to, moved to ``destination`` if all goes well and removed if not."""
-    if destination.exists():
+def appearing(destination: Path, *, replace: bool = False) -> Iterator[Path]:
+    """A place of the same name to write to, moved to ``destination`` if all goes well and removed if not.
+
+    Raises :class:`~vioframe.errors.DatasetError` where it cannot be written, or exists and is not to be replaced.
+    """
+    if destination.exists() and not replace:
         raise DatasetError(f"{destination} exists already; remove it or choose another name")
     workspace = destination.with_name(f".{destination.name}.unfinished")
     try:
         shutil.rmtree(workspace, ignore_errors=True)
         workspace.mkdir(parents=True)
         yield workspace / destination.name
-        (workspace / destination.name).rename(destination)
+        if destination.is_dir():
+            shutil.rmtree(destination)
+        (workspace / destination.name).replace(destination)
     except OSError as err:
         raise DatasetError(f"cannot write {destination}: {err.strerror or err}") from err
     finally:
         shutil.rmtree(workspace, ignore_errors=True)
 
 
-def _replace_sidecar(calibration: Calibration, destination: Path) -> None:
-    """Written before the recording appears, so that none ever stands without its calibration."""
-    sidecar = sidecar_folder(destination)
-    shutil.rmtree(sidecar, ignore_errors=True)
-    with appearing(sidecar) as unfinished:
+def write_sidecar(calibration: Calibration, recording: Path) -> None:
+    """Calibration files beside ``recording``, in place of any there.
+
+    To be written before the recording appears, so that none ever stands without its calibration.
+    """
+    with appearing(sidecar_folder(recording), replace=True) as unfinished:
         write_calibration(calibration, unfinished)

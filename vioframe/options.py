@@ -117,6 +117,11 @@ def plugin_factory(build: Callable[..., PartT], options_type: type) -> Callable[
     return factory
 
 
+def summary_of(factory: object) -> str:
+    """The first paragraph of a part's docstring, in one line."""
+    return " ".join((inspect.getdoc(factory) or "").partition("\n\n")[0].split())
+
+
 def did_you_mean(name: str, known: Iterable[str]) -> str:
     """``" (did you mean 'orb'?)"``, or nothing where no known name is near."""
     near = get_close_matches(name, list(known), n=1)

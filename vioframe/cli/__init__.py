@@ -18,6 +18,8 @@ _COMMANDS = {
     "view": "Show runs in three dimensions, in a window or as a picture.",
     "plugins": "List the detectors, back-ends and readers, or the options of one.",
     "config": "Print a complete configuration, or check a file.",
+    "simulate": "Render a flight and write it as a recording with exact truth.",
+    "montecarlo": "Fly many simulated flights: accuracy and consistency of back-ends.",
     "convert": "Convert a recording: ASL folder, ROS 1 bag, ROS 2 bag, MCAP.",
 }
 """Sub-commands and their short help, kept here so that ``vioframe --help`` needs none of their modules."""

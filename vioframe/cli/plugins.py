@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
-
 import click
 from rich.console import Console
 from rich.table import Table
@@ -11,7 +9,7 @@ from rich.text import Text
 
 from vioframe import registry
 from vioframe.errors import PluginError
-from vioframe.options import REQUIRED, did_you_mean
+from vioframe.options import REQUIRED, did_you_mean, summary_of
 
 
 @click.command("plugins")
@@ -36,7 +34,9 @@ def _list(console: Console, installed: registry.Registry) -> None:
     for kind in registry.KINDS:
         for name in installed.names(kind):
             part = installed.find(kind, name)
-            table.add_row(kind.name, name, part.source.distribution, part.source.version, Text(_summary(part.factory)))
+            table.add_row(
+                kind.name, name, part.source.distribution, part.source.version, Text(summary_of(part.factory))
+            )
     console.print(table)
     if installed.failures:
         failed = _table("failed to load", "distribution", "version", "why")
@@ -47,7 +47,7 @@ def _list(console: Console, installed: registry.Registry) -> None:
 
 
 def _show(console: Console, part: registry.Part) -> None:
-    console.print(Text(f"{part}: {_summary(part.factory)}"))
+    console.print(Text(f"{part}: {summary_of(part.factory)}"))
     if not part.options:
         console.print("It has no options.")
         return
@@ -63,7 +63,3 @@ def _table(*columns: str) -> Table:
     for column in columns:
         table.add_column(column, overflow="fold")
     return table
-
-
-def _summary(factory: object) -> str:
-    return " ".join((inspect.getdoc(factory) or "").partition("\n\n")[0].split())

@@ -1,0 +1,205 @@
+"""Rendered images: geometry to a tenth of a pixel, light as asked for, and the same bytes every time."""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from simulation_helpers import small_calibration
+
+from vioframe.calibration import packaged_calibration
+from vioframe.errors import ConfigError
+from vioframe.geometry import so3
+from vioframe.geometry.cameras import Camera
+from vioframe.simulation.camera import Shot, SimulatedCamera, Studio, take_pictures
+from vioframe.simulation.movers import draw_movers
+from vioframe.simulation.renderer import Renderer
+from vioframe.simulation.textures import SIZE, images_as_textures, procedural_textures
+from vioframe.simulation.world import MeshBuilder, MeshWorld
+
+pytest.importorskip("open3d", exc_type=ImportError)
+
+EUROC = packaged_calibration("euroc").camera
+FISHEYE = Camera(230.0, 229.0, 370.0, 236.0, (-0.01, 0.03, -0.02, 0.004), (752, 480), "equidistant")
+BLACK, WHITE = (np.full((8, 8), value, np.uint8) for value in (40, 220))
+SQUARE_M = 0.3
+
+
+def board(columns: int = 12, rows: int = 8) -> MeshWorld:
+    """A chequerboard in the plane z = 0, its centre in the origin, each square a face of its own."""
+    builder = MeshBuilder()
+    for i in range(columns):
+        for j in range(rows):
+            corner = SQUARE_M * np.array([i - columns / 2, j - rows / 2, 0.0])
+            x, y = SQUARE_M * np.eye(3)[:2]
+            builder.quad(corner, x, y, (i + j) % 2, 1.0, np.zeros(2))
+    return MeshWorld(builder.build(), (BLACK, WHITE))
+
+
+@pytest.mark.parametrize("camera", [EUROC, FISHEYE], ids=["radtan", "equidistant"])
+@pytest.mark.parametrize("seed", range(4))
+def test_a_vertex_is_drawn_where_it_projects_to(camera, seed):
+    rng = np.random.default_rng(seed)
+    world = board()
+    R_WC = so3.exp(rng.normal(0.0, 0.25, 3))
+    p_WC = R_WC @ np.append(rng.normal(0.0, 0.2, 2), rng.uniform(-2.2, -1.5))
+    image = SimulatedCamera(Studio(camera, world)).take(Shot(R_WC[None], p_WC[None], None, 1.0, (0,)))
+
+    inner = np.array([[i, j, 0.0] for i in range(-5, 6) for j in range(-3, 4)]) * SQUARE_M
+    p_CF = (inner - p_WC) @ R_WC
+    # The corner finder needs a few pixels of each square.
+    xy = camera.project(p_CF)[p_CF[:, 2] > 0.5]
+    xy = xy[camera.contains(xy, border_px=25.0)]
+    assert len(xy) > 20
+    stop = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 100, 1e-4)
+    drawn = cv2.cornerSubPix(image, np.ascontiguousarray(xy, np.float32)[:, None].copy(), (5, 5), (-1, -1), stop)[:, 0]
+    assert np.linalg.norm(drawn - xy, axis=1).max() < 0.1
+    assert np.abs((drawn - xy).mean(axis=0)).max() < 0.02
+
+
+def test_light_is_that_of_the_texture_and_of_the_surface():
+    """Straight on, a white wall is as bright everywhere; what is beyond it is grey."""
+    renderer = Renderer(small_calibration().camera, board())
+    light = renderer.render(np.eye(3), np.array([0.0, 0.0, -1.0]))
+    levels = np.unique(np.round(light[40:80, 60:120], 3))
+    assert levels[-1] / levels[0] == pytest.approx(220 / 40, rel=0.02)
+    away = renderer.render(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, -1.0]))
+    assert np.ptp(away) == 0.0
+
+
+def test_far_textures_do_not_alias():
+    """A texture of stripes finer than a pixel is seen as its mean."""
+    stripes = np.tile(np.array([[0, 255]], np.uint8), (64, 32))
+    builder = MeshBuilder()
+    builder.quad(np.array([-20.0, -20.0, 0.0]), *(40.0 * np.eye(3)[:2]), 0, 0.5, np.zeros(2))
+    renderer = Renderer(small_calibration().camera, MeshWorld(builder.build(), (stripes,)))
+    light = renderer.render(np.eye(3), np.array([0.0, 0.0, -8.0]))
+    assert light[30:90, 50:140].std() < 0.01 * light[30:90, 50:140].mean()
+
+
+def test_fog_and_contrast():
+    camera, pose = small_calibration().camera, (np.eye(3), np.array([0.0, 0.0, -2.0]))
+    centre = np.s_[50:70, 80:110]
+    clear = Renderer(camera, board()).render(*pose)[centre]
+    foggy = Renderer(camera, board(), fog_per_m=0.5).render(*pose)[centre]
+    # Two metres of air that loses a factor e each: Koschmieder's law.
+    assert np.ptp(foggy) / np.ptp(clear) == pytest.approx(np.exp(-1.0), rel=0.02)
+    plain = Renderer(camera, board(), contrast=0.0).render(*pose)[centre]
+    np.testing.assert_allclose(plain, clear, atol=1e-6)  # these textures have nothing but their means
+    textured = procedural_textures(np.random.default_rng(0), 1)
+    world = MeshWorld(board().mesh, (*textured, *textured))
+    spread = [Renderer(camera, world, contrast=c).render(*pose)[centre].std() for c in (1.0, 0.25)]
+    assert spread[1] / spread[0] == pytest.approx(0.25, rel=0.05)
+
+
+def shots(count: int, instants: int = 1) -> list[Shot]:
+    R = np.stack([so3.exp([0.0, 0.02 * k, 0.0]) for k in range(instants)])
+    return [Shot(R, np.tile([0.0, 0.1 * k, -2.0], (instants, 1)), None, 1.0, (1, k)) for k in range(count)]
+
+
+def test_the_number_of_processes_makes_no_difference():
+    studio = Studio(small_calibration().camera, board(), noise_deviation=0.05)
+    alone, together = (list(take_pictures(studio, shots(11), workers)) for workers in (1, 2))
+    assert len(alone) == len(together) == 11
+    assert all(np.array_equal(a, b) for a, b in zip(alone, together, strict=True))
+    assert not np.array_equal(alone[0], alone[1])
+
+
+def test_noise_is_as_strong_as_asked_and_gain_saturates():
+    grey = np.full((8, 8), 110, np.uint8)
+    studio = Studio(small_calibration().camera, MeshWorld(board().mesh, (grey, grey)))
+    (shot,) = shots(1)
+    inside = np.s_[40:80, 60:130]
+    clean = SimulatedCamera(studio).take(shot)[inside].astype(float)
+    noisy = SimulatedCamera(replace(studio, noise_deviation=0.05)).take(shot)[inside].astype(float)
+    assert (noisy - clean).std() == pytest.approx(0.05 * 255, rel=0.1)
+    assert abs((noisy - clean).mean()) < 1.0
+    dark = SimulatedCamera(replace(studio, light=0.03)).take(shot)[inside].astype(float)
+    assert dark.mean() == pytest.approx(clean.mean(), abs=2.0)
+    assert (dark - clean).std() > 8.0
+    assert (SimulatedCamera(studio).take(replace(shot, gain=8.0))[inside] == 255).all()
+
+
+def test_blur_is_the_mean_over_the_exposure():
+    studio = Studio(small_calibration().camera, board())
+    sharp = [
+        SimulatedCamera(studio).take(replace(s, R_WC=R[None], p_WC=s.p_WC[:1])) for s in shots(1, 4) for R in s.R_WC
+    ]
+    (blurred,) = take_pictures(studio, shots(1, 4), 1)
+    np.testing.assert_allclose(blurred, np.mean(sharp, axis=0), atol=1.0)
+
+
+def test_a_rolling_shutter_sees_every_row_from_its_own_pose():
+    camera = small_calibration().camera
+    height = camera.resolution[1]
+    studio = Studio(camera, board())
+    R_rows = so3.exp(np.column_stack([np.zeros(height), np.linspace(-0.1, 0.1, height), np.zeros(height)]))
+    p_rows = np.tile([0.0, 0.0, -2.0], (height, 1))
+    (rolled,) = take_pictures(studio, [Shot(R_rows[None], p_rows[None], None, 1.0, (0,))], 1)
+    for row in (10, 60, 110):
+        still = SimulatedCamera(studio).take(Shot(R_rows[row][None], p_rows[row][None], None, 1.0, (0,)))
+        # But for where surfaces meet: which pixels those are depends on the rows beside it.
+        assert np.mean(rolled[row] != still[row]) < 0.2
+        assert not np.array_equal(rolled[row], SimulatedCamera(studio).take(shots(1)[0])[row]) or row == 60
+
+
+def test_moving_boxes_hide_what_is_behind_them_and_keep_clear_of_the_flight():
+    rng, t_s = np.random.default_rng(2), np.linspace(0.0, 10.0, 200)
+    path = np.column_stack([np.sin(t_s), np.cos(t_s), np.zeros(200)])
+    movers = draw_movers(8, t_s, path, 2, rng)
+    assert movers.centre_W.shape == (8, 3)
+    places = movers.at(t_s)
+    assert np.linalg.norm(places - path[:, None], axis=2).min() > 1.2
+    assert np.ptp(places, axis=0).max() > 1.0
+
+    camera, world = small_calibration().camera, board()
+    renderer = Renderer(camera, world, movers)
+    pose = np.eye(3), np.array([0.0, 0.0, -2.0])
+    empty = renderer.render(*pose)
+    np.testing.assert_array_equal(empty, Renderer(camera, world).render(*pose))
+    near, behind = np.full((8, 3), 50.0), np.full((8, 3), 50.0)
+    near[0], behind[0] = (0.0, 0.0, -1.0), (0.0, 0.0, 3.0)
+    assert np.mean(renderer.render(*pose, near) != empty) > 0.02
+    np.testing.assert_array_equal(renderer.render(*pose, behind)[30:90, 50:140], empty[30:90, 50:140])
+
+
+def test_textures_are_the_same_for_the_same_seed_and_have_detail_at_every_scale():
+    first, again, other = (procedural_textures(np.random.default_rng(seed), 4) for seed in (5, 5, 6))
+    for a, b, c in zip(first, again, other, strict=True):
+        assert np.array_equal(a, b)
+        assert not np.array_equal(a, c)
+        for _ in range(5):
+            assert len(cv2.goodFeaturesToTrack(a, 500, 0.02, 5)) > 20
+            a = cv2.resize(a, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+
+
+def test_ones_own_images_are_textures_without_a_seam(tmp_path):
+    ramp = np.tile(np.linspace(0, 255, 300).astype(np.uint8), (200, 1))
+    cv2.imwrite(str(tmp_path / "ramp.png"), ramp)
+    (tmp_path / "notes.txt").write_text("no image")
+    (tmp_path / "broken.jpg").write_bytes(b"no image either")
+    (texture,) = images_as_textures(tmp_path, np.random.default_rng(0), 16)
+    assert texture.shape == (SIZE, SIZE)
+    assert np.abs(texture[:, 0].astype(int) - texture[:, -1]).max() <= 1
+    (tmp_path / "ramp.png").unlink()
+    with pytest.raises(ConfigError, match="no image that can be read"):
+        images_as_textures(tmp_path, np.random.default_rng(0), 16)
+
+
+@pytest.mark.parametrize(
+    ("change", "problem"),
+    [
+        ({"textures": (BLACK, np.zeros((8, 4), np.uint8))}, "square"),
+        ({"textures": (BLACK, np.zeros((12, 12), np.uint8))}, "power of two"),
+        ({"textures": (BLACK,)}, "texture 1 of 1"),
+        ({"textures": ()}, "square"),
+    ],
+)
+def test_a_world_that_cannot_be_drawn_is_refused(change, problem):
+    with pytest.raises(ConfigError, match=problem):
+        replace(board(), **change)
+    mesh = board().mesh
+    with pytest.raises(ConfigError, match="not finite"):
+        MeshWorld(replace(mesh, corners=np.full_like(mesh.corners, np.nan)), (BLACK, WHITE))
+    with pytest.raises(ConfigError, match="arrays"):
+        MeshWorld(replace(mesh, uv=mesh.uv[:1]), (BLACK, WHITE))

@@ -1,0 +1,100 @@
+"""What is to be simulated: YAML in, a frozen and validated :class:`SimulationConfig` out."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from io import StringIO
+from pathlib import Path
+from typing import Annotated, Any, Self
+
+from pydantic import Field, model_validator
+from pydantic_core import to_jsonable_python
+from ruamel.yaml import YAML
+
+from vioframe.config import PartConfig, Section, parse_assignments, read_tree, validate
+from vioframe.options import Option, options_of, validate_options
+from vioframe.registry import FLIGHT, WORLD, Registry
+from vioframe.simulation.conditions import Conditions
+from vioframe.simulation.imu import ImuErrors
+
+
+class SimulationConfig(Section):
+    """Everything that determines a simulated recording.
+
+    The motion is a ``flight`` by name, the file ``trajectory``, or that of the EuRoC sequence ``recorded``, whose
+    readings of the IMU are then taken as they are. ``made`` is what came of it, in a manifest; nothing reads it.
+    """
+
+    flight: PartConfig = PartConfig(name="figure_eight")
+    trajectory: Path | None = None
+    recorded: Path | None = None
+    start_s: Annotated[float, Field(ge=0.0, allow_inf_nan=False)] = 0.0
+    duration_s: Annotated[float | None, Field(gt=0.0, allow_inf_nan=False)] = None
+    seed: Annotated[int, Field(ge=0)] = 0
+    frame_rate_hz: Annotated[float, Field(gt=0.0, le=1000.0)] = 20.0
+    imu_rate_hz: Annotated[float | None, Field(gt=0.0, le=10_000.0)] = None
+    exact_imu: bool = False
+    imu: dict[str, Any] = Field(default_factory=dict)
+    world: PartConfig = PartConfig(name="hall")
+    conditions: dict[str, float] = Field(default_factory=dict)
+    calibration: tuple[Path, ...] = ()
+    made: dict[str, Any] = Field(default_factory=dict)
+
+    @model_validator(mode="after")
+    def _goes_together(self) -> Self:
+        if self.trajectory is not None and self.recorded is not None:
+            raise ValueError("give a trajectory or a recorded sequence, not both")
+        if self.recorded is not None and (self.imu or self.exact_imu or self.imu_rate_hz is not None):
+            raise ValueError("the readings of a recorded sequence are taken as they are; leave the IMU's settings out")
+        if self.start_s and self.trajectory is None and self.recorded is None:
+            raise ValueError("start_s is for trajectories and recorded sequences; a flight begins at its beginning")
+        return self
+
+
+def read(path: Path) -> SimulationConfig:
+    """Read a configuration, or the manifest of a simulated recording; raises :class:`ConfigError`."""
+    return validate(SimulationConfig, read_tree(path), str(path))
+
+
+def override(config: SimulationConfig, registry: Registry, assignments: Iterable[str]) -> SimulationConfig:
+    """``config`` with options of the flight, the world or the IMU set from ``key=value`` texts."""
+    tree = config.model_dump()
+    for section, name, value in parse_assignments(assignments, _options_by_section(config, registry)):
+        values = tree["imu"] if section == "imu" else tree[section]["options"]
+        values[name] = value
+    return validate(SimulationConfig, tree, "command line")
+
+
+def complete(config: SimulationConfig, registry: Registry) -> SimulationConfig:
+    """``config`` with every option checked, coerced and its default filled in, and paths made absolute."""
+    Conditions.of(config.conditions)
+    parts: dict[str, Any] = {}
+    if config.recorded is None:
+        parts["imu"] = validate_options("the IMU", ImuErrors, config.imu)
+    if config.recorded is None and config.trajectory is None:
+        parts["flight"] = _completed(config.flight, registry, FLIGHT)
+    parts["world"] = _completed(config.world, registry, WORLD)
+    for name in ("trajectory", "recorded"):
+        path: Path | None = getattr(config, name)
+        parts[name] = path if path is None else path.absolute()
+    parts["calibration"] = tuple(path.absolute() for path in config.calibration)
+    return config.model_copy(update=parts)
+
+
+def render(config: SimulationConfig) -> str:
+    """``config`` as YAML; :func:`read` returns the same configuration."""
+    yaml, stream = YAML(typ="safe", pure=True), StringIO()
+    yaml.default_flow_style, yaml.width, yaml.sort_base_mapping_type_on_output = False, 110, False  # type: ignore[assignment]
+    yaml.dump(to_jsonable_python(config.model_dump()), stream)
+    return stream.getvalue()
+
+
+def _completed(part: PartConfig, registry: Registry, kind: Any) -> PartConfig:
+    return PartConfig(name=part.name, options=registry.find(kind, part.name).validate(part.options))
+
+
+def _options_by_section(config: SimulationConfig, registry: Registry) -> dict[str, list[Option]]:
+    sections = {"world": registry.find(WORLD, config.world.name).options, "imu": options_of(ImuErrors)}
+    if config.trajectory is None and config.recorded is None:
+        sections["flight"] = registry.find(FLIGHT, config.flight.name).options
+    return sections

@@ -1,0 +1,123 @@
+"""A simulated recording written to disk: bags and ASL folders, each with its manifest, its world and its truth."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import ExitStack
+from dataclasses import asdict
+from heapq import merge
+from pathlib import Path
+from typing import Any
+
+import vioframe
+from vioframe import machine
+from vioframe.calibration import write_calibration
+from vioframe.convert import FORMATS, appearing, format_of, write_sidecar
+from vioframe.errors import DatasetError
+from vioframe.simulation import config as configuration
+from vioframe.simulation.files import MANIFEST, TRUTH, WORLD, simulation_folder
+from vioframe.simulation.recording import SimulatedRecording
+from vioframe.simulation.world import write_mesh
+from vioframe.types import Calibration, Frame, ImuSample, Measurement, NavState
+from vioframe.writers import RecordingWriter, TruthFile
+
+
+def record(
+    recording: SimulatedRecording,
+    destinations: Sequence[Path],
+    *,
+    compression: str | None = None,
+    overwrite: bool = False,
+    on_frame: Callable[[Frame], None] = lambda frame: None,
+) -> None:
+    """Write ``recording`` to every destination, whose name tells its format; see :func:`vioframe.convert.format_of`.
+
+    Beside a bag go ``<bag>.calib`` and ``<bag>.simulation``, the folder of the manifest, the ground truth in EuRoC's
+    format and the mesh of the world; an ASL folder holds them itself. All appear once all are complete. Raises
+    :class:`DatasetError`, also where a destination exists and ``overwrite`` is not set.
+    """
+    check_destinations(destinations, compression, overwrite=overwrite)
+    with ExitStack() as stack:
+        begun = [(path, stack.enter_context(appearing(path, replace=overwrite))) for path in destinations]
+        _write(recording, [_open(path, unfinished, compression) for path, unfinished in begun], on_frame)
+        for path, unfinished in begun:
+            if format_of(path) == "asl":
+                write_calibration(recording.calibration, unfinished / "mav0")
+                _describe(recording, simulation_folder(unfinished))
+            else:
+                with appearing(simulation_folder(path), replace=True) as folder:
+                    _describe(recording, folder)
+                write_sidecar(recording.calibration, path)
+
+
+def check_destinations(destinations: Sequence[Path], compression: str | None, *, overwrite: bool) -> None:
+    """Raise :class:`DatasetError` where :func:`record` would not write to one of them."""
+    for path in destinations:
+        offered = FORMATS[format_of(path)].compressions
+        if compression is not None and compression not in offered and offered:
+            raise DatasetError(
+                f"{path.name} cannot be compressed by {compression}; choose one of: {', '.join(offered)}"
+            )
+        if path.exists() and not overwrite:
+            raise DatasetError(f"{path} exists already; choose another name or pass --overwrite")
+        if path.exists() and not simulation_folder(path).is_dir():
+            raise DatasetError(f"{path} was not written by the simulator and is not overwritten; choose another name")
+    if len({path.absolute() for path in destinations}) < len(destinations):
+        raise DatasetError("a destination is named twice")
+
+
+def _open(path: Path, unfinished: Path, compression: str | None) -> RecordingWriter:
+    format = FORMATS[format_of(path)]
+    return format.open(unfinished, compression if format.compressions else None)
+
+
+def _write(
+    recording: SimulatedRecording, writers: Sequence[RecordingWriter], on_frame: Callable[[Frame], None]
+) -> None:
+    with ExitStack() as stack:
+        for writer in writers:
+            stack.enter_context(writer)
+        measurements: Iterable[Measurement | NavState] = recording.measurements()
+        for item in merge(measurements, recording.truth, key=lambda item: item.t_ns):
+            for writer in writers:
+                if isinstance(item, Frame):
+                    writer.write_frame(item)
+                elif isinstance(item, ImuSample):
+                    writer.write_imu(item)
+                elif isinstance(item, NavState):
+                    writer.write_truth(item)
+            if isinstance(item, Frame):
+                on_frame(item)
+
+
+def _describe(recording: SimulatedRecording, folder: Path) -> None:
+    """The manifest, the truth and the world's mesh in a new ``folder``."""
+    folder.mkdir()
+    (folder / MANIFEST).write_text(_manifest(recording), encoding="utf-8")
+    write_mesh(recording.world.mesh, folder / WORLD)
+    truth = TruthFile(folder / TRUTH)
+    for state in recording.truth:
+        truth.write(state)
+    truth.close()
+
+
+def _manifest(recording: SimulatedRecording) -> str:
+    """The configuration that makes the recording again, and what came of it."""
+    made = {
+        "name": recording.name,
+        "frames": recording.frame_count,
+        "imu_samples": recording.imu_count,
+        "path_m": round(recording.ground_truth.path_length_m, 6),
+        "true_calibration": _plain(recording.true_calibration),
+        "calibration_told": _plain(recording.calibration),
+        "vioframe": vioframe.__version__,
+        "revision": machine.commit(Path(vioframe.__file__).parent),
+    }
+    heading = "# A simulated recording: `vioframe simulate --config FILE NAME` makes it again.\n"
+    return heading + configuration.render(recording.config.model_copy(update={"made": made}))
+
+
+def _plain(calibration: Calibration) -> dict[str, Any]:
+    tree = asdict(calibration)
+    tree["R_BC"], tree["p_BC"] = calibration.R_BC.tolist(), calibration.p_BC.tolist()
+    return tree
