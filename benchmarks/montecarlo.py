@@ -2,8 +2,8 @@
 
     python benchmarks/montecarlo.py [--record]
 
-Target: pose NEES per axis within 0.7 to 1.5, orientation RMSE at most 0.4 deg, position RMSE at most 0.25 % of the path,
-and an NEES far outside without first-estimate Jacobians. 25 flights of 60 s, EuRoC's noise, true calibration.
+Target: NEES per axis within 0.7 to 1.5, orientation RMSE at most 0.4 deg, position RMSE at most 0.25 % of the path, and
+an NEES far outside without first-estimate Jacobians. 25 flights of 60 s each, EuRoC's noise, true calibration.
 """
 
 from pathlib import Path

@@ -26,8 +26,8 @@ FAILURES = ("never initialised", "diverged", "crashed")
 class Trial:
     """One flight of one back-end. ``failure`` is one of :data:`FAILURES` or None, ``detail`` a line about it.
 
-    ``figures`` are empty where there is no estimate at all. ``nees`` (N,) is by part of the pose, at ``t_ns`` (N,) since
-    the first frame.
+    ``figures`` are empty where there is no estimate at all. ``nees`` (N,) is by part of the pose, at ``t_ns`` (N,)
+    since the first frame.
     """
 
     seed: int
