@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import signal
 from collections.abc import Callable, Sequence
@@ -40,7 +41,7 @@ def map_in_processes(
         return results
     others = set(active_children())
     # Spawned, not forked: a fork copies the locks of threads (BLAS, the progress bar) that do not exist in the copy.
-    pool = ProcessPoolExecutor(min(workers, len(jobs)), get_context("spawn"), initializer=_leave_interrupts_to_parent)
+    pool = ProcessPoolExecutor(min(workers, len(jobs)), get_context("spawn"), initializer=_leave_talking_to_parent)
     try:
         futures = {pool.submit(function, job): i for i, job in enumerate(jobs)}
         by_index = {}
@@ -59,6 +60,7 @@ def map_in_processes(
         pool.shutdown()
 
 
-def _leave_interrupts_to_parent() -> None:
-    # Ctrl-C reaches every process of the terminal; one that says so is enough.
+def _leave_talking_to_parent() -> None:
+    # Ctrl-C and a plug-in that does not load reach every process; one that says so is enough.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    logging.getLogger("vioframe").addHandler(logging.NullHandler())

@@ -1,0 +1,383 @@
+"""Monte Carlo: is the statistics right, is every failure shown, is the result the same on any number of processes?
+
+At the end, what the project promises of its own filter: as accurate as asked for, and honest about it.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from plugin_helpers import install
+from scipy.stats import chi2
+
+from vioframe import registry
+from vioframe.bench import run_backend
+from vioframe.bench.consistency import PARTS, Outcome, Trial, average_band
+from vioframe.bench.contenders import Contender, parse_contenders
+from vioframe.bench.montecarlo import Setup, _installed, nees_by_stretch, run_montecarlo
+from vioframe.bench.processes import usable_cores
+from vioframe.cli import main
+from vioframe.errors import ConfigError, PluginError
+from vioframe.geometry import so3
+from vioframe.simulation import simulated_sequence
+from vioframe.trajectory import evaluate
+from vioframe.trajectory.alignment import rotation_z
+from vioframe.types import Estimate, NavState, Status
+
+# Back-ends for a body at rest at the origin: they know the truth, and lie about it as told.
+PARTS_THAT_FAIL = """
+import os, time
+import numpy as np
+from vioframe.geometry import so3
+from vioframe.simulation.flights import levelled
+from vioframe.types import *
+
+def state(calibration, tracks, error, cov):
+    R_WB = levelled(calibration.R_BC) @ so3.exp(error[:3])
+    return NavState(tracks.t_ns, R_WB, error[3:6], np.zeros(3), np.zeros(3), np.zeros(3), cov)
+
+class Drawn:
+    "Draws its errors from the covariance it states, or from one larger by `error_factor`."
+    def __init__(self, calibration, *, error_factor: float = 1.0, pause_s: float = 0.0):
+        self.calibration, self.factor, self.pause_s, self.rng = calibration, error_factor, pause_s, None
+    def process(self, imu, tracks):
+        time.sleep(self.pause_s)
+        cov = np.diag(np.repeat([0.002, 0.01, 1.0, 1.0, 1.0], 3) ** 2)
+        if self.rng is None:
+            self.rng = np.random.default_rng(int(1e6 * tracks.xy.sum()))
+            return Estimate(Status.TRACKING, state(self.calibration, tracks, np.zeros(6), np.zeros((15, 15))))
+        error = self.factor * np.sqrt(np.diag(cov)[:6]) * self.rng.normal(size=6)
+        return Estimate(Status.TRACKING, state(self.calibration, tracks, error, cov))
+
+class Unlucky(Drawn):
+    "Each seed goes wrong in a way of its own."
+    def process(self, imu, tracks):
+        if not hasattr(self, 'fate'): self.fate = int(1e6 * tracks.xy.sum()) % 4
+        if self.fate == 0: return Estimate(Status.INITIALISING, events=("initialisation refused: fog",))
+        estimate = super().process(imu, tracks)
+        if self.fate == 1: estimate.state.p_WB[0] = 3.0 * (tracks.t_ns * 1e-9 - 1.0)
+        if self.fate == 2 and tracks.t_ns > 3 * 10**9: raise ZeroDivisionError("division by zero")
+        return estimate
+
+class Silent(Drawn):
+    "Knows no covariance."
+    def process(self, imu, tracks):
+        estimate = super().process(imu, tracks)
+        return Estimate(Status.TRACKING, state(self.calibration, tracks, np.zeros(6), None))
+
+class Deadly(Drawn):
+    "Takes its process down."
+    def process(self, imu, tracks): os._exit(1)
+
+@hookimpl
+def vioframe_backends():
+    return {"drawn": Drawn, "unlucky": Unlucky, "silent": Silent, "deadly": Deadly}
+"""
+
+
+@pytest.fixture
+def parts(tmp_path, monkeypatch):
+    """A working folder of its own, with the back-ends above installed."""
+    install(tmp_path / "site", monkeypatch, distribution="odd-parts", module="odd_parts", code=PARTS_THAT_FAIL)
+    monkeypatch.chdir(tmp_path)
+    _installed.cache_clear()
+    yield
+    _installed.cache_clear()
+
+
+def montecarlo(*arguments: object, code: int = 0):
+    command = ["montecarlo", "--duration", "10", "--flight", "standstill", "--quiet", *map(str, arguments)]
+    result = CliRunner().invoke(main, command, catch_exceptions=False)
+    assert result.exit_code == code, result.output
+    return result
+
+
+def results(folder: str) -> list[dict]:
+    """What was recorded, without what no two runs have in common."""
+    found = json.loads((Path(folder) / "montecarlo.json").read_text())["results"]
+    for case in found:
+        del case["cpu_ms"]
+        for trial in case["by_seed"]:
+            trial.pop("cpu_ms", None)
+    return found
+
+
+# The statistics
+
+
+def honest_outcome(trials: int, instants: int, factor: float = 1.0) -> Outcome:
+    """Trials that begin one instant after the other, with NEES drawn independently at each."""
+    rng = np.random.default_rng(1)
+    made = []
+    for seed in range(trials):
+        t_ns = np.arange(seed % 5, instants) * 50_000_000
+        nees = {part: factor * rng.chisquare(dof, len(t_ns)) for part, dof in PARTS.items()}
+        made.append(Trial(seed, "f", "b", None, "", {"ate_m": 1.0}, t_ns, nees))
+    return Outcome("b", "b", {}, {"flight": "f"}, tuple(made))
+
+
+def test_bounds_of_the_average_are_those_of_the_chi2_distribution():
+    assert average_band(6, 25) == pytest.approx(tuple(chi2.ppf([0.025, 0.975], 150) / 25))
+
+
+@pytest.mark.parametrize("part", PARTS)
+def test_an_honest_filter_is_within_its_bounds_at_95_percent_of_the_instants(part):
+    nees = honest_outcome(25, 2000).nees(part)
+    assert nees.trials[:6].tolist() == [5, 10, 15, 20, 25, 25]
+    assert nees.low[0] < nees.low[-1] < PARTS[part] < nees.high[-1] < nees.high[0]
+    assert nees.inside == pytest.approx(0.95, abs=0.015)
+    assert nees.per_axis == pytest.approx(1.0, abs=0.02)
+    assert nees.verdict == "consistent"
+
+
+@pytest.mark.parametrize(("factor", "verdict"), [(2.0, "overconfident"), (0.5, "pessimistic")])
+def test_a_wrong_covariance_is_called_so(factor, verdict):
+    for part in PARTS:
+        nees = honest_outcome(25, 200, factor).nees(part)
+        assert nees.verdict == verdict
+        assert nees.per_axis == pytest.approx(factor, rel=0.05)
+
+
+def test_each_flight_counts_once_however_long_it_was_tracked():
+    short = Trial(0, "f", "b", None, t_ns=np.arange(10), nees=dict.fromkeys(PARTS, np.full(10, 8.0)))
+    long = Trial(1, "f", "b", None, t_ns=np.arange(90), nees=dict.fromkeys(PARTS, np.full(90, 2.0)))
+    nees = Outcome("b", "b", {}, {"flight": "f"}, (short, long)).nees("pose")
+    assert nees.mean == 5.0
+    assert nees.values[[0, 9, 10, 89]].tolist() == [5.0, 5.0, 2.0, 2.0]
+    assert nees.trials[[9, 10]].tolist() == [2, 1]
+
+
+class Wanderer:
+    """Errors drawn from its covariance, in a world turned and moved; halfway it is lost and begins in another."""
+
+    def __init__(self, sequence, seed):
+        self.truth, self.rng, self.k = sequence.true_states, np.random.default_rng(seed), -1
+        A = np.random.default_rng(0).normal(size=(6, 6))
+        scale = np.diag(np.repeat([0.001, 0.01], 3))
+        self.cov = scale @ (A @ A.T + np.eye(6)) @ scale
+
+    def process(self, imu, tracks):
+        self.k += 1
+        half = len(self.truth) // 2
+        if self.k == half:
+            return Estimate(Status.LOST)
+        R, p = (rotation_z(2.0), np.array([5.0, 1.0, 0.3])) if self.k < half else (rotation_z(-0.7), np.ones(3))
+        first, cov = self.k in (0, half + 1), np.zeros((15, 15))
+        error = np.zeros(6)
+        if not first:
+            cov[:6, :6], error = self.cov, self.rng.multivariate_normal(np.zeros(6), self.cov)
+        true = self.truth[self.k]
+        # R_true = R_est Exp(dtheta) and p_true = p_est + dp, in the world of the estimate.
+        R_WB, p_WB = R @ true.R_WB @ so3.exp(-error[:3]), R @ true.p_WB + p - error[3:]
+        return Estimate(Status.TRACKING, NavState(tracks.t_ns, R_WB, p_WB, *np.zeros((3, 3)), cov))
+
+
+def test_nees_is_taken_in_the_gauge_of_each_stretchs_first_pose():
+    sequence = simulated_sequence("figure_eight", seed=0, duration_s=10.0, max_points=1)
+    found = []
+    for seed in range(20):
+        run = run_backend(sequence, Wanderer(sequence, seed))
+        assert [len(piece) for piece in run.stretches] == [100, 100]
+        t_ns, nees = nees_by_stretch(run, sequence.ground_truth)
+        assert len(t_ns) == 198
+        found.append([nees[part].mean() for part in PARTS])
+    assert np.mean(found, axis=0) == pytest.approx([3.0, 3.0, 6.0], rel=0.05)
+    # One alignment for all of it takes the second world for an error.
+    whole = {n.part: n.mean for n in evaluate(run.trajectory, sequence.ground_truth).nees}
+    assert whole["position"] > 1000.0
+
+
+# What is compared
+
+
+def test_contenders_share_options_and_have_their_own(parts):
+    installed = registry.load()
+    drawn, own, msckf = parse_contenders(
+        ["drawn", "drawn:error_factor=3,pause_s=0.1", "msckf"],
+        ["error_factor=2", "backend.max_clones=7"],
+        installed,
+    )
+    assert (drawn.name, drawn.options) == ("drawn", {"error_factor": 2.0, "pause_s": 0.0})
+    assert own.name == "drawn:error_factor=3,pause_s=0.1"
+    assert own.options == {"error_factor": 3.0, "pause_s": 0.1}
+    assert msckf.options["max_clones"] == 7
+    assert len(parse_contenders(["drawn", "drawn"], [], installed)) == 1
+
+
+@pytest.mark.parametrize(
+    ("arguments", "why"),
+    [
+        (["--backend", "msckff"], "no backend is called 'msckff' (did you mean 'msckf'?)"),
+        (["--flight", "figure_nine"], "figure_nine"),
+        (["--seeds", "0"], "at least one seed"),
+        (["--workers", "0"], "one worker"),
+        (["--duration", "2"], "a flight of 2 s tells nothing; give at least 10 s"),
+        (["--duration", "nan"], "a flight of nan s tells nothing"),
+        (["--pixel-sigma", "-1"], "cannot be -1 px"),
+        (["--outliers", "1"], "the part of outliers cannot be 1"),
+        (["--max-points", "0"], "0 landmarks"),
+        (["-o", "max_clone=5"], "no part has such an option (did you mean"),
+        (["-o", "max_features"], "-o takes key=value"),
+        (["-o", "frontend.max_points=5"], "no part has such an option"),
+        (["--backend", "msckf:max_clones=1"], "needs max_clones >= 3"),
+        (["--backend", "msckf:max_clones=many"], "should be a valid integer"),
+    ],
+)
+def test_bad_input_is_one_line(tmp_path, arguments, why):
+    result = montecarlo(*arguments, "--out", tmp_path / "out", code=2)
+    assert result.stderr.count("\n") == 1
+    assert why in result.stderr
+    assert not (tmp_path / "out").exists()
+
+
+def test_only_a_monte_carlo_is_replaced_and_only_on_request(parts):
+    for name in ("mine", "done"):
+        Path(name).mkdir()
+    Path("mine/thesis.txt").touch()
+    Path("done/montecarlo.json").touch()
+    Path("done/old.png").touch()
+    command = ["--backend", "drawn", "--seeds", "1", "--workers", "1", "--out"]
+    assert "exists already" in montecarlo(*command, "done", code=2).stderr
+    assert "is not overwritten" in montecarlo(*command, "mine", "--overwrite", code=2).stderr
+    montecarlo(*command, "done", "--overwrite")
+    assert {path.name for path in Path("done").iterdir()} == {
+        *("montecarlo.json", "nees.csv", "nees_standstill.png", "trials.png")
+    }
+
+
+# The command
+
+
+def test_results_do_not_depend_on_the_number_of_processes(parts):
+    command = ["--backend", "drawn", "--backend", "unlucky", "--seeds", "4", "--flight", "hover"]
+    for workers in (1, 2):
+        montecarlo(*command, "--workers", workers, "--out", f"by_{workers}")
+    assert results("by_1") == results("by_2")
+    assert Path("by_1/nees.csv").read_bytes() == Path("by_2/nees.csv").read_bytes()
+    assert len({json.dumps(trial["nees"]) for trial in results("by_1")[0]["by_seed"]}) == 4
+
+
+def test_the_table_says_who_is_honest(parts):
+    result = montecarlo("--backend", "drawn", "--backend", "drawn:error_factor=2", "--seeds", "6", "--workers", "1")
+    honest, liar = results("runs/montecarlo")
+    assert honest["nees"]["pose"]["verdict"] == "consistent"
+    assert honest["nees"]["pose"]["per_axis"] == pytest.approx(1.0, abs=0.05)
+    assert liar["nees"]["pose"]["per_axis"] == pytest.approx(4.0, abs=0.2)
+    lines = [line for line in result.stdout.splitlines() if line.strip().startswith(("orientation, ", "pose, "))]
+    assert len(lines) == 2
+    for line in lines:
+        assert "consistent" in line
+        assert "overconfident" in line
+    rows = np.genfromtxt("runs/montecarlo/nees.csv", delimiter=",", skip_header=1)
+    assert len(rows) == 2 * 200
+    assert (rows[:, 3] == 6).all()
+    assert rows[:200, 4].mean() == pytest.approx(honest["nees"]["orientation"]["mean"], rel=1e-4)
+
+
+def test_no_failure_is_dropped(parts):
+    result = montecarlo("--backend", "unlucky", "--seeds", "12", "--workers", "1", "--out", "out")
+    (case,) = results("out")
+    counts = case["failures"]
+    assert all(counts[kind] > 0 for kind in ("never initialised", "diverged", "crashed"))
+    assert case["trials"] == len(case["by_seed"]) == 12
+    assert f"{sum(counts.values())} (" in result.stdout
+    notes = result.stderr.splitlines()
+    assert len(notes) == sum(counts.values())
+    assert any("never initialised: initialisation refused: fog" in note for note in notes)
+    assert any("crashed: ZeroDivisionError: division by zero" in note for note in notes)
+    # One that diverged has figures, and they count.
+    diverged = [trial for trial in case["by_seed"] if trial["failure"] == "diverged"]
+    assert case["ate_m"] > 1.0
+    assert case["nees"]["position"]["mean"] > np.mean([t["nees"]["position"] for t in diverged]) / 12
+
+
+def test_without_covariance_or_estimate_there_is_still_a_table(parts):
+    result = montecarlo("--backend", "silent", "--backend", "unlucky", "--seeds", "1", "--workers", "1", "--out", "out")
+    assert "silent on standstill: states no covariance, so there is no NEES" in result.stderr
+    assert results("out")[0]["nees"] == {}
+    assert not Path("out/nees_silent.png").exists()
+    assert Path("out/trials.png").exists()
+
+
+def test_a_worker_that_dies_is_one_line(parts):
+    result = montecarlo("--backend", "deadly", "--seeds", "2", "--workers", "2", "--out", "out", code=2)
+    assert result.stderr.count("\n") == 1
+    assert "a worker process died" in result.stderr
+    assert not Path("out").exists()
+
+
+def runs(pid: str) -> bool:
+    """Whether a process is there and more than a zombie that its new parent has not noticed."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except FileNotFoundError:
+        return False
+
+
+@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="looks for processes in /proc")
+def test_ctrl_c_ends_all_processes_and_leaves_nothing(parts, tmp_path):
+    command = [sys.executable, "-m", "vioframe", "montecarlo", "--backend", "drawn:pause_s=0.05", "--duration", "10"]
+    process = subprocess.Popen(
+        [*command, "--seeds", "50", "--workers", "2", "--flight", "standstill", "--out", "out"],
+        env=os.environ | {"PYTHONPATH": str(tmp_path / "site")},
+        stderr=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+    deadline = time.monotonic() + 60
+    children = Path(f"/proc/{process.pid}/task/{process.pid}/children")
+    while len(children.read_text().split()) < 3 and time.monotonic() < deadline:  # two workers, a resource tracker
+        time.sleep(0.1)
+    workers = children.read_text().split()
+    time.sleep(3.0)
+    os.killpg(process.pid, signal.SIGINT)
+    _, stderr = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert stderr.rstrip().endswith("vioframe: interrupted")
+    assert "Traceback" not in stderr
+    assert len(workers) >= 3
+    while any(map(runs, workers)) and time.monotonic() < deadline:
+        time.sleep(0.1)
+    assert not any(map(runs, workers))
+    assert not Path("out").exists()
+
+
+def test_a_setup_says_what_is_wrong_with_it():
+    with pytest.raises(ConfigError, match="at least 10 s"):
+        Setup("hover", 5.0)
+    with pytest.raises(PluginError, match="no backend is called"):
+        run_montecarlo([Setup("hover", 10.0)], [Contender("nothing")], 1)
+
+
+# What the project promises
+
+
+@pytest.mark.slow
+def test_the_msckf_is_accurate_and_honest_and_not_without_first_estimates():
+    """25 flights of 60 s at EuRoC's noise with its own initialisation; the figures of the project's brief."""
+    setup = Setup("figure_eight", 60.0)
+    (honest,) = run_montecarlo([setup], [Contender("msckf")], 25, workers=usable_cores())
+    assert sum(honest.failures.values()) == 0
+    assert honest.total("resets") == 0
+    assert honest.mean("completion") == 1.0
+    assert honest.rms("orientation_deg") <= 0.4
+    assert honest.rms("percent") <= 0.25
+    for part in PARTS:
+        assert 0.7 <= honest.nees(part).per_axis <= 1.5
+
+    without = Contender("msckf", {"first_estimate_jacobians": False})
+    (sure,) = run_montecarlo([setup], [without], 6, workers=usable_cores())
+    for part in PARTS:
+        assert sure.nees(part).per_axis > 3.0
+        assert sure.nees(part).verdict == "overconfident"
+    assert sure.nees("pose").inside < 0.5
