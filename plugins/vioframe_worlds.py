@@ -44,21 +44,17 @@ def mesh(
     p_WB: Float,
     rng: np.random.Generator,
     *,
-    file: Annotated[Path, "triangle mesh (PLY, OBJ, STL ...), metres, z up"],
+    file: Annotated[Path, "triangle mesh (PLY, OBJ, STL or OFF), metres, z up"],
     images: Images = None,
     tile_m: Annotated[float, "width of a texture on a surface, m"] = 2.0,
 ) -> MeshWorld:
     """The triangles of ``file`` as they lie in W; textures are laid on along the axis each face looks to most."""
-    from vioframe.simulation.world import Mesh, MeshWorld, import_open3d
+    from vioframe.geometry.meshes import read_mesh
+    from vioframe.simulation.world import Mesh, MeshWorld
 
-    if not file.is_file():
-        raise ConfigError(f"{file}: there is no such mesh; check world.file")
     if not tile_m > 0.0:
         raise ConfigError(f"tile_m must be above 0, not {tile_m:g}")
-    triangles = import_open3d().io.read_triangle_mesh(str(file))
-    corners = np.asarray(triangles.vertices)[np.asarray(triangles.triangles)]
-    if not len(corners):
-        raise ConfigError(f"{file} holds no triangles that can be read; give a PLY, OBJ, STL, OFF or glTF mesh")
+    corners = read_mesh(file)
     textures = _textures(images, rng)
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     axis = np.abs(normals).argmax(axis=1)

@@ -36,10 +36,10 @@ def read_mesh(path: Path) -> Float:
     return corners
 
 
-def ray_scene(corners: Float) -> Any:
-    """Open3D's ``RaycastingScene`` of triangles (T, 3, 3) m."""
+def ray_scene(corners: Float, threads: int = 0) -> Any:
+    """Open3D's ``RaycastingScene`` of triangles (T, 3, 3) m, built by ``threads``; 0 leaves their number to Open3D."""
     o3d = import_open3d("ray casting")
-    scene = o3d.t.geometry.RaycastingScene()
+    scene = o3d.t.geometry.RaycastingScene(nthreads=threads)
     vertices = np.ascontiguousarray(corners.reshape(-1, 3), dtype=np.float32)
     indices = np.arange(len(vertices), dtype=np.uint32).reshape(-1, 3)
     scene.add_triangles(o3d.core.Tensor.from_numpy(vertices), o3d.core.Tensor.from_numpy(indices))

@@ -9,6 +9,7 @@ from heapq import merge
 import numpy as np
 
 from vioframe.calibration import load_calibration, packaged_calibration
+from vioframe.interfaces import Flight
 from vioframe.registry import Registry
 from vioframe.simulation.brightness import wandering_gain
 from vioframe.simulation.camera import Shot, Studio, take_pictures
@@ -74,7 +75,7 @@ class SimulatedRecording:
             recorded = load_recorded_motion(config.recorded, start_s=config.start_s, duration_s=config.duration_s)
             return replayed(recorded), recorded.name
         if config.trajectory is not None:
-            flight = flight_from_file(config.trajectory, config.start_s, config.duration_s)
+            flight: Flight = flight_from_file(config.trajectory, config.start_s, config.duration_s)
             name = config.trajectory.name.partition(".")[0]
         else:
             R_LB = levelled(calibration.R_BC)

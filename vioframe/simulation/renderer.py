@@ -8,14 +8,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vioframe.geometry.cameras import Camera
+from vioframe.geometry.meshes import import_open3d, ray_scene
 from vioframe.interfaces import World
 from vioframe.simulation.movers import Movers
 from vioframe.simulation.shading import MISS, Float32, mip_pyramid, shade
-from vioframe.simulation.world import Mesh, import_open3d, ray_scene
+from vioframe.simulation.world import Mesh
 from vioframe.types import Float, Int
 
-# A pixel where surfaces meet is the mean over a rotated grid: no two samples share a row or a column.
-_SAMPLES_PX = np.array([[-0.125, -0.375], [0.375, -0.125], [0.125, 0.375], [-0.375, 0.125]])
+# A pixel where surfaces meet is the mean over eight places in it, no two of which share a row or a column.
+_SAMPLES_PX = (np.array([[k, 3 * k % 8] for k in range(8)]) + 0.5) / 8.0 - 0.5
 
 
 class Renderer:
@@ -40,7 +41,7 @@ class Renderer:
         pixels = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1).reshape(-1, 2)
         self._rays_C = [_rays(camera, pixels + offset) for offset in (np.zeros(2), *_SAMPLES_PX)]
         self._row = np.repeat(np.arange(height), width)
-        self._scene = ray_scene(world.mesh.corners)
+        self._scene = ray_scene(world.mesh.corners, threads=1)
         self._static = len(world.mesh.corners)
         meshes = [world.mesh] if movers is None else [world.mesh, movers.mesh]
         self._uv = np.concatenate([mesh.uv for mesh in meshes]).astype(np.float32)
@@ -59,7 +60,7 @@ class Renderer:
         For a rolling shutter the pose is one a row: (height, 3, 3) and (height, 3). ``p_WM`` (M, 3) m is where the
         movers are.
         """
-        movers = None if self._movers is None or p_WM is None else ray_scene(self._movers.corners(p_WM))
+        movers = None if self._movers is None or p_WM is None else ray_scene(self._movers.corners(p_WM), threads=1)
         everywhere = np.arange(len(self._row))
         light, surface = self._trace(0, everywhere, R_WC, p_WC, movers)
         edges = np.flatnonzero(_edges(surface.reshape(self._shape)))
@@ -134,5 +135,5 @@ def _edges(surface: NDArray[np.int32]) -> NDArray[np.bool_]:
 
 def _cast(scene: Any, rays: Float32) -> tuple[NDArray[np.uint32], Float32, Float32]:
     """Triangle (N,), weights (N, 2) of its second and third corner, and distance in ray lengths (N,)."""
-    hits = scene.cast_rays(import_open3d().core.Tensor.from_numpy(rays), nthreads=1)
+    hits = scene.cast_rays(import_open3d("rendering").core.Tensor.from_numpy(rays), nthreads=1)
     return hits["primitive_ids"].numpy(), hits["primitive_uvs"].numpy(), hits["t_hit"].numpy()

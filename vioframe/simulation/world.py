@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from vioframe.errors import ConfigError
+from vioframe.geometry.meshes import import_open3d, ray_scene
 from vioframe.interfaces import World
 from vioframe.types import Float, Image, Int
 
@@ -104,19 +104,9 @@ class MeshBuilder:
         return Mesh(np.array(corners), np.array(uv), np.array(texture, np.int32), np.array(surface, np.int32))
 
 
-def ray_scene(corners: Float) -> Any:
-    """Open3D's ``RaycastingScene`` of triangles (T, 3, 3) m, on a single thread."""
-    o3d = import_open3d()
-    scene = o3d.t.geometry.RaycastingScene(nthreads=1)
-    vertices = o3d.core.Tensor.from_numpy(np.ascontiguousarray(corners.reshape(-1, 3), np.float32))
-    triangles = np.arange(3 * len(corners), dtype=np.uint32).reshape(-1, 3)
-    scene.add_triangles(vertices, o3d.core.Tensor.from_numpy(triangles))
-    return scene
-
-
 def check_clear(world: World, t_s: Float, p_W: Float) -> None:
     """Raise :class:`ConfigError` where the path ``p_W`` (N, 3) m at times ``t_s`` (N,) goes through a surface."""
-    o3d = import_open3d()
+    o3d = import_open3d("checking a flight against its world")
     steps = np.diff(p_W, axis=0)
     rays = np.concatenate([p_W[:-1], steps], axis=1).astype(np.float32)
     hit = ray_scene(world.mesh.corners).cast_rays(o3d.core.Tensor.from_numpy(rays), nthreads=1)["t_hit"].numpy()
@@ -140,14 +130,3 @@ def write_mesh(mesh: Mesh, path: Path) -> None:
         f"element face {len(faces)}\nproperty list uchar int vertex_indices\nend_header\n"
     )
     path.write_bytes(header.encode() + vertices.tobytes() + faces.tobytes())
-
-
-def import_open3d() -> Any:
-    """The module, or a :class:`ConfigError` saying how to get it."""
-    try:
-        import open3d
-    except (ImportError, OSError) as error:
-        raise ConfigError(
-            f"simulated images need Open3D ({error}); install it: pip install 'vioframe[open3d]'"
-        ) from error
-    return open3d

@@ -1,0 +1,325 @@
+"""Simulated recordings: the conditions do what they say, files hold what was simulated, and failure leaves nothing."""
+
+import errno
+import subprocess
+import sys
+from dataclasses import fields
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from rosbags.highlevel import AnyReader
+from simulation_helpers import INSTALLED, small_calibration, small_simulation
+
+from vioframe.calibration import sidecar_folder, write_calibration
+from vioframe.cli import main
+from vioframe.errors import ConfigError, DatasetError, TrajectoryError
+from vioframe.geometry import so3
+from vioframe.simulation.conditions import CONDITIONS, Conditions
+from vioframe.simulation.files import MANIFEST, TRUTH, WORLD, simulation_folder
+from vioframe.simulation.record import record
+from vioframe.simulation.world import MeshBuilder, write_mesh
+from vioframe.trajectory import load_trajectory
+from vioframe.types import Frame, ImuSample
+from vioframe.writers import Ros1Writer
+
+pytest.importorskip("open3d", exc_type=ImportError)
+
+
+def content(recording) -> list[tuple]:
+    """The measurements as plain values that compare exactly."""
+    rows = []
+    for m in recording.measurements():
+        if isinstance(m, Frame):
+            rows.append((m.t_ns, m.image.tobytes()))
+        else:
+            rows.append((m.t_ns, m.gyro_B.tobytes(), m.accel_B.tobytes()))
+    return rows
+
+
+def images(recording) -> np.ndarray:
+    return np.array([m.image for m in recording.measurements() if isinstance(m, Frame)], np.float64)
+
+
+def readings(recording) -> tuple[np.ndarray, np.ndarray]:
+    samples = [m for m in recording.measurements() if isinstance(m, ImuSample)]
+    return np.array([s.t_ns for s in samples]), np.array([[*s.gyro_B, *s.accel_B] for s in samples])
+
+
+def under(tmp_path, condition: str, level: float = 1.0, **settings):
+    return small_simulation(
+        tmp_path, duration_s=settings.pop("duration_s", 0.5), conditions={condition: level}, **settings
+    )
+
+
+@pytest.fixture
+def clear(tmp_path):
+    return small_simulation(tmp_path, duration_s=0.5)
+
+
+def test_a_seed_gives_the_same_recording_and_another_seed_another(tmp_path):
+    settings = {"duration_s": 0.3, "conditions": {"noise": 0.2, "moving_objects": 0.3, "vibration": 0.1}}
+    first, again, other = (content(small_simulation(tmp_path, seed=seed, **settings)) for seed in (3, 3, 4))
+    assert first == again
+    assert first != other
+
+
+def test_measurements_are_complete_and_in_order(clear):
+    measured = list(clear.measurements())
+    stamps = [m.t_ns for m in measured]
+    assert stamps == sorted(stamps)
+    frames = [m for m in measured if isinstance(m, Frame)]
+    assert len(frames) == clear.frame_count == 11
+    assert frames[0].image.shape == (120, 188)
+    assert len(measured) - len(frames) == clear.imu_count == 101
+    assert [s.t_ns for s in clear.truth] == readings(clear)[0].tolist()
+
+
+def test_every_condition_has_a_level_and_an_explanation():
+    assert list(CONDITIONS) == [field.name for field in fields(Conditions)]
+    assert all(CONDITIONS.values())
+
+
+@pytest.mark.parametrize("name", list(CONDITIONS))
+def test_level_zero_changes_nothing_and_a_level_changes_something(name, tmp_path, clear):
+    assert content(under(tmp_path, name, 0.0)) == content(clear)
+    changed = under(tmp_path, name, 0.8)
+    assert content(changed) != content(clear) or changed.calibration != clear.calibration
+
+
+def sharpness(pictures: np.ndarray) -> float:
+    return float(np.abs(np.diff(pictures, axis=2)).mean())
+
+
+def test_blur_fog_and_plain_surfaces_take_detail_away(tmp_path):
+    fast = {"flight": {"name": "aggressive"}, "duration_s": 0.5}
+    clear = sharpness(images(small_simulation(tmp_path, **fast)))
+    for name, most in (("motion_blur", 0.7), ("fog", 0.4), ("low_texture", 0.6)):
+        levels = [sharpness(images(under(tmp_path, name, level, **fast))) for level in (0.5, 1.0)]
+        assert clear > levels[0] > levels[1]
+        assert levels[1] < most * clear
+
+
+def test_brightness_jumps_and_saturates(tmp_path, clear):
+    wild = images(under(tmp_path, "exposure", 1.0, duration_s=4.0, frame_rate_hz=5.0))
+    means = wild.mean(axis=(1, 2))
+    assert means.max() > 1.8 * means.min()
+    assert (wild == 255).mean() > 3.0 * (images(clear) == 255).mean() + 0.01
+
+
+def test_frames_are_dropped_and_readings_are_late(tmp_path, clear):
+    dropped = under(tmp_path, "dropped_frames", 1.0, duration_s=10.0, frame_rate_hz=20.0)
+    assert dropped.frame_count == pytest.approx(100, abs=20)
+    stamps, values = readings(under(tmp_path, "time_offset", 0.5))
+    expected, same = readings(clear)
+    assert np.array_equal(stamps, expected + 25_000_000)
+    assert np.array_equal(values, same)
+
+
+def test_vibration_shakes_the_imu_and_not_the_camera(tmp_path, clear):
+    shaken = under(tmp_path, "vibration", 0.5)
+    difference = readings(shaken)[1] - readings(clear)[1]
+    assert difference[:, :3].std() == pytest.approx(0.075, rel=0.3)
+    assert difference[:, 3:].std() == pytest.approx(1.5, rel=0.3)
+    assert np.array_equal(images(shaken), images(clear))
+
+
+def test_a_wrong_calibration_is_wrong_by_the_amount_asked_for(tmp_path, clear):
+    wrong = under(tmp_path, "wrong_calibration", 0.5)
+    told, true = wrong.calibration, wrong.true_calibration
+    assert true.camera == clear.calibration.camera
+    assert np.rad2deg(np.linalg.norm(so3.log(true.R_BC.T @ told.R_BC))) == pytest.approx(0.5)
+    assert np.linalg.norm(told.p_BC - true.p_BC) == pytest.approx(0.01)
+    off = [getattr(told.camera, name) - getattr(true.camera, name) for name in ("fx", "fy", "cx", "cy")]
+    assert np.linalg.norm(off[:2]) == pytest.approx(5.0)
+    assert np.linalg.norm(off[2:]) == pytest.approx(5.0)
+    assert np.array_equal(images(wrong), images(clear))
+
+
+def test_a_real_sequence_keeps_its_readings_stamps_and_poses(shared_data, tmp_path):
+    folder = shared_data / "euroc_imu_gt" / "MH_05_difficult"
+    files = {"recorded": folder / "imu0" / "data.csv.gz", "start_s": 20.0, "duration_s": 0.5}
+    recording = small_simulation(tmp_path, **files)
+    stamps = np.loadtxt(folder / "cam0" / "timestamps_ns.txt.gz", dtype=np.int64)
+    frames = np.array([m.t_ns for m in recording.measurements() if isinstance(m, Frame)])
+    assert np.isin(frames, stamps).all()
+    assert len(frames) == 11
+    rows = np.loadtxt(folder / "imu0" / "data.csv.gz", delimiter=",")
+    t_ns, values = readings(recording)
+    nearest = np.abs(rows[:, 0, None] - t_ns).argmin(axis=0)
+    assert np.array_equal(values, rows[nearest, 1:])
+    truth = load_trajectory(folder / "state_groundtruth_estimate0" / "data.csv.gz")
+    at = np.isin(truth.t_ns, recording.ground_truth.t_ns)
+    np.testing.assert_array_equal(truth.p_WB[at], recording.ground_truth.p_WB)
+
+
+def test_twenty_seconds_of_bag_and_folder_hold_what_was_simulated(tmp_path):
+    recording = small_simulation(tmp_path, duration_s=20.0, divisor=8, workers=2)
+    bag, folder = tmp_path / "flight.bag", tmp_path / "flight"
+    record(recording, [bag, folder])
+
+    topics = {"/cam0/image_raw": 401, "/imu0": 4001, "/vioframe/ground_truth": 4001}
+    # Of the tools that rosbags has, its releases of 0.11 install this one, which reads every message.
+    tool = Path(sys.executable).with_name("rosbags-convert")
+    subprocess.run([tool, "--src", bag, "--dst", tmp_path / "converted", "--dst-storage", "mcap"], check=True)
+    for path in (bag, tmp_path / "converted"):
+        with AnyReader([path]) as reader:
+            assert {c.topic: c.msgcount for c in reader.connections} == topics
+
+    expected = content(recording)
+    assert len(expected) == 401 + 4001
+    for path in (bag, folder):
+        read = INSTALLED.open_dataset(path)
+        assert content(read) == expected
+        np.testing.assert_array_equal(read.ground_truth.t_ns, recording.ground_truth.t_ns)
+        np.testing.assert_array_equal(read.ground_truth.p_WB, recording.ground_truth.p_WB)
+        np.testing.assert_allclose(read.ground_truth.R_WB, recording.ground_truth.R_WB, atol=1e-15)
+        assert read.calibration.camera == recording.calibration.camera
+        assert {file.name for file in simulation_folder(path).iterdir()} == {MANIFEST, TRUTH, WORLD}
+    states = np.loadtxt(simulation_folder(bag) / TRUTH, delimiter=",")
+    assert states.shape == (4001, 17)
+    np.testing.assert_array_equal(states[:, 14:], [state.bias_accel_B for state in recording.truth])
+
+
+def simulate(*arguments: object):
+    return CliRunner().invoke(main, ["simulate", *map(str, arguments)])
+
+
+@pytest.fixture
+def small(tmp_path) -> Path:
+    write_calibration(small_calibration(8), tmp_path / "small")
+    return tmp_path / "small"
+
+
+def test_a_manifest_makes_the_same_recording_again(tmp_path, small):
+    chosen = ["--flight", "hover", "--duration", 0.5, "--seed", 7, "-c", "noise=0.3", "-c", "fog", "-o", "speed=1.5"]
+    done = simulate(tmp_path / "one.bag", *chosen, "--calibration", small, "--workers", 1)
+    assert done.exit_code == 0, done.output
+    assert "conditions: noise 0.3, fog 1" in done.output
+    manifest = simulation_folder(tmp_path / "one.bag") / MANIFEST
+    again = simulate(tmp_path / "two.bag", "--config", manifest, "--workers", 1)
+    assert again.exit_code == 0, again.output
+    assert (tmp_path / "one.bag").read_bytes() == (tmp_path / "two.bag").read_bytes()
+    assert manifest.read_text() == (simulation_folder(tmp_path / "two.bag") / MANIFEST).read_text()
+
+
+def test_the_list_shows_flights_worlds_and_conditions():
+    listed = simulate("--list").output
+    for name in ("figure_eight", "inspection", "hall", "mesh", *CONDITIONS):
+        assert name in listed
+
+
+def box_world(tmp_path: Path, half_m: float) -> Path:
+    builder = MeshBuilder()
+    builder.box(np.full(3, -half_m), np.full(3, half_m), np.zeros(6, int), 1.0, np.zeros(2))
+    write_mesh(builder.build(), tmp_path / "box.ply")
+    return tmp_path / "box.ply"
+
+
+def test_ones_own_mesh_is_a_world_and_its_walls_are_solid(tmp_path, small):
+    room = box_world(tmp_path, 20.0)
+    settings = ["--calibration", small, "--duration", 3, "--rate", 2, "--workers", 1, "--world", "mesh"]
+    done = simulate(tmp_path / "room", *settings, "-o", f"world.file={room}")
+    assert done.exit_code == 0, done.output
+    closet = box_world(tmp_path, 1.0)
+    refused = simulate(tmp_path / "closet", *settings, "-o", f"world.file={closet}")
+    assert refused.exit_code == 2
+    assert "goes through a wall of the world" in refused.output
+    assert not list(tmp_path.glob("*closet*"))
+
+
+def jumping_file(tmp_path: Path) -> Path:
+    rows = [f"{0.1 * k:.1f} {0.1 * k + 5.0 * (k > 20):.2f} 0 0 0 0 0 1" for k in range(50)]
+    (tmp_path / "jump.tum").write_text("\n".join(rows) + "\n")
+    return tmp_path / "jump.tum"
+
+
+def repeating_file(tmp_path: Path) -> Path:
+    rows = [f"{0.1 * min(k, 30):.1f} {0.1 * k:.2f} 0 0 0 0 0 1" for k in range(50)]
+    (tmp_path / "repeat.tum").write_text("\n".join(rows) + "\n")
+    return tmp_path / "repeat.tum"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "problem"),
+    [
+        (["-c", "fogg=0.5"], "did you mean 'fog'"),
+        (["-c", "fog=1.5"], "must lie between 0 (none) and 1, not 1.5"),
+        (["-c", "fog=nan"], "must lie between 0 (none) and 1"),
+        (["-c", "fog=much"], "must be a number"),
+        (["--flight", "figure_ate"], "did you mean 'figure_eight'"),
+        (["--flight", "missing.tum"], "no such trajectory file"),
+        (["--flight", jumping_file], "jump"),
+        (["--flight", repeating_file], "repeats"),
+        (["--world", "hell"], "did you mean 'hall'"),
+        (["--imu", "nowhere"], "does not exist"),
+        (["--imu", "nowhere", "--exact-imu"], "taken as they are"),
+        (["--duration", "-1"], "duration_s"),
+        (["--start", "3"], "a flight begins at its beginning"),
+        (["-o", "colour=red"], "no part has such an option"),
+        (["-o", "world.images=nowhere"], "is not a folder"),
+        (["--calibration", "nowhere"], "nowhere"),
+        (["--config", "nowhere.yaml"], "cannot read the configuration"),
+    ],
+)
+def test_bad_input_is_one_line_and_leaves_nothing(arguments, problem, tmp_path):
+    given = [a(tmp_path) if callable(a) else a for a in arguments]
+    before = set(tmp_path.iterdir())
+    done = simulate(tmp_path / "out.bag", "--workers", 1, *given)
+    assert done.exit_code == 2, done.output
+    assert problem in done.output
+    assert done.output.startswith("vioframe: error: ")
+    assert done.output.count("\n") == 1
+    assert set(tmp_path.iterdir()) == before
+
+
+def test_destinations_are_checked_before_anything_is_rendered(tmp_path, small):
+    assert "no destination given" in simulate().output
+    assert "tells no format" in simulate(tmp_path / "flight.avi").output
+    (tmp_path / "mine.bag").write_text("precious")
+    assert "exists already" in simulate(tmp_path / "mine.bag").output
+    assert "was not written by the simulator" in simulate(tmp_path / "mine.bag", "--overwrite").output
+    assert (tmp_path / "mine.bag").read_text() == "precious"
+    assert "named twice" in simulate(tmp_path / "a", tmp_path / "a").output
+    assert "cannot be compressed by bz2" in simulate(tmp_path / "a.mcap", "--compression", "bz2").output
+
+
+def test_a_full_disk_leaves_no_half_written_bag(tmp_path, small, monkeypatch):
+    written = []
+
+    def write_frame(self, frame):
+        written.append(frame)
+        if len(written) > 2:
+            raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(Ros1Writer, "write_frame", write_frame)
+    done = simulate(tmp_path / "a.bag", "--calibration", small, "--duration", 1, "--workers", 1)
+    assert done.exit_code == 2
+    assert "No space left on device" in done.output
+    assert [path.name for path in tmp_path.iterdir()] == ["small"]
+
+
+def test_a_simulated_recording_is_replaced_only_by_a_complete_one(tmp_path, small, monkeypatch):
+    settings = [tmp_path / "a.bag", "--calibration", small, "--duration", 0.3, "--workers", 1]
+    assert simulate(*settings).exit_code == 0
+    first = (tmp_path / "a.bag").read_bytes()
+    assert "exists already" in simulate(*settings).output
+
+    with monkeypatch.context() as patched:
+        patched.setattr(Ros1Writer, "write_frame", lambda self, frame: (_ for _ in ()).throw(OSError(5, "I/O error")))
+        assert simulate(*settings, "--seed", 1, "--overwrite").exit_code == 2
+    assert (tmp_path / "a.bag").read_bytes() == first
+
+    assert simulate(*settings, "--seed", 1, "--overwrite").exit_code == 0
+    assert (tmp_path / "a.bag").read_bytes() != first
+    assert sidecar_folder(tmp_path / "a.bag").is_dir()
+
+
+def test_errors_of_the_library_have_their_types(tmp_path):
+    with pytest.raises(ConfigError, match="level of fog"):
+        Conditions(fog=-0.1)
+    with pytest.raises(TrajectoryError, match="jump"):
+        small_simulation(tmp_path, trajectory=jumping_file(tmp_path), duration_s=4.0)
+    with pytest.raises(DatasetError, match="exists already"):
+        record(small_simulation(tmp_path, duration_s=0.1), [tmp_path])
