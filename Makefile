@@ -1,5 +1,5 @@
 # Everything on a fresh Debian or Ubuntu machine with Python >= 3.11, make and a compiler:
-#   make demo   set up, then the main job: recording -> bag -> run -> evaluation and plots
+#   make demo   set up, then the main job on a simulated flight: bag -> runs -> evaluation, plots and a view
 #   make test   set up, then lint, types and all tests
 PYTHON ?= $(shell for p in python3 python3.13 python3.12 python3.11 python; do \
 	$$p -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null && echo $$p && break; done)
@@ -8,9 +8,10 @@ BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
 CODE := vioframe plugins tests docs/example-plugin
 
-RECORDING ?= ../shared/data/euroc/MH_01_easy_15s
 DEMO := build/demo
-BAG := $(DEMO)/$(notdir $(RECORDING)).bag
+FLIGHT ?= inspection
+FLIGHT_BAG := $(DEMO)/$(FLIGHT).bag
+DETECTORS := shi_tomasi fast orb sift
 
 # What Open3D's wheel needs from the system.
 SYSTEM_LIBRARIES := libusb-1.0-0 libgl1 libgomp1 libx11-6 libegl1
@@ -31,15 +32,16 @@ lint: install
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
+# Every detector on the same simulated flight; nothing is downloaded.
 demo: install
-	@test -d $(RECORDING)/mav0 || { echo "make demo: there is no recording at $(RECORDING);" \
-		"name a EuRoC sequence in ASL layout: make demo RECORDING=path/to/MH_05_difficult"; exit 2; }
-	@mkdir -p $(DEMO) && rm -f $(BAG)
-	$(BIN)/vioframe convert $(RECORDING) $(BAG)
-	$(BIN)/vioframe run $(BAG) --detector shi_tomasi --backend msckf \
-		--ground-truth $(RECORDING)/mav0/state_groundtruth_estimate0/data.csv --out $(DEMO)/run --overwrite
-	$(BIN)/vioframe evaluate $(DEMO)/run
-	$(BIN)/vioframe plot $(DEMO)/run
+	@mkdir -p $(DEMO)
+	$(BIN)/vioframe simulate $(FLIGHT_BAG) --flight $(FLIGHT) --duration 25 --overwrite
+	for detector in $(DETECTORS); do \
+		$(BIN)/vioframe run $(FLIGHT_BAG) --detector $$detector --backend msckf --out $(DEMO)/$$detector --overwrite || exit; \
+	done
+	$(BIN)/vioframe evaluate $(DETECTORS:%=$(DEMO)/%)
+	$(BIN)/vioframe plot $(DETECTORS:%=$(DEMO)/%) --out $(DEMO)/plots
+	$(BIN)/vioframe view $(DEMO)/$(firstword $(DETECTORS)) --world $(FLIGHT_BAG).simulation/world.ply --save $(DEMO)/plots/view.png
 
 install: $(INSTALLED) system-libraries
 

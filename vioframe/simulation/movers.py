@@ -10,7 +10,8 @@ from vioframe.simulation.world import Mesh, MeshBuilder
 from vioframe.types import Float, Int
 
 _SIZE_M = (0.3, 1.1)
-_SWING_M = (0.5, 3.0)
+_SWING_M = (0.4, 1.6)
+_AROUND_M = np.array([2.2, 2.2, 1.2])  # with the swing still within the walls of a hall
 _PERIOD_S = (3.0, 9.0)
 _CLEARANCE_M = 1.2
 _TRIES = 400
@@ -45,7 +46,7 @@ def draw_movers(count: int, t_s: Float, p_WC: Float, textures: int, rng: np.rand
 
     Fewer, or None, where the path leaves no room for them.
     """
-    low, high = p_WC.min(axis=0) - 3.0, p_WC.max(axis=0) + 3.0
+    low, high = p_WC.min(axis=0) - _AROUND_M, p_WC.max(axis=0) + _AROUND_M
     builder = MeshBuilder()
     owner: list[int] = []
     swings: list[tuple[Float, Float, Float, Float]] = []
