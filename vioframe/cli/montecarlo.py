@@ -33,7 +33,7 @@ _WIDE = 1000
     multiple=True,
     default=("figure_eight",),
     show_default=True,
-    help="Repeatable.",
+    help="Flight; repeat for more.",
 )
 @click.option("--seeds", type=int, default=25, show_default=True, help="Trials of each back-end on each flight.")
 @click.option("--duration", type=float, metavar="S", default=60.0, show_default=True, help="Length of a flight.")

@@ -49,23 +49,23 @@ def to_rich(outcomes: Sequence[Outcome]) -> Table:
             "flown": lambda o: str(len(o.trials)),
             "failed": _failures,
             "resets": lambda o: str(o.total("resets")),
-            "initialised after [s], mean": lambda o: _number(o.mean("initialised_s"), ".2f"),
-            "completion after that [%], mean": lambda o: _number(o.mean("completion"), ".1f", 100.0),
+            "initialised after [s]": lambda o: _number(o.mean("initialised_s"), ".2f"),
+            "completion after that [%]": lambda o: _number(o.mean("completion"), ".1f", 100.0),
         },
     )
     section(
-        "RMSE over all trials, position + yaw aligned (worst trial)",
+        "RMSE, position + yaw aligned (worst)",
         {
             "position (ATE) [m]": lambda o: _error(o, "ate_m", ".3f"),
-            "position [% of the path]": lambda o: _error(o, "percent", ".3f"),
+            "position [% of path]": lambda o: _error(o, "percent", ".3f"),
             "orientation [deg]": lambda o: _error(o, "orientation_deg", ".2f"),
         },
     )
     section(
-        "NEES, mean over trials and time [95 % bounds of an honest filter]",
+        "NEES, mean [95 % if honest]",
         {f"{part}, ideally {dof}": _mean_nees(part) for part, dof in PARTS.items()},
     )
-    section("NEES over its ideal (instants within the bounds)", {part: _nees_per_axis(part) for part in PARTS})
+    section("NEES over its ideal (instants in bounds)", {part: _nees_per_axis(part) for part in PARTS})
     section("Time", {"back-end, ms a frame": lambda o: _number(o.mean("cpu_ms"), ".1f")})
     return table
 

@@ -72,6 +72,7 @@ def nees_over_time(outcomes: Sequence[Outcome]) -> Figure:
         high = float(widest.mean_band[1])
         if highest > _LOGARITHMIC_FROM * high:
             ax.set_yscale("log")
+            ax.yaxis.set_major_formatter("{x:g}")
             ax.set_ylim(0.3 * widest.dof, 1.5 * highest)
         else:
             ax.set_ylim(0.0, 1.15 * max(highest, high))
@@ -114,6 +115,7 @@ def trials(outcomes: Sequence[Outcome]) -> Figure:
         every = np.concatenate(found)
         if len(every) and every.min() > 0.0 and every.max() > _LOGARITHMIC_SPAN * every.min():
             ax.set_xscale("log")
+            ax.xaxis.set_major_formatter("{x:g}")
         else:
             ax.set_xlim(left=0.0)
         ax.set_xlabel(title)
