@@ -3,7 +3,7 @@
 import errno
 import subprocess
 import sys
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -135,6 +135,25 @@ def test_a_wrong_calibration_is_wrong_by_the_amount_asked_for(tmp_path, clear):
     assert np.linalg.norm(off[:2]) == pytest.approx(5.0)
     assert np.linalg.norm(off[2:]) == pytest.approx(5.0)
     assert np.array_equal(images(wrong), images(clear))
+
+
+def test_the_imu_is_exact_or_as_wrong_as_asked(tmp_path, clear):
+    exact = small_simulation(tmp_path, duration_s=0.5, exact_imu=True)
+    assert not any(state.bias_accel_B.any() for state in exact.truth)
+    scale = [0.1, 0.0, -0.05]
+    scaled = readings(small_simulation(tmp_path, duration_s=0.5, exact_imu=True, imu={"accel_scale": scale}))[1]
+    np.testing.assert_allclose(scaled[:, 3:], readings(exact)[1][:, 3:] * (1.0 + np.array(scale)), rtol=1e-12)
+    noise = readings(clear)[1] - readings(exact)[1]
+    assert noise[:, :3].std() == pytest.approx(1.6968e-4 * np.sqrt(200.0), rel=0.15)
+    assert small_simulation(tmp_path, duration_s=0.5, imu_rate_hz=400.0).imu_count == 201
+
+
+def test_a_known_time_offset_is_in_the_stamps_and_in_the_calibration(tmp_path):
+    offset = replace(small_calibration(), time_offset_ns=7_000_000)
+    write_calibration(offset, tmp_path / "offset")
+    recording = small_simulation(tmp_path, duration_s=0.2, calibration=[tmp_path / "offset"])
+    assert recording.calibration.time_offset_ns == 7_000_000
+    assert readings(recording)[0][0] == recording.truth[0].t_ns + 7_000_000
 
 
 def test_a_real_sequence_keeps_its_readings_stamps_and_poses(shared_data, tmp_path):
