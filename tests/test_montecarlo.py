@@ -364,7 +364,7 @@ def test_a_setup_says_what_is_wrong_with_it():
 
 @pytest.mark.slow
 def test_the_msckf_is_accurate_and_honest_and_not_without_first_estimates():
-    """25 flights of 60 s at EuRoC's noise with its own initialisation; the figures of the project's brief."""
+    """25 flights of 60 s at EuRoC's noise with its own initialisation, every figure promised."""
     setup = Setup("figure_eight", 60.0)
     (honest,) = run_montecarlo([setup], [Contender("msckf")], 25, workers=usable_cores())
     assert sum(honest.failures.values()) == 0

@@ -17,6 +17,10 @@ from vioframe.types import Float, Int
 
 # A pixel where surfaces meet is the mean over eight places in it, no two of which share a row or a column.
 _SAMPLES_PX = (np.array([[k, 3 * k % 8] for k in range(8)]) + 0.5) / 8.0 - 0.5
+# Unless the two are as good as equally bright there: 1 is white.
+_LEAST_STEP = 3.0 / 255.0
+# Rays cast at a time: few enough for what they hit to stay in the processor's cache, which halves the time.
+_BLOCK = 8192
 
 
 class Renderer:
@@ -63,7 +67,7 @@ class Renderer:
         movers = None if self._movers is None or p_WM is None else ray_scene(self._movers.corners(p_WM), threads=1)
         everywhere = np.arange(len(self._row))
         light, surface = self._trace(0, everywhere, R_WC, p_WC, movers)
-        edges = np.flatnonzero(_edges(surface.reshape(self._shape)))
+        edges = np.flatnonzero(_edges(surface.reshape(self._shape), light.reshape(self._shape)))
         if len(edges):
             samples = [self._trace(s, edges, R_WC, p_WC, movers)[0] for s in range(1, len(self._rays_C))]
             light[edges] = np.mean(samples, axis=0)
@@ -73,6 +77,14 @@ class Renderer:
         self, sample: int, pixels: Int, R_WC: Float, p_WC: Float, movers: Any
     ) -> tuple[Float32, NDArray[np.int32]]:
         """Light and surface (N,) at ``pixels`` (N,), for one of the places of a ray within its pixel."""
+        begins = range(0, len(pixels), _BLOCK)
+        blocks = [self._trace_block(sample, pixels[b : b + _BLOCK], R_WC, p_WC, movers) for b in begins]
+        light, surface = zip(*blocks, strict=True)
+        return np.concatenate(light), np.concatenate(surface)
+
+    def _trace_block(
+        self, sample: int, pixels: Int, R_WC: Float, p_WC: Float, movers: Any
+    ) -> tuple[Float32, NDArray[np.int32]]:
         rays_C = self._rays_C[sample][pixels]
         rays = np.empty((len(pixels), 6), np.float32)
         if R_WC.ndim == 2:
@@ -122,10 +134,11 @@ def _density(mesh: Mesh) -> Float:
     return np.asarray(np.sqrt(np.abs(u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]) / np.maximum(area, 1e-12)))
 
 
-def _edges(surface: NDArray[np.int32]) -> NDArray[np.bool_]:
-    """Where a pixel and its right or lower neighbour lie on different surfaces, both of them."""
+def _edges(surface: NDArray[np.int32], light: Float32) -> NDArray[np.bool_]:
+    """Where a pixel and its right or lower neighbour lie on different surfaces and differ in light, both of them."""
     edges = np.zeros(surface.shape, np.bool_)
-    across, down = surface[:, 1:] != surface[:, :-1], surface[1:] != surface[:-1]
+    across = (surface[:, 1:] != surface[:, :-1]) & (np.abs(np.diff(light, axis=1)) > _LEAST_STEP)
+    down = (surface[1:] != surface[:-1]) & (np.abs(np.diff(light, axis=0)) > _LEAST_STEP)
     edges[:, 1:] |= across
     edges[:, :-1] |= across
     edges[1:] |= down
