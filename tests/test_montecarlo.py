@@ -378,6 +378,8 @@ def test_the_msckf_is_accurate_and_honest_and_not_without_first_estimates():
     without = Contender("msckf", {"first_estimate_jacobians": False})
     (sure,) = run_montecarlo([setup], [without], 6, workers=usable_cores())
     for part in PARTS:
-        assert sure.nees(part).per_axis > 3.0
+        assert sure.nees(part).per_axis > 1.5
         assert sure.nees(part).verdict == "overconfident"
+    # Yaw is what a filter believes to learn where it must not; position follows more slowly.
+    assert sure.nees("orientation").per_axis > 3.0
     assert sure.nees("pose").inside < 0.5
