@@ -8,9 +8,10 @@ from msckf_helpers import after, drawn_start, random_covariance
 
 from vioframe.bench import BackendRun, run_backend
 from vioframe.geometry import so3
+from vioframe.recovery import continued_from
 from vioframe.simulation import simulated_sequence
 from vioframe.types import Float, FrameTracks, NavState, Status
-from vioframe_msckf.backend import Msckf, _moved_to
+from vioframe_msckf.backend import Msckf
 from vioframe_msckf.options import MsckfOptions
 from vioframe_msckf.tracks import ObservationTable
 from vioframe_msckf.updates import select_tracks
@@ -130,7 +131,7 @@ def test_a_new_start_keeps_tilt_and_takes_over_position_and_yaw(R_LB, last_pitch
     last = NavState(0, so3.exp([0.0, 0.0, 2.0]) @ so3.exp([0.0, last_pitch, 0.0]) @ R_LB, np.ones(3), *np.zeros((3, 3)))
     R_WB = so3.exp([0.0, 0.0, -1.0]) @ R_LB
     initial = NavState(5, R_WB, *rng.normal(size=(4, 3)), random_covariance(rng, 15))
-    moved = _moved_to(last, initial)
+    moved = continued_from(last, initial)
     turn = so3.exp([0.0, 0.0, 3.0])
     np.testing.assert_allclose(moved.R_WB, turn @ initial.R_WB, atol=1e-12)
     np.testing.assert_allclose(moved.v_WB, turn @ initial.v_WB, atol=1e-12)

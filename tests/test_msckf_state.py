@@ -6,8 +6,9 @@ from filterpy.kalman import KalmanFilter
 from msckf_helpers import random_covariance, random_state
 
 from vioframe.geometry import so3
+from vioframe.recovery import DivergedError
 from vioframe.types import DBA, DBG, DP, DTHETA, DV, NS_PER_S, Float, ImuNoise, ImuSegment
-from vioframe_msckf.state import CALIBRATION, CLONES, IMU, OFFSET, FilterDivergedError, FilterState, compress
+from vioframe_msckf.state import CALIBRATION, CLONES, IMU, OFFSET, FilterState, compress
 
 NOISE = ImuNoise(gyro_density=2e-3, accel_density=2e-2, gyro_walk=2e-3, accel_walk=3e-2, rate_hz=200.0)
 
@@ -222,14 +223,14 @@ def test_what_is_not_finite_is_refused(what):
         residual[0] = np.nan
     else:
         state.cov[0, 0] = np.nan
-    with pytest.raises(FilterDivergedError):
+    with pytest.raises(DivergedError):
         state.update(H, residual, slice(0, IMU), 1.0)
 
 
 def test_a_covariance_that_is_not_positive_is_refused():
     state = random_state(12)
     state.cov[:IMU, :IMU] = -np.eye(IMU)
-    with pytest.raises(FilterDivergedError, match="positive definite"):
+    with pytest.raises(DivergedError, match="positive definite"):
         state.update(np.eye(IMU), np.zeros(IMU), slice(0, IMU), 0.1)
 
 

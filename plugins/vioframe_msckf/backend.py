@@ -6,26 +6,20 @@ first-estimate Jacobians (Li and Mourikis, IJRR 2013) and long-lived landmarks k
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from vioframe.initialization import Initializer
+from vioframe.recovery import DivergedError, check_plausible, continued_from, noise_over
+from vioframe.standstill import StandstillDetector
 from vioframe.stopwatch import Stopwatch
-from vioframe.trajectory.alignment import rotation_z, yaw_of
-from vioframe.types import Calibration, Estimate, FrameTracks, ImuNoise, ImuSegment, NavState, Status
+from vioframe.types import Calibration, Estimate, FrameTracks, ImuSegment, NavState, Status
 from vioframe_msckf.options import MsckfOptions
-from vioframe_msckf.standstill import StandstillDetector, hold_still
-from vioframe_msckf.state import FilterDivergedError, FilterState
+from vioframe_msckf.standstill import hold_still
+from vioframe_msckf.state import FilterState
 from vioframe_msckf.tracks import ObservationTable
 from vioframe_msckf.updates import promote_tracks, select_tracks, update_from_landmarks, update_from_tracks
-
-# What a body may do unseen while readings are missing, rad/s and m/s^2, and how long that can be bridged.
-_UNSEEN_TURN, _UNSEEN_ACCELERATION, _MAX_IMU_GAP_S = 0.5, 2.0, 0.5
-# Beyond these an estimate is not merely inaccurate but wrong, whatever the covariance says.
-_MAX_SPEED_M_S, _MAX_BIAS_GYRO, _MAX_BIAS_ACCEL = 30.0, 1.0, 2.5
 
 
 class Msckf:
@@ -61,8 +55,8 @@ class Msckf:
             return self._initialise(imu, tracks)
         try:
             estimate = self._filter(self._state, imu, tracks)
-            self._check(self._state, tracks.t_ns)
-        except FilterDivergedError as error:
+            self._check(self._state.nav_state(tracks.t_ns))
+        except DivergedError as error:
             return self._lose(str(error))
         self._last = estimate.state
         return estimate
@@ -75,7 +69,7 @@ class Msckf:
             return Estimate(Status.TRACKING, state.nav_state(tracks.t_ns), stage_seconds=watch.seconds)
         watch.lap("standstill")
 
-        state.propagate(imu, _noise_over(imu, self._calibration.imu), options.first_estimate_jacobians)
+        state.propagate(imu, noise_over(imu, self._calibration.imu), options.first_estimate_jacobians)
         state.augment_clone(imu.gyro_B[-1] - state.bias_gyro_B)
         observations.add_frame(_without(tracks, state.landmark_ids))
         watch.lap("propagate")
@@ -121,7 +115,7 @@ class Msckf:
             refusal = self._initializer.refusal
             events = (f"initialisation refused: {refusal}",) if refusal else ()
             return Estimate(Status.INITIALISING, events=events, stage_seconds=watch.seconds)
-        nav = initial.states[-1] if self._last is None else _moved_to(self._last, initial.states[-1])
+        nav = initial.states[-1] if self._last is None else continued_from(self._last, initial.states[-1])
         self._begin(nav)
         self._last = nav
         return Estimate(Status.TRACKING, nav, events=(f"initialised ({initial.method})",), stage_seconds=watch.seconds)
@@ -138,55 +132,16 @@ class Msckf:
         self._observations = ObservationTable()
         self._seeing_ns = nav.t_ns
 
-    def _check(self, state: FilterState, t_ns: int) -> None:
-        blind_s = (t_ns - self._seeing_ns) * 1e-9
+    def _check(self, state: NavState) -> None:
+        check_plausible(state)
+        blind_s = (state.t_ns - self._seeing_ns) * 1e-9
         if blind_s > self._options.max_blind_s:
-            raise FilterDivergedError(f"nothing usable was seen for {blind_s:.1f} s")
-        if np.linalg.norm(state.v_WB) > _MAX_SPEED_M_S:
-            raise FilterDivergedError(f"the speed exceeds {_MAX_SPEED_M_S:g} m/s")
-        if np.linalg.norm(state.bias_gyro_B) > _MAX_BIAS_GYRO or np.linalg.norm(state.bias_accel_B) > _MAX_BIAS_ACCEL:
-            raise FilterDivergedError("the IMU's biases became implausible")
+            raise DivergedError(f"nothing usable was seen for {blind_s:.1f} s")
 
     def _lose(self, why: str) -> Estimate:
         self._state = None
         self._initializer.reset()
         return Estimate(Status.LOST, events=(f"lost: {why}",))
-
-
-def _noise_over(imu: ImuSegment, noise: ImuNoise) -> ImuNoise:
-    """``noise``, raised where readings are missing: the straight line drawn over a gap is only a guess.
-
-    A rate that is off by w for a gap of T turns the body by w T, as white noise of density w sqrt(T) would.
-    """
-    gap_s = imu.largest_gap_s
-    if gap_s > _MAX_IMU_GAP_S:
-        raise FilterDivergedError(f"no inertial readings for {gap_s:.2f} s")
-    if gap_s < 5.0 / noise.rate_hz:
-        return noise
-    return replace(
-        noise,
-        gyro_density=noise.gyro_density + _UNSEEN_TURN * gap_s**0.5,
-        accel_density=noise.accel_density + _UNSEEN_ACCELERATION * gap_s**0.5,
-    )
-
-
-def _moved_to(last: NavState, initial: NavState) -> NavState:
-    """``initial``, which begins at a world origin of its own, placed at the position and yaw where ``last`` ended."""
-    R = rotation_z(float(yaw_of(last.R_WB @ initial.R_WB.T)))
-    cov = initial.cov
-    if cov is not None:
-        G = np.eye(15)
-        G[3:6, 3:6] = G[6:9, 6:9] = R
-        cov = G @ cov @ G.T
-    return NavState(
-        initial.t_ns,
-        R @ initial.R_WB,
-        last.p_WB,
-        R @ initial.v_WB,
-        initial.bias_gyro_B,
-        initial.bias_accel_B,
-        cov,
-    )
 
 
 def _without(tracks: FrameTracks, ids: NDArray[np.int64]) -> FrameTracks:

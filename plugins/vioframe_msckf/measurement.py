@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vioframe.geometry.kernels import distort, hat, intrinsics_jacobian, undistort
+from vioframe.geometry.triangulation import triangulate
 from vioframe.jit import kernel
 from vioframe.types import Float, Int
 from vioframe_msckf.state import CALIBRATION, CLONES, FilterState
-from vioframe_msckf.triangulation import triangulate
 
 ACCEPTED, NOT_TRIANGULATED, GATED = 0, 1, 2
 

@@ -16,6 +16,7 @@ from scipy.linalg.lapack import dgeqrf, dpotrf, dtrtrs
 
 from vioframe.geometry import kernels, so3
 from vioframe.inertial.propagation import propagate, yaw_consistent_transition
+from vioframe.recovery import DivergedError
 from vioframe.types import DBA, DBG, DP, DTHETA, DV, Calibration, Float, ImuNoise, ImuSegment, NavState
 
 IMU = 15
@@ -25,10 +26,6 @@ CLONES = 30  # where the clones begin
 
 # Prior standard deviations of the calibration (rad, m, s, px, distortion), as published for OpenVINS on EuRoC.
 _SIGMA_ROTATION, _SIGMA_TRANSLATION, _SIGMA_OFFSET, _SIGMA_PIXELS, _SIGMA_DISTORTION = 0.005, 0.015, 0.01, 1.0, 0.005
-
-
-class FilterDivergedError(ArithmeticError):
-    """The covariance lost its positive definiteness or the state became non-finite."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,7 +109,7 @@ class FilterState:
         """Move the body's state along ``imu``; eq. (10)-(11) of Mourikis and Roumeliotis (2007), block by block."""
         step = propagate(imu, self.R_WB, self.p_WB, self.v_WB, self.bias_gyro_B, self.bias_accel_B, noise)
         if not np.isfinite([step.p_WB, step.v_WB]).all():
-            raise FilterDivergedError("the inertial readings lead nowhere finite")
+            raise DivergedError("the inertial readings lead nowhere finite")
         Phi = step.transition
         end = (step.R_WB, step.p_WB, step.v_WB)
         if first_estimates:
@@ -176,14 +173,14 @@ class FilterState:
         """Kalman update with ``residual`` (m,) = ``H`` (m, k) @ error[columns] + noise of variance ``R``.
 
         ``R`` is one variance for all rows or (m,) variances. In square-root form, P -= W^T W with W = L^-1 H P and
-        S = L L^T, which keeps the covariance symmetric; raises :class:`FilterDivergedError` where S is not positive.
+        S = L L^T, which keeps the covariance symmetric; raises :class:`DivergedError` where S is not positive.
         """
         HP = H @ self.cov[columns]
         S = HP[:, columns] @ H.T
         S[np.diag_indices(len(S))] += R
         L, bad = dpotrf(S, lower=1, clean=1)
         if bad or not np.isfinite(residual).all():
-            raise FilterDivergedError("the innovation covariance is not positive definite")
+            raise DivergedError("the innovation covariance is not positive definite")
         W, _ = dtrtrs(L, np.column_stack([HP, residual]), lower=1)
         dx = W[:, :-1].T @ W[:, -1]
         W = W[:, :-1]
@@ -218,7 +215,7 @@ class FilterState:
         self.clones = self.clones.corrected(dx[CLONES:at])
         self.p_WF = self.p_WF + dx[at:].reshape(-1, 3)
         if not (np.isfinite(dx).all() and (np.diag(self.cov)[:IMU] > 0.0).all()):
-            raise FilterDivergedError("the state is not finite or its variances are not positive")
+            raise DivergedError("the state is not finite or its variances are not positive")
 
     def _delete(self, index: NDArray[np.intp]) -> None:
         keep = np.ones(len(self.cov), dtype=bool)

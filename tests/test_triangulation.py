@@ -5,8 +5,8 @@ import pytest
 from scipy.optimize import least_squares
 
 from vioframe.geometry import so3
+from vioframe.geometry.triangulation import MAX_DEPTH_M, triangulate
 from vioframe.types import Float
-from vioframe_msckf.triangulation import MAX_DEPTH_M, triangulate
 
 PIXEL = 1.0 / 458.0
 

@@ -5,13 +5,14 @@ import math
 import numpy as np
 
 from vioframe.jit import kernel
+from vioframe.types import Float
 
 MIN_DEPTH_M, MAX_DEPTH_M = 0.1, 60.0
 _ITERATIONS = 5
 
 
 @kernel
-def triangulate(R_WC, p_WC, xy, sigma):
+def triangulate(R_WC: Float, p_WC: Float, xy: Float, sigma: float) -> tuple[bool, Float]:
     """(m, 3, 3), (m, 3) camera poses and (m, 2) points on their z = 1 planes -> (whether it can be trusted, (3,) p_WF).
 
     ``sigma`` is the standard deviation of the points. A position is trusted where the depth lies within 0.1-60 m and
@@ -32,11 +33,11 @@ def triangulate(R_WC, p_WC, xy, sigma):
             for c in range(3):
                 A[r, c] -= ray[r] * ray[c]
             A[r, r] += 1.0
-    p = np.zeros(3)
+    p: Float = np.zeros(3)
     eigenvalues = np.linalg.eigvalsh(A)
     if eigenvalues[0] <= 1e-12 * eigenvalues[2]:
         return False, p
-    p = np.linalg.solve(A, b)
+    p = np.asarray(np.linalg.solve(A, b), np.float64)
 
     first = R_WC[0].T @ (p - p_WC[0])
     if first[2] < MIN_DEPTH_M or first[2] > MAX_DEPTH_M:
@@ -81,7 +82,7 @@ def triangulate(R_WC, p_WC, xy, sigma):
 
 
 @kernel
-def _normal_equations(R, t, xy, theta):
+def _normal_equations(R: Float, t: Float, xy: Float, theta: Float) -> tuple[float, Float, Float]:
     """Squared reprojection error on the z = 1 planes, its Gauss-Newton matrix and gradient over [a b rho]."""
     N = np.zeros((3, 3))
     g = np.zeros(3)
