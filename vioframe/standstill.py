@@ -7,12 +7,13 @@ shakes (motors, a hand nearby) does not, although its IMU reads far more than no
 from __future__ import annotations
 
 from collections import deque
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.stats import chi2
 
 from vioframe.geometry import so3
-from vioframe.types import DBA, DBG, DTHETA, DV, NS_PER_S, Float, FrameTracks, ImuNoise, ImuSegment, NavState, g_W
+from vioframe.types import DBA, DBG, DTHETA, DV, NS_PER_S, Float, FrameTracks, ImuNoise, ImuSegment, g_W
 
 STANDSTILL_GATE = float(chi2.ppf(0.95, 9))
 """Squared Mahalanobis distance below which the readings agree with standstill."""
@@ -49,23 +50,50 @@ def median_disparity_px(before: FrameTracks, now: FrameTracks) -> float:
     return float(np.median(np.linalg.norm(now.xy[j] - before.xy[i], axis=1)))
 
 
-def standstill_measurement(state: NavState, imu: ImuSegment, noise: ImuNoise) -> tuple[Float, Float, Float]:
-    """Residual (9,), Jacobian (9, 15) at ``state``, and variances (9,) of: the body stood still over ``imu``.
+@dataclass(frozen=True, slots=True)
+class Standstill:
+    """The readings of a body that stood still: means ``gyro_B`` (3,) and ``accel_B`` (3,) over ``duration_s``.
 
-    Standing still says: mean gyro = bias, mean accelerometer = -R_WB^T g + bias, velocity = 0.
+    They say: mean gyro = bias, mean accelerometer = -R_WB^T g + bias, velocity = 0. ``sigma`` (9,) are the standard
+    deviations of the three.
     """
-    up_B = -state.R_WB.T @ g_W
-    H = np.zeros((9, 15))
-    H[0:3, DBG] = np.eye(3)
-    H[3:6, DTHETA], H[3:6, DBA] = so3.hat(up_B), np.eye(3)
-    H[6:9, DV] = np.eye(3)
-    residual = np.concatenate(
-        [
-            imu.gyro_B.mean(axis=0) - state.bias_gyro_B,
-            imu.accel_B.mean(axis=0) - state.bias_accel_B - up_B,
-            -state.v_WB,
-        ]
-    )
-    density = _SHAKING * np.array([noise.gyro_density, noise.accel_density])
-    sigma = np.append(density / np.sqrt(imu.duration_s), _VELOCITY_SIGMA_M_S)
-    return residual, H, np.repeat(sigma**2, 3)
+
+    gyro_B: Float
+    accel_B: Float
+    duration_s: float
+    noise: ImuNoise
+
+    @staticmethod
+    def over(imu: ImuSegment, noise: ImuNoise) -> Standstill:
+        return Standstill(imu.gyro_B.mean(axis=0), imu.accel_B.mean(axis=0), imu.duration_s, noise)
+
+    def and_then(self, later: Standstill) -> Standstill:
+        """Both, as one."""
+        duration_s = self.duration_s + later.duration_s
+        part = later.duration_s / duration_s
+        gyro_B = (1.0 - part) * self.gyro_B + part * later.gyro_B
+        return Standstill(gyro_B, (1.0 - part) * self.accel_B + part * later.accel_B, duration_s, self.noise)
+
+    @property
+    def sigma(self) -> Float:
+        noise, T = self.noise, self.duration_s
+        gyro, accel = _SHAKING * noise.gyro_density / np.sqrt(T), _SHAKING * noise.accel_density / np.sqrt(T)
+        # The mean over a long time is that of a bias that walked.
+        gyro, accel = (
+            np.hypot(gyro, noise.gyro_walk * np.sqrt(T / 3)),
+            np.hypot(accel, noise.accel_walk * np.sqrt(T / 3)),
+        )
+        return np.repeat([gyro, accel, _VELOCITY_SIGMA_M_S], 3)
+
+    def residual(self, R_WB: Float, v_WB: Float, bias_gyro_B: Float, bias_accel_B: Float) -> Float:
+        """(9,) the readings beyond what the state makes of them."""
+        return np.concatenate([self.gyro_B - bias_gyro_B, self.accel_B - bias_accel_B + R_WB.T @ g_W, -v_WB])
+
+    @staticmethod
+    def jacobian(R_WB: Float) -> Float:
+        """(9, 15) of what is measured, by the error of the state; minus that of the residual."""
+        H = np.zeros((9, 15))
+        H[0:3, DBG] = np.eye(3)
+        H[3:6, DTHETA], H[3:6, DBA] = so3.hat(-R_WB.T @ g_W), np.eye(3)
+        H[6:9, DV] = np.eye(3)
+        return H

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
-from vioframe.standstill import STANDSTILL_GATE, standstill_measurement
+from vioframe.standstill import STANDSTILL_GATE, Standstill
 from vioframe.types import ImuNoise, ImuSegment
 from vioframe_msckf.state import IMU, FilterState
 
@@ -16,10 +14,10 @@ def hold_still(state: FilterState, imu: ImuSegment, noise: ImuNoise, first_estim
 
     The readings serve as measurements here and so do not propagate the pose as well.
     """
-    now = state.nav_state(int(imu.t_ns[-1]))
-    residual, H, variance = standstill_measurement(now, imu, noise)
-    if first_estimates:
-        _, H, _ = standstill_measurement(replace(now, R_WB=state.first[0]), imu, noise)
+    still = Standstill.over(imu, noise)
+    residual = still.residual(state.R_WB, state.v_WB, state.bias_gyro_B, state.bias_accel_B)
+    H = still.jacobian(state.first[0] if first_estimates else state.R_WB)
+    variance = still.sigma**2
     S = H @ state.cov[:IMU, :IMU] @ H.T + np.diag(variance)
     if residual @ np.linalg.solve(S, residual) > STANDSTILL_GATE:
         return False

@@ -43,6 +43,16 @@ class StateArrays:
             self.R_WB[part], self.p_WB[part], self.v_WB[part], self.bias_gyro_B[part], self.bias_accel_B[part]
         )
 
+    def append(self, other: StateArrays) -> StateArrays:
+        """These, then the ``other`` ones."""
+        return StateArrays(
+            np.concatenate([self.R_WB, other.R_WB]),
+            np.concatenate([self.p_WB, other.p_WB]),
+            np.concatenate([self.v_WB, other.v_WB]),
+            np.concatenate([self.bias_gyro_B, other.bias_gyro_B]),
+            np.concatenate([self.bias_accel_B, other.bias_accel_B]),
+        )
+
     def unstack(self, t_ns: Int) -> list[NavState]:
         """One by one again, with their stamps (K,)."""
         parts = (self.R_WB, self.p_WB, self.v_WB, self.bias_gyro_B, self.bias_accel_B)
@@ -77,6 +87,8 @@ class ImuFactors:
 
     @staticmethod
     def stack(measurements: Sequence[Preintegrated]) -> ImuFactors:
+        if not measurements:
+            return _NO_FACTORS
         cov = np.stack([m.cov for m in measurements])
         return ImuFactors(
             np.array([m.dt_s for m in measurements]),
@@ -134,3 +146,12 @@ class ImuFactors:
         r[:, DBG] = j.bias_gyro_B - i.bias_gyro_B
         r[:, DBA] = j.bias_accel_B - i.bias_accel_B
         return r, R_BiW, p_i, v_i, correction
+
+
+_NO_FACTORS = ImuFactors(
+    np.empty(0),
+    np.empty((0, 3, 3)),
+    *np.empty((4, 0, 3)),
+    np.empty((0, 9, 6)),
+    np.empty((0, 15, 15)),
+)

@@ -49,9 +49,10 @@ class Preintegrated:
         return preintegrate(self.imu, bias_gyro_B, bias_accel_B, self.noise)
 
     def predict(self, state: NavState) -> NavState:
-        """Where ``state`` leads, with its biases; no covariance."""
+        """Where ``state`` leads, with its biases; with covariance if it has one."""
         dR, dp, dv = self.corrected(state.bias_gyro_B, state.bias_accel_B)
         T = self.dt_s
+        cov = None if state.cov is None else self._propagated(state.R_WB, dR, dp, dv, state.cov)
         return NavState(
             int(self.imu.t_ns[-1]),
             state.R_WB @ dR,
@@ -59,7 +60,20 @@ class Preintegrated:
             state.v_WB + g_W * T + state.R_WB @ dv,
             state.bias_gyro_B,
             state.bias_accel_B,
+            cov,
         )
+
+    def _propagated(self, R_WB: Float, dR: Float, dp: Float, dv: Float, cov: Float) -> Float:
+        """``cov`` (15, 15) of the first state, moved to the second one, with the noise of the readings."""
+        F, G = np.eye(15), np.eye(15)
+        F[DTHETA, DTHETA] = dR.T
+        F[DP, DTHETA], F[DV, DTHETA] = -R_WB @ so3.hat(dp), -R_WB @ so3.hat(dv)
+        F[DP, DV] = self.dt_s * np.eye(3)
+        F[0:9, 9:15] = self.bias_jacobian
+        G[DP, DP] = G[DV, DV] = R_WB  # the measurement's errors are in the first body frame
+        F[DP, 9:15], F[DV, 9:15] = R_WB @ F[DP, 9:15], R_WB @ F[DV, 9:15]
+        out = F @ cov @ F.T + G @ self.cov @ G.T
+        return 0.5 * (out + out.T)
 
 
 def preintegrate(imu: ImuSegment, bias_gyro_B: Float, bias_accel_B: Float, noise: ImuNoise) -> Preintegrated:

@@ -1,0 +1,23 @@
+"""A sliding-window optimiser in the manner of VINS-Mono (Qin, Li, Shen, T-RO 2018), as a back-end."""
+
+from collections.abc import Mapping
+
+from vioframe.hookspecs import hookimpl
+from vioframe.interfaces import Backend, BackendFactory
+from vioframe.options import plugin_factory
+from vioframe.types import Calibration
+from vioframe_sliding_window.options import SlidingWindowOptions
+
+
+def sliding_window(calibration: Calibration, options: SlidingWindowOptions) -> Backend:
+    """Tightly coupled non-linear optimisation over a window of keyframes, with a marginalisation prior."""
+    from vioframe_sliding_window.backend import SlidingWindow
+    from vioframe_sliding_window.warm_up import warm_up
+
+    warm_up(calibration)
+    return SlidingWindow(calibration, options)
+
+
+@hookimpl
+def vioframe_backends() -> Mapping[str, BackendFactory]:
+    return {"sliding_window": plugin_factory(sliding_window, SlidingWindowOptions)}

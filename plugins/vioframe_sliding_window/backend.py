@@ -1,0 +1,162 @@
+"""The optimiser as a recipe: :meth:`SlidingWindow.process` and :meth:`SlidingWindow._estimate` read top to bottom.
+
+Qin, Li, Shen, "VINS-Mono: A Robust and Versatile Monocular Visual-Inertial State Estimator", T-RO 2018, with first
+estimates kept in the prior and landmarks of three degrees of freedom. Derivation: ``docs/derivations/sliding_window.md``.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from vioframe.inertial.preintegration import join_segments, preintegrate
+from vioframe.initialization import Initializer
+from vioframe.recovery import DivergedError, check_plausible, continued_from, noise_over
+from vioframe.standstill import STANDSTILL_GATE, Standstill, StandstillDetector
+from vioframe.stopwatch import Stopwatch
+from vioframe.types import NS_PER_S, Calibration, Estimate, Float, FrameTracks, ImuSegment, NavState, Status
+from vioframe_sliding_window.options import SlidingWindowOptions
+from vioframe_sliding_window.window import Window
+
+# Landmarks without which a frame counts as blind.
+_MIN_LANDMARKS = 5
+
+
+class SlidingWindow:
+    """One frame at a time; settings in :class:`SlidingWindowOptions`.
+
+    ``initial_state``, with covariance, stands for the state at the first frame and spares the initialisation.
+    """
+
+    def __init__(
+        self,
+        calibration: Calibration,
+        options: SlidingWindowOptions | None = None,
+        initial_state: NavState | None = None,
+    ) -> None:
+        self._calibration = calibration
+        self._options = options or SlidingWindowOptions()
+        self._initializer = Initializer(calibration)
+        self._standstill = StandstillDetector(self._options.standstill_disparity_px)
+        self._window: Window | None = None
+        self._initial_state = initial_state
+        self._before: FrameTracks | None = None
+        self._pending: list[ImuSegment] = []
+        self._last: NavState | None = None
+        self._seeing_ns = 0
+
+    @property
+    def window(self) -> Window | None:
+        """The window; None before initialisation."""
+        return self._window
+
+    def process(self, imu: ImuSegment, tracks: FrameTracks) -> Estimate:
+        """Initialise, or estimate one frame; where that fails it says so and starts again from where it was."""
+        velocity = self._image_velocity(tracks)
+        if self._window is None:
+            return self._initialise(imu, tracks, velocity)
+        try:
+            estimate = self._estimate(self._window, imu, tracks, velocity)
+            assert estimate.state is not None
+            check_plausible(estimate.state)
+            self._check_sight(tracks.t_ns)
+        except (DivergedError, np.linalg.LinAlgError) as error:
+            return self._lose(str(error))
+        self._last = estimate.state
+        return estimate
+
+    def _estimate(self, window: Window, imu: ImuSegment, tracks: FrameTracks, velocity: Float) -> Estimate:
+        options, watch = self._options, Stopwatch()
+        self._pending.append(imu)
+        since = join_segments(self._pending)
+        predicted = _predict(window.newest, since, self._calibration)
+        still = self._stands_still(predicted, since, tracks)
+        due = since.duration_s > 1.0 / options.max_rate_hz - 0.5 * imu.duration_s
+        watch.lap("propagate")
+        if not (still or due):
+            return Estimate(Status.TRACKING, predicted, stage_seconds=watch.seconds)
+
+        self._pending.clear()
+        if still:
+            window.hold_still(tracks.t_ns, Standstill.over(since, self._calibration.imu))
+        else:
+            window.add_frame(since, tracks, velocity)
+        window.repropagate()
+        window.triangulate()
+        watch.lap("triangulate")
+        window.optimise()
+        used = window.reject_outliers()
+        watch.lap("optimise")
+        ids, p_WF = window.landmarks()
+        newest = window.newest
+        self._check_jump(predicted, newest)
+        if len(used) >= _MIN_LANDMARKS or still:
+            self._seeing_ns = tracks.t_ns
+        is_keyframe = window.choose_keyframe()
+        if window.is_full:
+            window.marginalise_oldest()
+        watch.lap("marginalise")
+        return Estimate(Status.TRACKING, newest, ids, p_WF, is_keyframe, stage_seconds=watch.seconds)
+
+    def _stands_still(self, predicted: NavState, imu: ImuSegment, tracks: FrameTracks) -> bool:
+        """Whether neither the images nor the readings show motion."""
+        if not (self._standstill.sees_standstill(tracks) and self._options.zero_velocity_update):
+            return False
+        assert predicted.cov is not None
+        still = Standstill.over(imu, self._calibration.imu)
+        residual = still.residual(predicted.R_WB, predicted.v_WB, predicted.bias_gyro_B, predicted.bias_accel_B)
+        H = still.jacobian(predicted.R_WB)
+        S = H @ predicted.cov @ H.T + np.diag(still.sigma**2)
+        return bool(residual @ np.linalg.solve(S, residual) < STANDSTILL_GATE)
+
+    def _initialise(self, imu: ImuSegment, tracks: FrameTracks, velocity: Float) -> Estimate:
+        watch = Stopwatch()
+        self._standstill.sees_standstill(tracks)
+        if self._initial_state is not None:
+            nav, method = self._initial_state, "given"
+            self._initial_state = None
+        else:
+            initial = self._initializer.add(imu, tracks)
+            watch.lap("initialise")
+            if initial is None:
+                refusal = self._initializer.refusal
+                events = (f"initialisation refused: {refusal}",) if refusal else ()
+                return Estimate(Status.INITIALISING, events=events, stage_seconds=watch.seconds)
+            nav, method = initial.states[-1], initial.method
+        if self._last is not None:
+            nav = continued_from(self._last, nav)
+        self._window = Window(nav, tracks, velocity, self._calibration, self._options)
+        self._pending.clear()
+        self._seeing_ns = nav.t_ns
+        self._last = nav
+        return Estimate(Status.TRACKING, nav, events=(f"initialised ({method})",), stage_seconds=watch.seconds)
+
+    def _image_velocity(self, tracks: FrameTracks) -> Float:
+        """(N, 2) motion of the tracks on the z = 1 plane since the frame before, 1/s; zero for new ones."""
+        velocity = np.zeros((len(tracks.ids), 2))
+        before, self._before = self._before, tracks
+        if before is not None and tracks.t_ns > before.t_ns:
+            _, i, j = np.intersect1d(before.ids, tracks.ids, assume_unique=True, return_indices=True)
+            velocity[j] = (tracks.xy_normalised[j] - before.xy_normalised[i]) / (tracks.t_ns - before.t_ns) * NS_PER_S
+        return velocity
+
+    def _check_sight(self, t_ns: int) -> None:
+        blind_s = (t_ns - self._seeing_ns) * 1e-9
+        if blind_s > self._options.max_blind_s:
+            raise DivergedError(f"nothing usable was seen for {blind_s:.1f} s")
+
+    def _check_jump(self, predicted: NavState, newest: NavState) -> None:
+        jump = float(np.linalg.norm(newest.p_WB - predicted.p_WB))
+        if not jump < self._options.max_jump_m:
+            raise DivergedError(f"images moved the position by {jump:.1f} m from where the readings put it")
+
+    def _lose(self, why: str) -> Estimate:
+        self._window = None
+        self._pending.clear()
+        self._initializer.reset()
+        return Estimate(Status.LOST, events=(f"lost: {why}",))
+
+
+def _predict(state: NavState, imu: ImuSegment, calibration: Calibration) -> NavState:
+    """Where the readings lead from ``state``, with covariance."""
+    noise = noise_over(imu, calibration.imu)
+    return preintegrate(imu, state.bias_gyro_B, state.bias_accel_B, noise).predict(state)

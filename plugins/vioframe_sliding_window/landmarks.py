@@ -1,0 +1,49 @@
+"""Landmarks from tracks, and their places in the world."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from vioframe.geometry.triangulation import triangulate
+from vioframe.inertial.imu_factors import StateArrays
+from vioframe.jit import kernel
+from vioframe.types import Float
+from vioframe_sliding_window.problem import Calibrated
+from vioframe_sliding_window.tracks import Bool, Rows
+
+
+def triangulate_tracks(
+    states: StateArrays, camera: Calibrated, seen: Bool, xy: Float, sigma: float
+) -> tuple[Bool, Float]:
+    """Which of F tracks, ``seen`` (F, K) at ``xy`` (F, K, 2), have a trustworthy landmark, and [x y rho] (F, 3)."""
+    R_WC, p_WC = camera_poses(states, camera)
+    known, landmarks = _triangulate_all(R_WC, p_WC, seen, xy, sigma)
+    return known, landmarks
+
+
+def positions(states: StateArrays, camera: Calibrated, hosts: Rows, landmarks: Float) -> Float:
+    """p_WF (L, 3) m of [x y rho] (L, 3) in the frames ``hosts`` (L,)."""
+    R_WC, p_WC = camera_poses(states, camera)
+    p_C = np.column_stack([landmarks[:, :2], np.ones(len(landmarks))]) / landmarks[:, 2:]
+    return (R_WC[hosts] @ p_C[..., None])[..., 0] + p_WC[hosts]
+
+
+def camera_poses(states: StateArrays, camera: Calibrated) -> tuple[Float, Float]:
+    """R_WC (K, 3, 3) and p_WC (K, 3)."""
+    return states.R_WB @ camera.R_BC, states.R_WB @ camera.p_BC + states.p_WB
+
+
+@kernel
+def _triangulate_all(R_WC, p_WC, seen, xy, sigma):
+    count = len(seen)
+    known = np.zeros(count, dtype=np.bool_)
+    landmarks = np.zeros((count, 3))
+    for i in range(count):
+        views = np.flatnonzero(seen[i])
+        ok, p_WF = triangulate(R_WC[views], p_WC[views], xy[i][views], sigma)
+        if ok:
+            host = views[0]
+            p_C = R_WC[host].T @ (p_WF - p_WC[host])
+            known[i] = True
+            landmarks[i, 0], landmarks[i, 1], landmarks[i, 2] = p_C[0] / p_C[2], p_C[1] / p_C[2], 1.0 / p_C[2]
+    return known, landmarks

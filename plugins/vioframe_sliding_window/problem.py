@@ -1,0 +1,219 @@
+"""What the solver minimises: prior, readings, standstill and sightings over the states of the window, and calibration.
+
+The error vector is [dtheta dp dv dbg dba] of every state, oldest first, then [dtheta_BC dp_BC d_offset]; landmarks are
+eliminated before it is solved for (Triggs et al., "Bundle Adjustment: A Modern Synthesis", 2000, section 6.1).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vioframe.geometry import so3
+from vioframe.inertial.imu_factors import ImuFactors, StateArrays
+from vioframe.standstill import Standstill
+from vioframe.types import Float, NavState
+from vioframe_sliding_window.reprojection import CALIBRATION_SIZE, Poses, Sightings, eliminate
+
+STATE_SIZE = 15
+
+
+@dataclass(frozen=True, slots=True)
+class Calibrated:
+    """The calibration that is estimated: the camera on the body, and what is left of the time offset, s."""
+
+    R_BC: Float
+    p_BC: Float
+    offset_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class Variables:
+    """K states, the calibration, and L landmarks [x y rho]."""
+
+    states: StateArrays
+    camera: Calibrated
+    landmarks: Float
+
+    def retract(self, step: Float, landmark_step: Float) -> Variables:
+        """Moved by ``step`` (15 K + 7,) and ``landmark_step`` (L, 3)."""
+        d = step[-CALIBRATION_SIZE:]
+        camera = Calibrated(
+            self.camera.R_BC @ so3.exp(d[:3]), self.camera.p_BC + d[3:6], float(self.camera.offset_s + d[6])
+        )
+        states = self.states.retract(step[:-CALIBRATION_SIZE].reshape(-1, STATE_SIZE))
+        return Variables(states, camera, self.landmarks + landmark_step)
+
+
+@dataclass(frozen=True, slots=True)
+class Prior:
+    """What is known from frames that have left the window: half dx^T H dx + b^T dx about first estimates.
+
+    ``states`` and ``camera`` are the first estimates; ``frozen`` (K,) are the states that the prior knows of, to which
+    alone they matter. ``H`` (n, n) is zero for the others.
+    """
+
+    H: Float
+    b: Float
+    states: StateArrays
+    camera: Calibrated
+    frozen: NDArray[np.bool_]
+
+    @staticmethod
+    def of(state: NavState, camera: Calibrated, camera_sigma: Float) -> Prior:
+        """On a single state with covariance, and on the calibration with standard deviations (7,)."""
+        assert state.cov is not None
+        H = np.zeros((STATE_SIZE + CALIBRATION_SIZE, STATE_SIZE + CALIBRATION_SIZE))
+        H[:STATE_SIZE, :STATE_SIZE] = np.linalg.inv(state.cov)
+        H[STATE_SIZE:, STATE_SIZE:] = np.diag(camera_sigma**-2.0)
+        return Prior(H, np.zeros(len(H)), StateArrays.stack([state]), camera, np.ones(1, dtype=bool))
+
+    def with_state(self, states: StateArrays) -> Prior:
+        """The same on the window ``states`` (K + 1), of which it does not know the newest."""
+        old = np.r_[
+            0 : len(self.b) - CALIBRATION_SIZE, len(self.b) + STATE_SIZE - CALIBRATION_SIZE : len(self.b) + STATE_SIZE
+        ]
+        H, b = np.zeros((len(self.b) + STATE_SIZE, len(self.b) + STATE_SIZE)), np.zeros(len(self.b) + STATE_SIZE)
+        H[np.ix_(old, old)], b[old] = self.H, self.b
+        return Prior(H, b, self.first(states[:-1]).append(states[-1:]), self.camera, np.append(self.frozen, False))
+
+    def without_newest(self) -> Prior:
+        """The same without the newest state, of which it must not know."""
+        assert not self.frozen[-1]
+        at = len(self.b) - CALIBRATION_SIZE - STATE_SIZE
+        keep = np.r_[0:at, at + STATE_SIZE : len(self.b)]
+        return Prior(self.H[np.ix_(keep, keep)], self.b[keep], self.states[:-1], self.camera, self.frozen[:-1])
+
+    def difference(self, x: Variables) -> Float:
+        """``x`` beyond the first estimates, (n,); zero for states that the prior does not know."""
+        d = np.zeros((len(x.states), STATE_SIZE))
+        d[:, :3] = so3.log(np.swapaxes(self.states.R_WB, -1, -2) @ x.states.R_WB)
+        d[:, 3:6] = x.states.p_WB - self.states.p_WB
+        d[:, 6:9] = x.states.v_WB - self.states.v_WB
+        d[:, 9:12] = x.states.bias_gyro_B - self.states.bias_gyro_B
+        d[:, 12:15] = x.states.bias_accel_B - self.states.bias_accel_B
+        d[~self.frozen] = 0.0
+        rotation = so3.log(self.camera.R_BC.T @ x.camera.R_BC)
+        offset = x.camera.offset_s - self.camera.offset_s
+        return np.concatenate([d.ravel(), rotation, x.camera.p_BC - self.camera.p_BC, [offset]])
+
+    def first(self, states: StateArrays) -> StateArrays:
+        """``states``, with the first estimates of those that are frozen in their place."""
+        frozen = self.frozen[:, None]
+        return StateArrays(
+            np.where(frozen[..., None], self.states.R_WB, states.R_WB),
+            np.where(frozen, self.states.p_WB, states.p_WB),
+            np.where(frozen, self.states.v_WB, states.v_WB),
+            np.where(frozen, self.states.bias_gyro_B, states.bias_gyro_B),
+            np.where(frozen, self.states.bias_accel_B, states.bias_accel_B),
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Problem:
+    """``readings`` are between consecutive states, from the first on; ``still`` is standstill by state.
+
+    With ``first_estimates`` Jacobians are taken at the prior's first estimates wherever there are any.
+    """
+
+    prior: Prior
+    readings: ImuFactors
+    still: Mapping[int, Standstill]
+    sightings: Sightings
+    first_estimates: bool
+
+    def cost(self, x: Variables) -> float:
+        """Half the sum of squares, robust for the sightings, up to a constant."""
+        d = self.prior.difference(x)
+        total = 0.5 * d @ self.prior.H @ d + self.prior.b @ d
+        total += self.sightings.cost(*self._seen_from(x))
+        r = self._reading_residuals(x.states)
+        total += 0.5 * float((r * r).sum())
+        for k, still in self.still.items():
+            total += 0.5 * float(((_still_residual(still, x.states, k) / still.sigma) ** 2).sum())
+        return float(total)
+
+    def linearise(self, x: Variables) -> Normal:
+        """The normal equations at ``x``."""
+        K = len(x.states)
+        first = self.prior.first(x.states) if self.first_estimates else x.states
+        d = self.prior.difference(x)
+        H, b = self.prior.H.copy(), self.prior.b + self.prior.H @ d
+        self._add_readings(H, b, x.states, first)
+        for k, still in self.still.items():
+            residual = _still_residual(still, x.states, k) / still.sigma
+            J = -still.jacobian(first.R_WB[k]) / still.sigma[:, None]
+            at = slice(STATE_SIZE * k, STATE_SIZE * (k + 1))
+            H[at, at] += J.T @ J
+            b[at] += J.T @ residual
+        poses, *rest = self._seen_from(x)
+        first_poses = Poses.of(first.R_WB, first.p_WB) if self.first_estimates else poses
+        H_visual, b_visual, V, W, c = self.sightings.linearise(poses, first_poses, *rest)
+        columns = pose_columns(K)
+        H[np.ix_(columns, columns)] += H_visual
+        b[columns] += b_visual
+        return Normal(H, b, V, W, c, columns)
+
+    def _seen_from(self, x: Variables) -> tuple[Poses, Float, Float, float, Float]:
+        poses = Poses.of(x.states.R_WB, x.states.p_WB)
+        return poses, x.camera.R_BC, x.camera.p_BC, x.camera.offset_s, x.landmarks
+
+    def _reading_residuals(self, states: StateArrays) -> Float:
+        """Whitened, (count, 15)."""
+        count = len(self.readings.dt_s)
+        r = self.readings.residuals(states[:count], states[1 : count + 1])
+        return np.asarray((self.readings.sqrt_information @ r[..., None])[..., 0])
+
+    def _add_readings(self, H: Float, b: Float, states: StateArrays, first: StateArrays) -> None:
+        count = len(self.readings.dt_s)
+        if not count:
+            return
+        r = self._reading_residuals(states)
+        _, J_i, J_j = self.readings.linearise(first[:count], first[1 : count + 1])
+        J = self.readings.sqrt_information @ np.concatenate([J_i, J_j], axis=2)
+        J_T = np.swapaxes(J, -1, -2)
+        blocks, gradients = J_T @ J, (J_T @ r[..., None])[..., 0]
+        for k in range(count):
+            at = slice(STATE_SIZE * k, STATE_SIZE * (k + 2))
+            H[at, at] += blocks[k]
+            b[at] += gradients[k]
+
+
+@dataclass(frozen=True, slots=True)
+class Normal:
+    """Normal equations [H W^T; W V], gradients b and c; ``W`` (L, 3, m) has the columns ``columns`` (m,) of H."""
+
+    H: Float
+    b: Float
+    V: Float
+    W: Float
+    c: Float
+    columns: NDArray[np.intp]
+
+    def reduced(self, damping: float) -> tuple[Float, Float, tuple[Float, Float, Float]]:
+        """Damped equations S (n, n) and gradient (n,) without the landmarks, and what :meth:`landmark_step` needs."""
+        Y, z, inverse = eliminate(self.V, self.W, self.c, damping)
+        flat = Y.reshape(-1, len(self.columns))
+        S, g = self.H.copy(), self.b.copy()
+        S[np.diag_indices_from(S)] *= 1.0 + damping
+        S[np.ix_(self.columns, self.columns)] -= flat.T @ flat
+        g[self.columns] -= flat.T @ z.ravel()
+        return S, g, (Y, z, inverse)
+
+    def landmark_step(self, step: Float, eliminated: tuple[Float, Float, Float]) -> Float:
+        """(L, 3), given the ``step`` (n,) of the rest."""
+        Y, z, inverse = eliminated
+        return -(np.swapaxes(inverse, -1, -2) @ (z + Y @ step[self.columns])[..., None])[..., 0]
+
+
+def _still_residual(still: Standstill, states: StateArrays, k: int) -> Float:
+    return still.residual(states.R_WB[k], states.v_WB[k], states.bias_gyro_B[k], states.bias_accel_B[k])
+
+
+def pose_columns(K: int) -> NDArray[np.intp]:
+    """Indices of [dtheta dp] of every state, and of the calibration, in the error vector of K states."""
+    poses = (STATE_SIZE * np.arange(K)[:, None] + np.arange(6)).ravel()
+    return np.concatenate([poses, STATE_SIZE * K + np.arange(CALIBRATION_SIZE)])

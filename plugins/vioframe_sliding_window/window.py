@@ -1,0 +1,228 @@
+"""The window: its states, readings and tracks, and what they say together. Frames come and go here, and nowhere else."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vioframe.inertial.imu_factors import ImuFactors, StateArrays
+from vioframe.inertial.preintegration import Preintegrated, join_segments, preintegrate
+from vioframe.recovery import noise_over
+from vioframe.standstill import Standstill
+from vioframe.types import NS_PER_S, Calibration, Float, FrameTracks, ImuSegment, Int, NavState
+from vioframe_sliding_window.keyframes import parallax
+from vioframe_sliding_window.landmarks import positions, triangulate_tracks
+from vioframe_sliding_window.marginalisation import marginalise_oldest
+from vioframe_sliding_window.options import SlidingWindowOptions
+from vioframe_sliding_window.problem import STATE_SIZE, Calibrated, Prior, Problem, Variables
+from vioframe_sliding_window.reprojection import CALIBRATION_SIZE, Poses, Sightings
+from vioframe_sliding_window.solver import solve, solve_positive
+from vioframe_sliding_window.tracks import Rows, TrackTable
+
+# Prior standard deviations of the calibration: rad, m, s. Those of OpenVINS on EuRoC.
+_SIGMA_CALIBRATION = np.repeat([0.005, 0.015, 0.01], [3, 3, 1])
+# Biases that moved farther from those the readings were integrated with have them integrated anew, rad/s and m/s^2.
+_REPROPAGATE_GYRO, _REPROPAGATE_ACCEL = 0.01, 0.1
+
+
+class Window:
+    """K states, the newest last, and all factors between them.
+
+    It begins with one state, whose covariance is the first prior, and the tracks of its frame. ``velocity`` (N, 2) 1/s
+    is the motion of tracks on the z = 1 plane, here and in :meth:`add_frame`.
+    """
+
+    def __init__(
+        self,
+        state: NavState,
+        tracks: FrameTracks,
+        velocity: Float,
+        calibration: Calibration,
+        options: SlidingWindowOptions,
+    ) -> None:
+        self._noise = calibration.imu
+        self._options = options
+        self._focal_px = calibration.camera.focal_px
+        self._sigma = options.pixel_sigma / self._focal_px
+        self._t_ns = [state.t_ns]
+        self._states = StateArrays.stack([state])
+        self._camera = Calibrated(calibration.R_BC, calibration.p_BC, 0.0)
+        self._prior = Prior.of(state, self._camera, _SIGMA_CALIBRATION)
+        self._readings: list[Preintegrated] = []
+        self._still: dict[int, Standstill] = {}
+        self._newest_is_keyframe = True
+        self._cov = state.cov
+        self.tracks = TrackTable()
+        self.tracks.add_frame(tracks, velocity)
+
+    def __len__(self) -> int:
+        return len(self._t_ns)
+
+    @property
+    def newest(self) -> NavState:
+        """The newest state, with covariance."""
+        return replace(self._states[-1:].unstack(np.array(self._t_ns[-1:]))[0], cov=self._cov)
+
+    @property
+    def camera(self) -> Calibrated:
+        return self._camera
+
+    @property
+    def prior(self) -> Prior:
+        return self._prior
+
+    def add_frame(self, imu: ImuSegment, tracks: FrameTracks, velocity: Float) -> None:
+        """Append the frame that ``imu`` leads to from the newest one, which gives way if it is no keyframe."""
+        noise = noise_over(imu, self._noise)
+        newest = self.newest
+        predicted = preintegrate(imu, newest.bias_gyro_B, newest.bias_accel_B, noise).predict(newest)
+        if not self._newest_is_keyframe:
+            imu = join_segments([self._readings[-1].imu, imu])
+            noise = noise_over(imu, self._noise)
+            self._drop_newest()
+        base = self._states[-1:]
+        self._readings.append(preintegrate(imu, base.bias_gyro_B[0], base.bias_accel_B[0], noise))
+        self._t_ns.append(predicted.t_ns)
+        self._states = self._states.append(StateArrays.stack([predicted]))
+        self._prior = self._prior.with_state(self._states)
+        self.tracks.add_frame(tracks, velocity)
+        self._newest_is_keyframe = False
+
+    @property
+    def is_full(self) -> bool:
+        """Whether the oldest state has to go before another frame comes."""
+        return self._newest_is_keyframe and len(self) > self._options.window_size
+
+    def choose_keyframe(self) -> bool:
+        """Decide whether the newest frame stays in the window, and say so."""
+        if not self._newest_is_keyframe:
+            options, k = self._options, len(self) - 1
+            R_WC = self._states.R_WB @ self._camera.R_BC
+            common, moved = parallax(self.tracks, k - 1, k, R_WC[k - 1].T @ R_WC[k])
+            self._newest_is_keyframe = (
+                moved * self._focal_px >= options.keyframe_parallax_px
+                or common < options.keyframe_min_tracks
+                or self._t_ns[k] - self._t_ns[k - 1] >= options.keyframe_interval_s * NS_PER_S
+            )
+        return self._newest_is_keyframe
+
+    def hold_still(self, t_ns: int, still: Standstill) -> None:
+        """The body has not moved from the newest state until ``t_ns``, which the readings ``still`` bear out."""
+        k = len(self) - 1
+        self._still[k] = self._still[k].and_then(still) if k in self._still else still
+        self._t_ns[-1] = t_ns
+        self._newest_is_keyframe = True
+
+    def _drop_newest(self) -> None:
+        self.tracks.drop_frame(len(self) - 1)
+        self._t_ns.pop()
+        self._readings.pop()
+        self._states = self._states[:-1]
+        self._prior = self._prior.without_newest()
+
+    def triangulate(self) -> None:
+        """Find the landmarks of tracks that have been seen often enough."""
+        tracks = self.tracks
+        rows = np.flatnonzero(~tracks.known & (tracks.seen.sum(axis=1) >= self._options.min_observations))
+        known, landmarks = triangulate_tracks(
+            self._states, self._camera, tracks.seen[rows], tracks.xy[rows], self._sigma
+        )
+        tracks.landmarks[rows], tracks.known[rows] = landmarks, known
+
+    def repropagate(self) -> None:
+        """Integrate readings anew where the biases have moved far from those they were integrated with."""
+        for k, reading in enumerate(self._readings):
+            gyro, accel = self._states.bias_gyro_B[k], self._states.bias_accel_B[k]
+            if (
+                np.linalg.norm(gyro - reading.bias_gyro_B) > _REPROPAGATE_GYRO
+                or np.linalg.norm(accel - reading.bias_accel_B) > _REPROPAGATE_ACCEL
+            ):
+                self._readings[k] = reading.repropagated(gyro, accel)
+
+    def optimise(self) -> int:
+        """Move states, calibration and landmarks to where all factors agree best; returns the number of steps."""
+        options, rows = self._options, np.flatnonzero(self.tracks.known)
+        problem = self._problem(rows)
+        solution = solve(
+            problem, self._variables(rows), self._active(), options.max_iterations, 1e-3 * options.max_solve_ms
+        )
+        x = solution.variables
+        self._states, self._camera, self.tracks.landmarks[rows] = x.states, x.camera, x.landmarks
+        S, _, _ = problem.linearise(x).reduced(0.0)
+        self._cov = self._newest_covariance(S)
+        return solution.iterations
+
+    def reject_outliers(self) -> Rows:
+        """Drop tracks that do not fit; returns the rows of those that do."""
+        tracks = self.tracks
+        rows = np.flatnonzero(tracks.known)
+        x = self._variables(rows)
+        poses = Poses.of(x.states.R_WB, x.states.p_WB)
+        camera = x.camera
+        errors = self._sightings(rows).errors(poses, camera.R_BC, camera.p_BC, camera.offset_s, x.landmarks)
+        bad = (errors * self._options.pixel_sigma > self._options.outlier_px) | (x.landmarks[:, 2] <= 0.0)
+        keep = np.ones(len(tracks.ids), dtype=bool)
+        keep[rows[bad]] = False
+        tracks.keep(keep)
+        return np.flatnonzero(tracks.known)
+
+    def landmarks(self) -> tuple[Int, Float]:
+        """Ids (L,) and positions p_WF (L, 3) m of the known landmarks."""
+        rows = np.flatnonzero(self.tracks.known)
+        p_WF = positions(self._states, self._camera, self.tracks.hosts[rows], self.tracks.landmarks[rows])
+        return self.tracks.ids[rows], p_WF
+
+    def marginalise_oldest(self) -> None:
+        """Turn what the oldest state and its landmarks say about the rest into the prior, and let go of them."""
+        tracks = self.tracks
+        rows = np.flatnonzero(tracks.known & (tracks.hosts == 0))
+        problem = self._problem(rows, readings=1, oldest_only=True)
+        self._prior = marginalise_oldest(problem, self._variables(rows))
+        tracks.forget(rows)
+        tracks.drop_frame(0)
+        self._t_ns.pop(0)
+        self._readings.pop(0)
+        self._states = self._states[1:]
+        self._still = {k - 1: still for k, still in self._still.items() if k > 0}
+
+    def _variables(self, rows: Rows) -> Variables:
+        return Variables(self._states, self._camera, self.tracks.landmarks[rows])
+
+    def _problem(self, rows: Rows, readings: int | None = None, *, oldest_only: bool = False) -> Problem:
+        still = {k: s for k, s in self._still.items() if k == 0} if oldest_only else self._still
+        return Problem(
+            self._prior,
+            ImuFactors.stack(self._readings[:readings]),
+            still,
+            self._sightings(rows),
+            self._options.first_estimate_jacobians,
+        )
+
+    def _sightings(self, rows: Rows) -> Sightings:
+        options, tracks = self._options, self.tracks
+        return Sightings(
+            tracks.seen[rows],
+            tracks.xy[rows],
+            tracks.velocity[rows],
+            self._sigma,
+            options.cauchy_sigmas,
+            options.residual == "sphere",
+        )
+
+    def _active(self) -> NDArray[np.intp]:
+        """The entries of the error vector that are estimated."""
+        options, n = self._options, STATE_SIZE * len(self)
+        active = np.ones(n + CALIBRATION_SIZE, dtype=bool)
+        active[n : n + 6] = options.calibrate_extrinsics
+        active[n + 6] = options.calibrate_time_offset
+        return np.flatnonzero(active)
+
+    def _newest_covariance(self, S: Float) -> Float:
+        active = self._active()
+        at = STATE_SIZE * (len(self) - 1)
+        unit = np.zeros((len(active), STATE_SIZE))
+        unit[at : at + STATE_SIZE] = np.eye(STATE_SIZE)
+        cov = solve_positive(S[np.ix_(active, active)], unit)[at : at + STATE_SIZE]
+        return 0.5 * (cov + cov.T)
