@@ -20,7 +20,7 @@ from ruamel.yaml.error import YAMLError
 from vioframe.errors import ConfigError
 from vioframe.frontend import FrontendOptions
 from vioframe.options import Option, did_you_mean, options_of, validate_options
-from vioframe.registry import BACKEND, DETECTOR, Registry
+from vioframe.registry import BACKEND, DETECTOR, LOOP_CLOSER, Registry
 
 SectionT = TypeVar("SectionT", bound="Section")
 
@@ -40,7 +40,7 @@ class DatasetConfig(Section):
 
 
 class PartConfig(Section):
-    """A detector or back-end by name, and its options."""
+    """A detector, back-end or loop closer by name, and its options."""
 
     name: str
     options: dict[str, Any] = {}
@@ -52,6 +52,7 @@ class Config(Section):
     dataset: DatasetConfig = DatasetConfig()
     detector: PartConfig = PartConfig(name="shi_tomasi")
     backend: PartConfig = PartConfig(name="msckf")
+    loop_closure: PartConfig | None = Field(default=None, description="loop closer (name, options); null: none")
     frontend: dict[str, Any] = {}
     ground_truth: Path | None = Field(default=None, description="trajectory file (TUM, or EuRoC csv) to compare with")
     start_s: float = Field(default=0.0, ge=0.0, allow_inf_nan=False, description="seconds skipped at the start")
@@ -141,6 +142,11 @@ def complete(config: Config, registry: Registry) -> Config:
         ),
         "frontend": validate_options("the front-end", FrontendOptions, config.frontend),
     }
+    if config.loop_closure is not None:
+        parts["loop_closure"] = PartConfig(
+            name=config.loop_closure.name,
+            options=registry.find(LOOP_CLOSER, config.loop_closure.name).validate(config.loop_closure.options),
+        )
     FrontendOptions(**parts["frontend"])  # raises on a value out of range
     if config.dataset.path is not None:
         reader = registry.find_reader(config.dataset.path, config.dataset.reader)
@@ -161,7 +167,11 @@ def render(config: Config, registry: Registry) -> str:
     lines += ["dataset:", *_entry("path", dataset.path, "bag or folder to read", 1)]
     lines += _entry("reader", dataset.reader, "null: the one that accepts the path", 1)
     lines += _options("options", dataset.options, options.get("dataset", []), 1)
-    for section, part in (("detector", config.detector), ("backend", config.backend)):
+    for section in ("detector", "backend", "loop_closure"):
+        part = getattr(config, section)
+        if part is None:
+            lines += _entry(section, None, Config.model_fields[section].description or "", 0)
+            continue
         lines += [f"{section}:", *_entry("name", part.name, "", 1)]
         lines += _options("options", part.options, options[section], 1)
     lines += _options("frontend", config.frontend, options["frontend"], 0)
@@ -176,6 +186,8 @@ def _options_by_section(config: Config, registry: Registry) -> dict[str, list[Op
         "backend": registry.find(BACKEND, config.backend.name).options,
         "frontend": options_of(FrontendOptions),
     }
+    if config.loop_closure is not None:
+        sections["loop_closure"] = registry.find(LOOP_CLOSER, config.loop_closure.name).options
     if config.dataset.path is not None:
         sections["dataset"] = registry.find_reader(config.dataset.path, config.dataset.reader).options
     return sections

@@ -6,7 +6,8 @@ The command line and the benchmarks both come through here; :mod:`vioframe.pipel
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, field
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
 from itertools import chain
 from pathlib import Path
 from time import perf_counter
@@ -18,11 +19,11 @@ from vioframe.calibration import write_calibration
 from vioframe.config import Config
 from vioframe.errors import DatasetError, PluginError, RunError, VioframeError
 from vioframe.incidents import Incidents
-from vioframe.interfaces import Backend, Dataset, Detector
+from vioframe.interfaces import Backend, Dataset, Detector, LoopCloser
 from vioframe.recorder import Recorder, new_run_folder, write_json
-from vioframe.registry import BACKEND, DATASET, DETECTOR, Registry, describe
+from vioframe.registry import BACKEND, DATASET, DETECTOR, LOOP_CLOSER, Registry, describe
 from vioframe.trajectory import Trajectory, load_trajectory, write_tum
-from vioframe.types import Step
+from vioframe.types import LoopClosure, Step
 
 # More threads than this gain nothing on images of this size, and cost on machines that have many.
 _MAX_OPENCV_THREADS = 4
@@ -38,6 +39,7 @@ class Experiment:
     detector: Detector
     backend: Backend
     ground_truth: Trajectory | None
+    loop_closer: LoopCloser | None = None
     incidents: Incidents = field(default_factory=Incidents)
 
     @property
@@ -45,33 +47,54 @@ class Experiment:
         return f"{self.dataset.name}_{self.config.detector.name}_{self.config.backend.name}"
 
     def steps(self) -> Iterator[Step]:
-        """The main loop; what a plug-in raises comes out as a :class:`PluginError` that names it."""
+        """The main loop, the loop closer taking part; errors come out as :meth:`_blaming_plugins` says."""
         import cv2
         from threadpoolctl import threadpool_limits
 
         cv2.setNumThreads(min(cv2.getNumThreads(), _MAX_OPENCV_THREADS))
         # numpy and scipy bring a BLAS each; on matrices this small their threads only wait for one another.
-        with threadpool_limits(1):
-            try:
-                yield from pipeline.run(
-                    self.dataset,
-                    self.detector,
-                    self.backend,
-                    self.config.frontend_options,
-                    start_s=self.config.start_s,
-                    duration_s=self.config.duration_s,
-                    incidents=self.incidents,
-                )
-            except VioframeError:
+        with threadpool_limits(1), self._blaming_plugins():
+            steps = pipeline.run(
+                self.dataset,
+                self.detector,
+                self.backend,
+                self.config.frontend_options,
+                start_s=self.config.start_s,
+                duration_s=self.config.duration_s,
+                incidents=self.incidents,
+            )
+            yield from steps if self.loop_closer is None else _closing_loops(steps, self.loop_closer)
+
+    def close_loops(self) -> LoopClosure | None:
+        """What the loop closer, if any, made of all steps; to be called once they are through."""
+        if self.loop_closer is None:
+            return None
+        with self._blaming_plugins():
+            return self.loop_closer.finish()
+
+    @contextmanager
+    def _blaming_plugins(self) -> Iterator[None]:
+        """What a plug-in raises comes out as a :class:`PluginError` that names it."""
+        try:
+            yield
+        except VioframeError:
+            raise
+        except (Exception, SystemExit) as error:
+            if isinstance(error.__cause__, KeyboardInterrupt):
+                # Ctrl-C within compiled code comes out as a SystemError.
+                raise KeyboardInterrupt from error
+            source = self.registry.blame(error.__traceback__)
+            if source is None:
                 raise
-            except (Exception, SystemExit) as error:
-                if isinstance(error.__cause__, KeyboardInterrupt):
-                    # Ctrl-C within compiled code comes out as a SystemError.
-                    raise KeyboardInterrupt from error
-                source = self.registry.blame(error.__traceback__)
-                if source is None:
-                    raise
-                raise PluginError(f"plug-in {source.entry_point!r} ({source}) failed: {describe(error)}") from error
+            raise PluginError(f"plug-in {source.entry_point!r} ({source}) failed: {describe(error)}") from error
+
+
+def _closing_loops(steps: Iterable[Step], loop_closer: LoopCloser) -> Iterator[Step]:
+    """``steps`` as ``loop_closer`` has seen them, with the time that took."""
+    for step in steps:
+        begin = perf_counter()
+        loop_closer.add(step)
+        yield replace(step, stage_seconds={**step.stage_seconds, "loop_closure": perf_counter() - begin})
 
 
 def prepare(config: Config, registry: Registry) -> Experiment:
@@ -87,6 +110,9 @@ def prepare(config: Config, registry: Registry) -> Experiment:
         registry.create_detector(config.detector.name, config.detector.options),
         registry.create_backend(config.backend.name, dataset.calibration, config.backend.options),
         dataset.ground_truth if config.ground_truth is None else load_trajectory(config.ground_truth),
+        None
+        if config.loop_closure is None
+        else registry.create_loop_closer(config.loop_closure.name, dataset.calibration, config.loop_closure.options),
     )
 
 
@@ -128,6 +154,8 @@ def _write(
             for step in steps:
                 recorder.add(step)
                 on_step(step)
+            if (loop_closure := experiment.close_loops()) is not None:
+                recorder.add_loop_closure(loop_closure)
         except BaseException as error:
             error.add_note(f"what was estimated until then is in {folder}")
             raise
@@ -137,11 +165,14 @@ def _write(
 def _about(experiment: Experiment) -> dict[str, Any]:
     config = experiment.config
     chosen = {DATASET: config.dataset.reader or "", DETECTOR: config.detector.name, BACKEND: config.backend.name}
+    if config.loop_closure is not None:
+        chosen[LOOP_CLOSER] = config.loop_closure.name
     return {
         "name": experiment.name,
         "dataset": experiment.dataset.name,
         "detector": config.detector.name,
         "backend": config.backend.name,
+        "loop_closer": None if config.loop_closure is None else config.loop_closure.name,
         "plugins": {kind.name: str(experiment.registry.find(kind, name).source) for kind, name in chosen.items()},
         "start_s": config.start_s,
         "duration_s": config.duration_s,

@@ -1,4 +1,4 @@
-"""The hooks through which every detector, back-end, reader, flight and world comes in, the built-in ones included.
+"""The hooks through which every part comes in, the built-in ones included.
 
 A plug-in is a module that implements any of these with :data:`hookimpl` and is named in the ``vioframe`` entry-point
 group of its distribution. Factories should import heavy libraries inside, so that listing plug-ins stays quick.
@@ -8,7 +8,14 @@ from collections.abc import Mapping
 
 import pluggy
 
-from vioframe.interfaces import BackendFactory, DatasetFactory, DetectorFactory, FlightFactory, WorldFactory
+from vioframe.interfaces import (
+    BackendFactory,
+    DatasetFactory,
+    DetectorFactory,
+    FlightFactory,
+    LoopCloserFactory,
+    WorldFactory,
+)
 
 PROJECT = "vioframe"
 hookspec = pluggy.HookspecMarker(PROJECT)
@@ -23,6 +30,11 @@ def vioframe_detectors() -> Mapping[str, DetectorFactory]:  # type: ignore[empty
 @hookspec
 def vioframe_backends() -> Mapping[str, BackendFactory]:  # type: ignore[empty-body]
     """Map names to factories: ``factory(calibration, **options) -> Backend``."""
+
+
+@hookspec
+def vioframe_loop_closers() -> Mapping[str, LoopCloserFactory]:  # type: ignore[empty-body]
+    """Map names to factories: ``factory(calibration, **options) -> LoopCloser``."""
 
 
 @hookspec

@@ -6,7 +6,18 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
-from vioframe.types import Calibration, Estimate, Float, FrameTracks, Image, ImuSegment, Keypoints, Measurement
+from vioframe.types import (
+    Calibration,
+    Estimate,
+    Float,
+    FrameTracks,
+    Image,
+    ImuSegment,
+    Keypoints,
+    LoopClosure,
+    Measurement,
+    Step,
+)
 
 if TYPE_CHECKING:
     from vioframe.simulation.flights import Motion
@@ -29,6 +40,22 @@ class Backend(Protocol):
 
     def process(self, imu: ImuSegment, tracks: FrameTracks) -> Estimate:
         """Take the readings since the last frame and the tracks of this one; say what is known now."""
+        ...
+
+
+@runtime_checkable
+class LoopCloser(Protocol):
+    """Recognises places and takes out the drift between them; a consumer of the main loop's steps, of any back-end."""
+
+    def add(self, step: Step) -> None:
+        """Take in one frame and its estimate, quickly: long work belongs into a thread or process beside the loop.
+
+        The result may depend on the steps only, not on how long anything took.
+        """
+        ...
+
+    def finish(self) -> LoopClosure:
+        """The corrected poses of all tracked frames; called once, after the last step."""
         ...
 
 
@@ -104,5 +131,6 @@ class World(Protocol):
 
 DetectorFactory = Callable[..., Detector]
 BackendFactory = Callable[..., Backend]
+LoopCloserFactory = Callable[..., LoopCloser]
 FlightFactory = Callable[..., Flight]
 WorldFactory = Callable[..., World]

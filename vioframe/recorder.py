@@ -6,6 +6,7 @@
     tracks.csv       every feature observation                     ground_truth.tum where there is one
     timings.csv      seconds, a column a stage                     map.ply          landmarks, written at the end
     calibration/     as it was given, in EuRoC's format
+    trajectory_loop.tum, loops.csv  poses corrected by loop closure, and the loops, where a run has it
 
 Each frame is flushed as it comes, so an interrupted run leaves what it had, with ``finished: false`` in its summary.
 All but the timings, the machine and the summary's clock-dependent figures are the same byte for byte in every run.
@@ -27,8 +28,8 @@ import numpy as np
 
 from vioframe.errors import PluginError, RunError
 from vioframe.incidents import Incidents
-from vioframe.trajectory import tum_line
-from vioframe.types import NS_PER_S, Float, NavState, Status, Step
+from vioframe.trajectory import tum_line, write_tum
+from vioframe.types import NS_PER_S, Float, LoopClosure, NavState, Status, Step
 
 STATE_COLUMNS = (
     "t_ns",
@@ -36,6 +37,7 @@ STATE_COLUMNS = (
     *(f"cov_{i}" for i in range(15)),
 )
 POSE_COV_COLUMNS = ("t_ns", *(f"c{i}{j}" for i in range(6) for j in range(i, 6)))
+LOOP_COLUMNS = ("earlier_t_ns", "later_t_ns", "x_m", "y_m", "z_m", "yaw_rad", "inliers", "accepted", "weight")
 _UPPER = np.triu_indices(6)
 
 
@@ -90,6 +92,7 @@ class Recorder:
         self._timings: list[tuple[int, Mapping[str, float]]] = []
         self._landmarks: dict[int, Float] = {}
         self._statuses: list[Status] = []
+        self._segments: list[dict[str, int]] = []
         self._events: list[dict[str, Any]] = []
         self._stage_totals: Counter[str] = Counter()
         self._frame_seconds = 0.0
@@ -124,12 +127,33 @@ class Recorder:
         self._add_timings(t_ns, step.stage_seconds)
         self._frame_seconds += sum(seconds for stage, seconds in step.stage_seconds.items() if "." not in stage)
         self._events += [{"t_ns": t_ns, "event": event} for event in estimate.events]
-        if self._statuses and self._statuses[-1] is Status.TRACKING and estimate.status is not Status.TRACKING:
+        tracked_before = bool(self._statuses) and self._statuses[-1] is Status.TRACKING
+        if tracked_before and estimate.status is not Status.TRACKING:
             self._landmarks.clear()  # a new start is a new world: old landmarks do not belong to it
         self._statuses.append(estimate.status)
         if estimate.status is Status.TRACKING and estimate.state is not None:
+            if not (tracked_before and self._segments):
+                self._segments.append({"first_t_ns": t_ns, "last_t_ns": t_ns, "poses": 0})
+            self._segments[-1]["last_t_ns"] = t_ns
+            self._segments[-1]["poses"] += 1
             self._add_state(t_ns, estimate.state)
             self._landmarks.update(zip(estimate.landmark_ids.tolist(), estimate.p_WF, strict=True))
+
+    def add_loop_closure(self, result: LoopClosure) -> None:
+        """Write what a loop closer made of the run."""
+        if result.trajectory is not None:
+            write_tum(result.trajectory, self.folder / "trajectory_loop.tum")
+        self._append("loops.csv", ",".join(LOOP_COLUMNS) + "\n")
+        for loop in result.loops:
+            row = [loop.later_t_ns, *(f"{x:.9g}" for x in (*loop.p_L, loop.yaw)), loop.inliers, int(loop.accepted)]
+            self._append("loops.csv", f"{loop.earlier_t_ns},{','.join(map(str, row))},{loop.weight:.9g}\n")
+        accepted = sum(loop.accepted for loop in result.loops)
+        self.summary["loop_closure"] = {
+            "keyframes": len(result.keyframe_t_ns),
+            "loops": accepted,
+            "rejected": len(result.loops) - accepted,
+            "seconds_beside": dict(result.stage_seconds),
+        }
 
     def _add_state(self, t_ns: int, state: NavState) -> None:
         cov = np.full((15, 15), np.nan) if state.cov is None else state.cov
@@ -181,6 +205,7 @@ class Recorder:
             "initialised_after_s": None if begin is None else (stamps[begin] - stamps[0]) / NS_PER_S,
             "completion": 0.0 if begin is None else sum(tracking[begin:]) / (frames - begin),
             "resets": sum(before and not now for before, now in pairwise(tracking)),
+            "segments": self._segments,
             "tracked_points_mean": self._points / frames,
             "mean_ms": {stage: 1e3 * self._stage_totals[stage] / frames for stage in self._stages},
             "mean_frame_ms": 1e3 * self._frame_seconds / frames,

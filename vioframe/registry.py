@@ -1,4 +1,4 @@
-"""Finds the parts: detectors, back-ends, readers, flights and worlds come in by name through ``vioframe`` entry points.
+"""Finds the parts: detectors, back-ends, readers and the others come in by name through ``vioframe`` entry points.
 
 pluggy finds the parts once and checks the hooks; after that the names are looked up in plain tables and the parts are
 called directly. A plug-in that cannot be loaded never takes the others down: it is skipped with a warning and listed
@@ -21,7 +21,7 @@ import pluggy
 
 from vioframe import hookspecs
 from vioframe.errors import DatasetError, PluginError, VioframeError
-from vioframe.interfaces import Backend, Dataset, Detector, Flight, World
+from vioframe.interfaces import Backend, Dataset, Detector, Flight, LoopCloser, World
 from vioframe.options import Option, did_you_mean, options_of, plugin_factory, validate_options
 from vioframe.types import Calibration, Float
 
@@ -44,10 +44,11 @@ class Kind:
 
 DETECTOR = Kind("detector", "vioframe_detectors", Detector, 0)
 BACKEND = Kind("backend", "vioframe_backends", Backend, 1)
+LOOP_CLOSER = Kind("loop closer", "vioframe_loop_closers", LoopCloser, 1)
 DATASET = Kind("dataset", "vioframe_datasets", Dataset, 1)
 FLIGHT = Kind("flight", "vioframe_flights", Flight, 2)
 WORLD = Kind("world", "vioframe_worlds", World, 2)
-KINDS = (DETECTOR, BACKEND, DATASET, FLIGHT, WORLD)
+KINDS = (DETECTOR, BACKEND, LOOP_CLOSER, DATASET, FLIGHT, WORLD)
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,6 +137,11 @@ class Registry:
 
     def create_backend(self, name: str, calibration: Calibration, options: Mapping[str, Any] | None = None) -> Backend:
         return cast(Backend, self.find(BACKEND, name).create(calibration, options=options or {}))
+
+    def create_loop_closer(
+        self, name: str, calibration: Calibration, options: Mapping[str, Any] | None = None
+    ) -> LoopCloser:
+        return cast(LoopCloser, self.find(LOOP_CLOSER, name).create(calibration, options=options or {}))
 
     def create_flight(
         self, name: str, duration_s: float, R_LB: Float, options: Mapping[str, Any] | None = None

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 if TYPE_CHECKING:
     from vioframe.geometry.cameras import Camera
+    from vioframe.trajectory import Trajectory
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
@@ -178,6 +179,40 @@ class Step:
     tracks: FrameTracks
     estimate: Estimate
     stage_seconds: Mapping[str, float]
+
+
+@dataclass(frozen=True, slots=True)
+class Loop:
+    """A place seen again: two keyframes, and where the later body is as seen from the earlier one.
+
+    ``p_L`` (3,) m and ``yaw`` rad are in the earlier body's levelled frame L: z is up and x has the body's heading. ``inliers`` is the number of points that support it, ``weight`` what was made of it, from 0 (it was
+    rejected) to 1.
+    """
+
+    earlier_t_ns: int
+    later_t_ns: int
+    p_L: Float
+    yaw: float
+    inliers: int
+    weight: float
+
+    @property
+    def accepted(self) -> bool:
+        return self.weight > 0.5
+
+
+@dataclass(frozen=True, slots=True)
+class LoopClosure:
+    """What a loop closer made of a run: the pose of every tracked frame, corrected, and the loops it found.
+
+    ``trajectory`` is None where nothing was tracked; ``keyframe_t_ns`` (K,) are the frames that loops may tie together.
+    ``stage_seconds`` is the time that was spent beside the main loop.
+    """
+
+    trajectory: Trajectory | None
+    keyframe_t_ns: Int
+    loops: tuple[Loop, ...] = ()
+    stage_seconds: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)

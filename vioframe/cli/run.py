@@ -27,6 +27,7 @@ _FILE = click.Path(path_type=Path)
 @click.argument("data", type=_FILE, required=False)
 @click.option("--detector", metavar="NAME", help="Keypoint detector.  [default: shi_tomasi]")
 @click.option("--backend", metavar="NAME", help="Estimator.  [default: msckf]")
+@click.option("--loop-closure", metavar="NAME", help="Loop closer, such as pose_graph.  [default: none]")
 @click.option("-o", "--option", "options", metavar="KEY=VALUE", multiple=True, help="Set an option of a part.")
 @click.option("--config", "config_file", type=_FILE, help="Configuration file; the other options override it.")
 @click.option("--ground-truth", type=_FILE, help="Trajectory to compare with: TUM or EuRoC csv.")
@@ -60,6 +61,7 @@ def _configure(
     data: Path | None,
     detector: str | None,
     backend: str | None,
+    loop_closure: str | None,
     options: tuple[str, ...],
     config_file: Path | None,
     ground_truth: Path | None,
@@ -71,8 +73,8 @@ def _configure(
     """The configuration file, if any, with the command line's choices over it."""
     config = Config() if config_file is None else configuration.read(config_file)
     tree = config.model_dump()
-    for section, name in (("detector", detector), ("backend", backend)):
-        if name is not None and name != tree[section]["name"]:
+    for section, name in (("detector", detector), ("backend", backend), ("loop_closure", loop_closure)):
+        if name is not None and (tree[section] is None or name != tree[section]["name"]):
             tree[section] = {"name": name}  # the options in the file are those of another part
     if data is not None:
         tree["dataset"]["path"] = data

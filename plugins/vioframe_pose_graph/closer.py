@@ -1,0 +1,108 @@
+"""The loop closer as a recipe: pick keyframes, recognise places in a thread of its own, correct at the end.
+
+Qin, Li, Shen, "VINS-Mono" (T-RO 2018), sections VII and VIII, with other means of retrieval and verification.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from time import perf_counter
+
+import numpy as np
+
+from vioframe.trajectory import Trajectory
+from vioframe.trajectory.alignment import rotation_z, yaw_of
+from vioframe.types import Calibration, Float, Int, Loop, LoopClosure, NavState, Status, Step
+from vioframe_pose_graph.consistency import GATE, believable, sighting_cov
+from vioframe_pose_graph.correction import carry
+from vioframe_pose_graph.drift import Odometry
+from vioframe_pose_graph.graph import Edges, root_of
+from vioframe_pose_graph.keyframes import KeyframeSelector
+from vioframe_pose_graph.options import PoseGraphOptions
+from vioframe_pose_graph.place import Keyframe, Place
+from vioframe_pose_graph.recognition import Recogniser, Sighting
+from vioframe_pose_graph.robust import solve_robustly
+
+
+class PoseGraph:
+    """Recognition sees the keyframes in their order whatever the clock says, so the result is the same every time."""
+
+    def __init__(self, calibration: Calibration, options: PoseGraphOptions | None = None) -> None:
+        self._options = options or PoseGraphOptions()
+        self._selector = KeyframeSelector(calibration, self._options.parallax_px)
+        self._recogniser = Recogniser(calibration, self._options)
+        self._worker = ThreadPoolExecutor(1, "loop-closure")
+        self._waiting: deque[Future[None]] = deque()
+        self._states: list[NavState] = []
+        self._segments: list[int] = []
+
+    def add(self, step: Step) -> None:
+        """Take in a frame; raises what recognition of an earlier one raised."""
+        self._submit(self._selector.add(step))
+        if step.estimate.status is Status.TRACKING and step.estimate.state is not None:
+            self._states.append(step.estimate.state)
+            self._segments.append(self._selector.segment)
+        while self._waiting and self._waiting[0].done():
+            self._waiting.popleft().result()
+
+    def finish(self) -> LoopClosure:
+        """Wait for recognition, believe what is consistent, and correct every frame."""
+        self._submit(self._selector.flush())
+        while self._waiting:
+            self._waiting.popleft().result()
+        self._worker.shutdown()
+        if not self._states:
+            return LoopClosure(None, np.empty(0, np.int64), (), self._recogniser.seconds)
+        return self._close()
+
+    def _submit(self, keyframes: list[Keyframe]) -> None:
+        self._waiting.extend(self._worker.submit(self._recogniser.add, keyframe) for keyframe in keyframes)
+
+    def _close(self) -> LoopClosure:
+        begin = perf_counter()
+        places, sightings = self._recogniser.places, self._recogniser.sightings
+        t_ns = np.array([place.t_ns for place in places])
+        segment = np.array([place.segment for place in places])
+        odometry = Odometry.of(t_ns, np.array([place.p_WB for place in places]), segment, self._options)
+
+        believed = believable(sightings, odometry, t_ns)
+        loops = _edges([s for s, good in zip(sightings, believed, strict=True) if good], odometry)
+        p, yaw, weights = solve_robustly(odometry.p, odometry.edges(), loops, GATE)
+        trajectory = self._corrected(t_ns, segment, odometry.p, p, yaw)
+
+        weight_of = np.zeros(len(sightings))
+        weight_of[believed] = weights
+        found = tuple(_loop(s, places, weight) for s, weight in zip(sightings, weight_of.tolist(), strict=True))
+        return LoopClosure(trajectory, t_ns, found, {**self._recogniser.seconds, "solve": perf_counter() - begin})
+
+    def _corrected(self, t_ns: Int, segment: Int, key_p: Float, p: Float, yaw: Float) -> Trajectory:
+        stamps = np.array([state.t_ns for state in self._states])
+        frames = (
+            stamps,
+            np.array(self._segments),
+            np.array([state.R_WB for state in self._states]),
+            np.array([state.p_WB for state in self._states]),
+        )
+        return Trajectory(stamps, *carry(frames, (t_ns, segment, key_p), p, yaw))
+
+
+def _edges(sightings: Sequence[Sighting], odometry: Odometry) -> Edges:
+    """What the sightings say, as edges of the graph."""
+    earlier = np.array([s.earlier for s in sightings], np.int64)
+    later = np.array([s.later for s in sightings], np.int64)
+    p_AB = np.array([s.relation.p_AB for s in sightings]).reshape(-1, 3)
+    turn = np.array([s.relation.yaw for s in sightings])
+    cov = np.array([sighting_cov(s, odometry) for s in sightings]).reshape(-1, 4, 4)
+    return Edges(earlier, later, p_AB - odometry.p[earlier], turn, root_of(cov))
+
+
+def _loop(sighting: Sighting, places: Sequence[Place], weight: float) -> Loop:
+    """The sighting as it leaves the plug-in: the later body seen from the earlier one, levelled."""
+    earlier, later, relation = places[sighting.earlier], places[sighting.later], sighting.relation
+    heading = float(yaw_of(earlier.R_WB))
+    p_L = rotation_z(heading).T @ (relation.p_AB - earlier.p_WB)
+    yaw = float(yaw_of(later.R_WB)) + relation.yaw - heading
+    yaw = float(np.arctan2(np.sin(yaw), np.cos(yaw)))
+    return Loop(earlier.t_ns, later.t_ns, p_L, yaw, relation.inliers, weight)

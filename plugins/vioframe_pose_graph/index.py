@@ -1,0 +1,107 @@
+"""An inverted index over binary descriptors: which earlier keyframes look like this one?
+
+Multi-index hashing (Norouzi, Punjani, Fleet, CVPR 2012): a descriptor is cut into 16 words of 16 bits, and each word
+has a table from its value to the descriptors that hold it. Two descriptors that differ in few bits agree in some word,
+so looking up 16 lists finds most near ones; each found is then compared in full. No vocabulary has to be learnt.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vioframe.jit import kernel
+from vioframe.types import Float
+from vioframe_pose_graph.hamming import distance
+
+_TABLES, _VALUES = 16, 1 << 16
+_MAX_DISTANCE = 48
+# A longer list belongs to a word that says little: whatever the camera sees, some corners hold it.
+_MAX_LIST = 500
+
+
+class DescriptorIndex:
+    """Grows by a keyframe at a time; keyframes are numbered in the order they are added."""
+
+    def __init__(self) -> None:
+        self._heads = np.full((_TABLES, _VALUES), -1, np.int32)
+        self._lengths = np.zeros((_TABLES, _VALUES), np.int32)
+        self._next = np.empty((_TABLES, 1024), np.int32)
+        self._descriptors = np.empty((1024, 4), np.uint64)
+        self._owners = np.empty(1024, np.int32)
+        self._size = 0
+        self.keyframes = 0
+
+    def add(self, descriptors: NDArray[np.uint64]) -> None:
+        """Add the descriptors (K, 4) of the next keyframe."""
+        end = self._size + len(descriptors)
+        while end > len(self._descriptors):
+            self._next = np.concatenate([self._next, np.empty_like(self._next)], axis=1)
+            self._descriptors = np.concatenate([self._descriptors, np.empty_like(self._descriptors)])
+            self._owners = np.concatenate([self._owners, np.empty_like(self._owners)])
+        self._descriptors[self._size : end] = descriptors
+        self._owners[self._size : end] = self.keyframes
+        words = np.ascontiguousarray(descriptors).view(np.uint16).reshape(-1, _TABLES)
+        _insert(self._heads, self._lengths, self._next, words, self._size)
+        self._size = end
+        self.keyframes += 1
+
+    def similarity(self, descriptors: NDArray[np.uint64], before: int) -> Float:
+        """(before,) for each of the first ``before`` keyframes, the part of ``descriptors`` (K, 4) that is found there.
+
+        A descriptor found in many keyframes tells little about the place, and counts by its inverse frequency.
+        """
+        words = np.ascontiguousarray(descriptors).view(np.uint16).reshape(-1, _TABLES)
+        scores = np.zeros(before)
+        _vote(self._heads, self._lengths, self._next, self._descriptors, self._owners, descriptors, words, scores)
+        return scores / max(len(descriptors), 1)
+
+
+@kernel
+def _insert(
+    heads: NDArray[np.int32],
+    lengths: NDArray[np.int32],
+    following: NDArray[np.int32],
+    words: NDArray[np.uint16],
+    start: int,
+) -> None:
+    for i in range(len(words)):
+        for t in range(_TABLES):
+            value = words[i, t]
+            following[t, start + i] = heads[t, value]
+            heads[t, value] = start + i
+            lengths[t, value] += 1
+
+
+@kernel
+def _vote(
+    heads: NDArray[np.int32],
+    lengths: NDArray[np.int32],
+    following: NDArray[np.int32],
+    descriptors: NDArray[np.uint64],
+    owners: NDArray[np.int32],
+    query: NDArray[np.uint64],
+    words: NDArray[np.uint16],
+    scores: Float,
+) -> None:
+    before = len(scores)
+    last_asked = np.full(before, -1, np.int64)
+    found = np.empty(before, np.int64)
+    for i in range(len(query)):
+        count = 0
+        for t in range(_TABLES):
+            value = words[i, t]
+            if lengths[t, value] > _MAX_LIST:
+                continue
+            entry = heads[t, value]
+            while entry >= 0:
+                owner = owners[entry]
+                if owner < before and last_asked[owner] != i and distance(query[i], descriptors[entry]) < _MAX_DISTANCE:
+                    last_asked[owner] = i
+                    found[count] = owner
+                    count += 1
+                entry = following[t, entry]
+        if count:
+            weight = np.log((before + 1.0) / count)
+            for k in range(count):
+                scores[found[k]] += weight

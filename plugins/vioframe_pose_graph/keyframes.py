@@ -1,0 +1,84 @@
+"""Which frames become keyframes of the graph, and what is known of the features they saw."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+
+from vioframe.types import NS_PER_S, Calibration, Float, FrameTracks, Image, NavState, Status, Step
+from vioframe_pose_graph.place import Keyframe
+
+# A feature may get its position later than the frame that sees it: from the frames that follow.
+_WAIT_NS = NS_PER_S
+_MIN_COMMON = 0.5
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Pending:
+    state: NavState
+    segment: int
+    image: Image
+    tracks: FrameTracks
+
+
+class KeyframeSelector:
+    """Thins the frames of any back-end by how much the picture has moved, turning left out."""
+
+    def __init__(self, calibration: Calibration, parallax_px: float) -> None:
+        self._R_BC = calibration.R_BC
+        self._parallax = parallax_px / calibration.camera.focal_px
+        self._pending: deque[_Pending] = deque()
+        self._last: _Pending | None = None
+        self._p_WF: dict[int, Float] = {}
+        self._tracking = False
+        self.segment = -1
+
+    def add(self, step: Step) -> list[Keyframe]:
+        """Take in a frame; the keyframes, of a second ago, about which everything is known by now."""
+        estimate, state = step.estimate, step.estimate.state
+        if estimate.status is not Status.TRACKING or state is None:
+            self._tracking = False
+            return self.flush()
+        ready = []
+        if not self._tracking:
+            ready = self.flush()
+            self._tracking, self._last = True, None
+            self.segment += 1
+        self._p_WF.update(zip(estimate.landmark_ids.tolist(), estimate.p_WF, strict=True))
+        if self._last is None or (estimate.is_keyframe and self._moved_on(self._last, step.tracks, state)):
+            self._last = _Pending(state, self.segment, step.frame.image, step.tracks)
+            self._pending.append(self._last)
+            self._forget(step.tracks)
+        while self._pending and step.frame.t_ns - self._pending[0].state.t_ns >= _WAIT_NS:
+            ready.append(self._complete(self._pending.popleft()))
+        return ready
+
+    def flush(self) -> list[Keyframe]:
+        """The keyframes that still wait, with what is known of them: nothing more will come."""
+        ready = [self._complete(pending) for pending in self._pending]
+        self._pending.clear()
+        self._p_WF.clear()
+        return ready
+
+    def _moved_on(self, last: _Pending, tracks: FrameTracks, state: NavState) -> bool:
+        _, i, j = np.intersect1d(last.tracks.ids, tracks.ids, assume_unique=True, return_indices=True)
+        if len(i) < _MIN_COMMON * len(last.tracks.ids):
+            return True
+        R = (state.R_WB @ self._R_BC).T @ (last.state.R_WB @ self._R_BC)
+        rays = np.column_stack([last.tracks.xy_normalised[i], np.ones(len(i))]) @ R.T
+        ahead = rays[:, 2] > 0.0
+        moved = tracks.xy_normalised[j][ahead] - rays[ahead, :2] / rays[ahead, 2:]
+        return bool(np.median(np.linalg.norm(moved, axis=1)) > self._parallax) if ahead.any() else True
+
+    def _forget(self, tracks: FrameTracks) -> None:
+        """Drop the positions that no keyframe in waiting and no track of now asks for."""
+        needed = set(tracks.ids.tolist()).union(*(pending.tracks.ids.tolist() for pending in self._pending))
+        self._p_WF = {i: p for i, p in self._p_WF.items() if i in needed}
+
+    def _complete(self, pending: _Pending) -> Keyframe:
+        unknown = np.full(3, np.nan)
+        ids, state = pending.tracks.ids.tolist(), pending.state
+        p_WF = np.array([self._p_WF.get(i, unknown) for i in ids]).reshape(-1, 3)
+        return Keyframe(state.t_ns, pending.segment, state.R_WB, state.p_WB, pending.image, pending.tracks.xy, p_WF)
