@@ -21,7 +21,7 @@ from vioframe.types import Float, Int
 
 @dataclass(frozen=True, slots=True)
 class RotationEquations:
-    """Gauss-Newton equations of each pair's rotation, ``R_12 <- R_12 Exp(dtheta)``: ``H`` (P, 3, 3) dtheta = -``b`` (P, 3).
+    """Gauss-Newton equations ``H`` (P, 3, 3) dtheta = -``b`` (P, 3) of each pair's rotation, R_12 <- R_12 Exp(dtheta).
 
     ``weight`` (P, N) is for the next call, ``distance`` (P, N) how far each track is from its epipolar line in standard
     deviations, zero where the pair does not share it.
@@ -58,7 +58,7 @@ class BearingPairs:
         f, g = self.f, self.g
         y = g @ np.swapaxes(R_12, -1, -2)
         n = np.cross(f, y)
-        t = np.linalg.eigh(np.swapaxes(n * weight[..., None], -1, -2) @ n)[1][:, :, 0]
+        t = _translation(_moments(n, weight), _noise_of_normals(f, y, R_12, weight * self.common))
         t_x_f = np.cross(t[:, None], f)
         by_g = t_x_f @ R_12
 
@@ -68,17 +68,13 @@ class BearingPairs:
         r = (n @ t[..., None])[..., 0] / scale
         robust = np.where(self.common, 1.0 / (1.0 + (r / cauchy) ** 2), 0.0)
 
-        # The two angles of every pair's translation are eliminated; as a direction, they have a prior of 1 rad.
-        J = np.concatenate([np.cross(g, by_g), n @ _tangent(t)], axis=2) / scale[..., None]
+        # Each translation is at its own minimum; its two angles, with a prior of 1 rad, are eliminated.
+        tangent = _tangent(t)
+        J = np.concatenate([np.cross(g, by_g), n @ tangent], axis=2) / scale[..., None]
         weighted = np.swapaxes(J * robust[..., None], -1, -2)
-        H, b = weighted @ J, (weighted @ r[..., None])[..., 0]
-        gain = H[:, :3, 3:] @ np.linalg.inv(H[:, 3:, 3:] + np.eye(2))
-        return RotationEquations(
-            H[:, :3, :3] - gain @ H[:, 3:, :3],
-            b[:, :3] - (gain @ b[:, 3:, None])[..., 0],
-            robust / scale**2,
-            np.abs(r),
-        )
+        H, b = weighted @ J, (weighted[:, :3] @ r[..., None])[..., 0]
+        eliminated = H[:, :3, 3:] @ np.linalg.solve(H[:, 3:, 3:] + np.eye(2), H[:, 3:, :3])
+        return RotationEquations(H[:, :3, :3] - eliminated, b, robust / scale**2, np.abs(r))
 
 
 def relative_rotations(imu: Sequence[Preintegrated], bias: Float, first: Int, second: Int) -> tuple[Float, Float]:
@@ -99,6 +95,39 @@ def relative_rotations(imu: Sequence[Preintegrated], bias: Float, first: Int, se
 
 def _bearings(xy: Float, common: Bool) -> Float:
     return np.where(common[..., None], np.concatenate([xy, np.ones((*xy.shape[:-1], 1))], axis=-1), 0.0)
+
+
+def _moments(v: Float, weight: Float) -> Float:
+    """Sums of weight v v' over the tracks: (P, N, 3), (P, N) -> (P, 3, 3)."""
+    out: Float = np.swapaxes(v * weight[..., None], -1, -2) @ v
+    return out
+
+
+def _noise_of_normals(f: Float, y: Float, R_12: Float, weight: Float) -> Float:
+    """What unit noise in both points adds to the moments (P, 3, 3) of the normals f x y, on average.
+
+    Noise e across the optical axis z moves a normal by e x y, and the average of (e x y)(e x y)' over the plane is
+    |y|^2 I - y y' - (z x y)(z x y)'. That of the second point lies across its own axis, R z.
+    """
+    across = so3.hat([0.0, 0.0, 1.0]), so3.hat(R_12[..., 2])
+    out = np.zeros_like(R_12)
+    for moments, z_x in zip((_moments(y, weight), _moments(f, weight)), across, strict=True):
+        trace = np.trace(moments, axis1=-2, axis2=-1)
+        out += trace[:, None, None] * np.eye(3) - moments - z_x @ moments @ np.swapaxes(z_x, -1, -2)
+    return out
+
+
+def _translation(moments: Float, noise: Float) -> Float:
+    """(P, 3) unit vectors t that minimise t' moments t over t' noise t: the likeliest direction (Kanatani 2005).
+
+    Plain eigenvectors are drawn to where noise hurts least, and the more so the smaller the parallax.
+    """
+    trace = np.trace(noise, axis1=-2, axis2=-1)[:, None, None]
+    whitener = np.linalg.inv(np.linalg.cholesky(noise + 1e-6 * trace * np.eye(3)))
+    transposed = np.swapaxes(whitener, -1, -2)
+    t = (transposed @ np.linalg.eigh(whitener @ moments @ transposed)[1][..., :1])[..., 0]
+    out: Float = t / np.linalg.norm(t, axis=1, keepdims=True)
+    return out
 
 
 def _tangent(t: Float) -> Float:

@@ -9,8 +9,9 @@ import numpy as np
 
 from vioframe.initialization import dynamic, static
 from vioframe.initialization.estimate import InitialEstimate, RefusalError
+from vioframe.initialization.hand_eye import CameraRotation, RotationCalibrator
 from vioframe.initialization.options import InitializationOptions
-from vioframe.initialization.window import Packet
+from vioframe.initialization.window import Packet, finite_tracks
 from vioframe.types import Calibration, FrameTracks, ImuNoise, ImuSegment
 
 _log = logging.getLogger("vioframe.initialization")
@@ -19,7 +20,8 @@ _log = logging.getLogger("vioframe.initialization")
 class Initializer:
     """Tries the static method at every frame, and the dynamic one every so often, until one is sure of itself.
 
-    Every attempt is logged to ``vioframe.initialization``.
+    With ``options.unknown_camera_rotation`` both wait for the hand-eye calibration of the camera's rotation, which is
+    done once. Every attempt is logged to ``vioframe.initialization``.
     """
 
     def __init__(self, calibration: Calibration, options: InitializationOptions | None = None) -> None:
@@ -27,9 +29,21 @@ class Initializer:
         self._calibration = calibration
         self._in_flight = replace(calibration, imu=_inflated(calibration.imu, options.imu_noise_factor))
         self._options = options
+        self._calibrator = RotationCalibrator(calibration, options) if options.unknown_camera_rotation else None
+        self._camera_rotation: CameraRotation | None = None
         self._refusals: dict[str, str] = {}
         self._packets: list[Packet] = []
         self._last_attempt_ns: int | None = None
+
+    @property
+    def calibration(self) -> Calibration:
+        """That of the sensors, with the camera's rotation that was found in place of the unknown one."""
+        return self._calibration
+
+    @property
+    def camera_rotation(self) -> CameraRotation | None:
+        """What the hand-eye calibration found; None where it has not, or was not asked for."""
+        return self._camera_rotation
 
     @property
     def refusal(self) -> str:
@@ -37,7 +51,9 @@ class Initializer:
         return "; ".join(f"{method}: {reason}" for method, reason in self._refusals.items())
 
     def reset(self) -> None:
-        """Forget everything seen."""
+        """Forget everything seen, but not how the camera is turned on the body."""
+        if self._calibrator is not None:
+            self._calibrator.reset()
         self._packets.clear()
         self._last_attempt_ns = None
         self._refusals.clear()
@@ -47,8 +63,10 @@ class Initializer:
         if imu.largest_gap_s > self._options.largest_imu_gap_s:
             self.reset()
             _log.info("no readings for %.2f s: begun anew", imu.largest_gap_s)
-        self._packets.append((imu, _finite(tracks)))
+        self._packets.append((imu, finite_tracks(tracks)))
         self._packets = self._last(self._options.longest_window_s)
+        if self._calibrator is not None and not self._find_camera_rotation(self._calibrator, imu, tracks):
+            return None
         for method, attempt in (("static", self._static), ("dynamic", self._dynamic)):
             try:
                 estimate = attempt()
@@ -61,6 +79,18 @@ class Initializer:
                 self._refusals.clear()
                 return estimate
         return None
+
+    def _find_camera_rotation(self, calibrator: RotationCalibrator, imu: ImuSegment, tracks: FrameTracks) -> bool:
+        found = calibrator.add(imu, tracks)
+        if found is None:
+            if calibrator.refusal:
+                self._refusals["hand-eye"] = calibrator.refusal
+            return False
+        self._refusals.clear()
+        self._calibrator, self._camera_rotation = None, found
+        self._calibration = replace(self._calibration, R_BC=found.R_BC)
+        self._in_flight = replace(self._in_flight, R_BC=found.R_BC)
+        return True
 
     def _static(self) -> InitialEstimate | None:
         packets = self._last(self._options.static_window_s)
@@ -96,9 +126,3 @@ def _inflated(noise: ImuNoise, factor: float) -> ImuNoise:
         noise.accel_walk * factor,
         noise.rate_hz,
     )
-
-
-def _finite(tracks: FrameTracks) -> FrameTracks:
-    """Without the points that could not be undistorted."""
-    good = np.isfinite(tracks.xy_normalised).all(axis=1)
-    return FrameTracks(tracks.t_ns, tracks.ids[good], tracks.xy[good], tracks.xy_normalised[good])

@@ -21,6 +21,14 @@ class InitializationOptions:
     largest_imu_gap_s: float = 0.1
     """A longer stretch without readings begins the window anew."""
 
+    unknown_camera_rotation: bool = False
+    """Find how the camera is turned on the body first, by hand-eye calibration; what the calibration says of that is
+    not used. The body must turn about two axes before anything else can begin."""
+    min_second_turn_rad: float = 0.15
+    """Turns about other axes than the main one (root of their sum of squares) that the hand-eye calibration needs."""
+    max_camera_rotation_sigma_deg: float = 0.4
+    """Largest standard deviation of the camera's rotation on the body that is accepted."""
+
     static_window_s: float = 1.0
     """Length of the standstill that the static method needs."""
     static_gyro_std: float = 0.02

@@ -55,6 +55,12 @@ def build_window(packets: Sequence[Packet], chosen: Sequence[int], min_views: in
     return Window(np.array([t.t_ns for t in tracks]), segments, ids, xy, ~np.isnan(xy[..., 0]))
 
 
+def finite_tracks(tracks: FrameTracks) -> FrameTracks:
+    """Without the points that could not be undistorted."""
+    good = np.isfinite(tracks.xy_normalised).all(axis=1)
+    return FrameTracks(tracks.t_ns, tracks.ids[good], tracks.xy[good], tracks.xy_normalised[good])
+
+
 def spread_indices(t_ns: Int, count: int) -> list[int]:
     """At most ``count`` ascending indices of ``t_ns``, first and last among them, evenly spaced in time."""
     wanted = np.linspace(t_ns[0], t_ns[-1], count)
