@@ -10,14 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from vioframe.initialization import Initializer
+from vioframe.initialization import InitializationOptions, Initializer
 from vioframe.recovery import DivergedError, check_plausible, continued_from, noise_over
 from vioframe.standstill import StandstillDetector
 from vioframe.stopwatch import Stopwatch
 from vioframe.types import Calibration, Estimate, FrameTracks, ImuSegment, NavState, Status
 from vioframe_msckf.options import MsckfOptions
 from vioframe_msckf.standstill import hold_still
-from vioframe_msckf.state import FilterState
+from vioframe_msckf.state import EXTRINSICS, FilterState
 from vioframe_msckf.tracks import ObservationTable
 from vioframe_msckf.updates import promote_tracks, select_tracks, update_from_landmarks, update_from_tracks
 
@@ -25,7 +25,8 @@ from vioframe_msckf.updates import promote_tracks, select_tracks, update_from_la
 class Msckf:
     """One frame at a time; settings in :class:`MsckfOptions`.
 
-    ``initial_state``, with covariance, stands for the state at the first frame and spares the initialisation.
+    ``initial_state``, with covariance, stands for the state at the first frame and spares the initialisation; it needs
+    a camera whose rotation on the body is known.
     """
 
     def __init__(
@@ -33,7 +34,10 @@ class Msckf:
     ) -> None:
         self._calibration = calibration
         self._options = options or MsckfOptions()
-        self._initializer = Initializer(calibration)
+        unknown_rotation = self._options.unknown_camera_rotation
+        if unknown_rotation and initial_state is not None:
+            raise ValueError("unknown_camera_rotation is found while initialising; leave out initial_state")
+        self._initializer = Initializer(calibration, InitializationOptions(unknown_camera_rotation=unknown_rotation))
         dof = np.arange(1, 2 * self._options.max_clones + 3)
         self._gate = np.concatenate([[0.0], chi2.ppf(self._options.gate_quantile, dof)])
         self._state: FilterState | None = None
@@ -118,17 +122,23 @@ class Msckf:
         nav = initial.states[-1] if self._last is None else continued_from(self._last, initial.states[-1])
         self._begin(nav)
         self._last = nav
-        return Estimate(Status.TRACKING, nav, events=(f"initialised ({initial.method})",), stage_seconds=watch.seconds)
+        found = self._initializer.camera_rotation
+        notes = [f"initialised ({initial.method})"] + ([] if found is None else [str(found)])
+        return Estimate(Status.TRACKING, nav, events=tuple(notes), stage_seconds=watch.seconds)
 
     def _begin(self, nav: NavState) -> None:
         options = self._options
         self._state = FilterState(
             nav,
-            self._calibration,
+            self._initializer.calibration,
             extrinsics=options.calibrate_extrinsics,
             offset=options.calibrate_time_offset,
             intrinsics=options.calibrate_intrinsics,
         )
+        found = self._initializer.camera_rotation
+        if found is not None and options.calibrate_extrinsics:
+            rotation = slice(EXTRINSICS.start, EXTRINSICS.start + 3)
+            self._state.cov[rotation, rotation] = found.cov
         self._observations = ObservationTable()
         self._seeing_ns = nav.t_ns
 

@@ -21,6 +21,9 @@ class MsckfOptions:
     """Quantile of the chi2 distribution below which a feature's residual is accepted."""
     first_estimate_jacobians: bool = True
     """Evaluate Jacobians at first estimates, so that yaw and position stay unobservable."""
+    unknown_camera_rotation: bool = False
+    """Find how the camera is turned on the body before anything else (hand-eye calibration), whatever the calibration
+    says; needs turns about two axes. Best with frontend.predict_with_gyro=false."""
     calibrate_extrinsics: bool = True
     """Estimate the camera's pose on the body."""
     calibrate_time_offset: bool = True

@@ -1,7 +1,8 @@
 """How an estimator begins: at rest, or in motion by visual-inertial alignment. Shared by all back-ends."""
 
 from vioframe.initialization.estimate import InitialEstimate
+from vioframe.initialization.hand_eye import CameraRotation, RotationCalibrator
 from vioframe.initialization.initializer import Initializer
 from vioframe.initialization.options import InitializationOptions
 
-__all__ = ["InitialEstimate", "InitializationOptions", "Initializer"]
+__all__ = ["CameraRotation", "InitialEstimate", "InitializationOptions", "Initializer", "RotationCalibrator"]

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from vioframe.geometry import so3
 from vioframe.inertial.preintegration import Preintegrated, join_segments, preintegrate
 from vioframe.initialization.estimate import RefusalError
 from vioframe.initialization.hand_eye_solver import Chain, Solution, second_turn, solve
@@ -42,6 +43,10 @@ class CameraRotation:
     def sigma_deg(self) -> float:
         """Standard deviation about the axis that is known worst."""
         return float(np.rad2deg(np.sqrt(np.linalg.eigvalsh(self.cov)[-1])))
+
+    def __str__(self) -> str:
+        quat = " ".join(f"{q:.5f}" for q in so3.to_quat_xyzw(self.R_BC))
+        return f"camera's rotation on the body found to {self.sigma_deg:.2f} deg: R_BC as quat_xyzw {quat}"
 
 
 class RotationCalibrator:
@@ -85,7 +90,7 @@ class RotationCalibrator:
             _log.debug("%d hand-eye refused: %s", tracks.t_ns, refusal)
             return None
         self.refusal = ""
-        _log.info("%d camera's rotation on the body found to %.2f deg", tracks.t_ns, found.sigma_deg)
+        _log.info("%d %s", tracks.t_ns, found)
         return found
 
     def _chain(self, imu: ImuSegment, tracks: FrameTracks) -> bool:
