@@ -185,8 +185,8 @@ class Step:
 class Loop:
     """A place seen again: two keyframes, and where the later body is as seen from the earlier one.
 
-    ``p_L`` (3,) m and ``yaw`` rad are in the earlier body's levelled frame L: z is up and x has the body's heading. ``inliers`` is the number of points that support it, ``weight`` what was made of it, from 0 (it was
-    rejected) to 1.
+    ``p_L`` (3,) m and ``yaw`` rad are in the earlier body's levelled frame L: z is up and x has the body's heading.
+    ``inliers`` is the number of points that support it, ``weight`` what was made of it, from 0 (rejected) to 1.
     """
 
     earlier_t_ns: int

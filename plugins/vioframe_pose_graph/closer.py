@@ -68,7 +68,7 @@ class PoseGraph:
         odometry = Odometry.of(t_ns, np.array([place.p_WB for place in places]), segment, self._options)
 
         believed = believable(sightings, odometry, t_ns)
-        loops = _edges([s for s, good in zip(sightings, believed, strict=True) if good], odometry)
+        loops = _edges([s for s, good in zip(sightings, believed, strict=True) if good])
         p, yaw, weights = solve_robustly(odometry.p, odometry.edges(), loops, GATE)
         trajectory = self._corrected(t_ns, segment, odometry.p, p, yaw)
 
@@ -88,21 +88,21 @@ class PoseGraph:
         return Trajectory(stamps, *carry(frames, (t_ns, segment, key_p), p, yaw))
 
 
-def _edges(sightings: Sequence[Sighting], odometry: Odometry) -> Edges:
+def _edges(sightings: Sequence[Sighting]) -> Edges:
     """What the sightings say, as edges of the graph."""
     earlier = np.array([s.earlier for s in sightings], np.int64)
     later = np.array([s.later for s in sightings], np.int64)
-    p_AB = np.array([s.relation.p_AB for s in sightings]).reshape(-1, 3)
+    z = np.array([s.relation.z for s in sightings]).reshape(-1, 3)
     turn = np.array([s.relation.yaw for s in sightings])
-    cov = np.array([sighting_cov(s, odometry) for s in sightings]).reshape(-1, 4, 4)
-    return Edges(earlier, later, p_AB - odometry.p[earlier], turn, root_of(cov))
+    cov = np.array([sighting_cov(s) for s in sightings]).reshape(-1, 4, 4)
+    return Edges(earlier, later, z, turn, root_of(cov))
 
 
 def _loop(sighting: Sighting, places: Sequence[Place], weight: float) -> Loop:
     """The sighting as it leaves the plug-in: the later body seen from the earlier one, levelled."""
     earlier, later, relation = places[sighting.earlier], places[sighting.later], sighting.relation
     heading = float(yaw_of(earlier.R_WB))
-    p_L = rotation_z(heading).T @ (relation.p_AB - earlier.p_WB)
+    p_L = rotation_z(heading).T @ relation.z
     yaw = float(yaw_of(later.R_WB)) + relation.yaw - heading
     yaw = float(np.arctan2(np.sin(yaw), np.cos(yaw)))
     return Loop(earlier.t_ns, later.t_ns, p_L, yaw, relation.inliers, weight)

@@ -23,20 +23,20 @@ GATE = float(chi2.ppf(0.999, 4))
 _REPEAT_NS = 3 * NS_PER_S
 # Points seen to a pixel place a camera to millimetres; but the points themselves were placed by the odometry, whose
 # scale is off by some per cent.
-_SIGMA_M, _SIGMA_PART, _SIGMA_YAW = 0.03, 0.02, np.radians(0.3)
+_SIGMA_M, _SIGMA_PART, _SIGMA_YAW = 0.02, 0.02, np.radians(0.2)
 
 
-def sighting_cov(sighting: Sighting, odometry: Odometry) -> Float:
+def sighting_cov(sighting: Sighting) -> Float:
     """(4, 4) covariance of [position yaw] of the later keyframe's body seen from the earlier one."""
     relation = sighting.relation
-    apart = np.linalg.norm(relation.p_AB - odometry.p[sighting.earlier])
+    apart = np.linalg.norm(relation.z)
     variance = _SIGMA_M**2 + (_SIGMA_PART * apart) ** 2
     return relation.cov + np.diag([variance, variance, variance, _SIGMA_YAW**2])
 
 
 def believable(sightings: Sequence[Sighting], odometry: Odometry, t_ns: Int) -> NDArray[np.bool_]:
     """(S,) whether a sighting lies within the drift, was repeated by another keyframe soon, and has no twin."""
-    covs = [sighting_cov(sighting, odometry) for sighting in sightings]
+    covs = [sighting_cov(sighting) for sighting in sightings]
     within = [_within_drift(s, odometry, cov) for s, cov in zip(sightings, covs, strict=True)]
     repeated, twin = np.zeros(len(sightings), bool), np.zeros(len(sightings), bool)
     for a, first in enumerate(sightings):
@@ -54,7 +54,7 @@ def believable(sightings: Sequence[Sighting], odometry: Odometry, t_ns: Int) -> 
 
 def _within_drift(sighting: Sighting, odometry: Odometry, cov: Float) -> bool:
     i, j = sighting.earlier, sighting.later
-    e = np.append(sighting.relation.p_AB - odometry.p[j], sighting.relation.yaw)
+    e = np.append(sighting.relation.z - (odometry.p[j] - odometry.p[i]), sighting.relation.yaw)
     return bool(e @ np.linalg.solve(odometry.cov(i, j) + cov, e) < GATE)
 
 
@@ -66,14 +66,15 @@ def _disagreement(a: Sighting, b: Sighting, odometry: Odometry, cov_a: Float, co
     """
     R = rotation_z(a.relation.yaw)
     moved = R @ (odometry.p[b.later] - odometry.p[a.later])
-    error = np.append(a.relation.p_AB + moved - b.relation.p_AB, a.relation.yaw - b.relation.yaw)
+    p_a, p_b = odometry.p[a.earlier] + a.relation.z, odometry.p[b.earlier] + b.relation.z
+    error = np.append(p_a + moved - p_b, a.relation.yaw - b.relation.yaw)
     error[3] = np.arctan2(np.sin(error[3]), np.cos(error[3]))
     later = odometry.cov(a.later, b.later)
     later[:3] = R @ later[:3]
     later[:, :3] = later[:, :3] @ R.T
     cov = _seen_from_afar(cov_a, moved) + cov_b + later
     first, last = sorted((a.earlier, b.earlier))
-    cov += _seen_from_afar(odometry.cov(first, last), b.relation.p_AB - odometry.p[last])
+    cov += _seen_from_afar(odometry.cov(first, last), p_b - odometry.p[last])
     return float(error @ np.linalg.solve(cov, error))
 
 

@@ -8,6 +8,9 @@ import numpy as np
 
 from vioframe.types import Calibration, Float, Image
 from vioframe_pose_graph.descriptors import Describer, Words
+from vioframe_pose_graph.resection import resect
+
+_MAX_SIGMAS = 4.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -31,13 +34,15 @@ class Keyframe:
 class Place:
     """What recognition needs of a keyframe: K described points on the z = 1 plane, some of them with a position.
 
-    ``p_WF`` (K, 3) m is NaN where unknown. The camera's pose is in the world of the odometry at that time.
+    ``p_WF`` (K, 3) m is NaN where unknown. ``R_WC`` and ``p_WC`` are the camera's pose as those points say, and
+    ``p_WB_seen`` (3,) m is where the body is by that; ``R_WB`` and ``p_WB`` are its pose as the odometry gave it.
     """
 
     t_ns: int
     segment: int
     R_WB: Float
     p_WB: Float
+    p_WB_seen: Float
     R_WC: Float
     p_WC: Float
     xy_normalised: Float
@@ -45,24 +50,30 @@ class Place:
     descriptors: Words
 
 
-def describe(keyframe: Keyframe, describer: Describer, calibration: Calibration) -> Place:
-    """Find and describe the points of ``keyframe``."""
+def describe(keyframe: Keyframe, describer: Describer, calibration: Calibration, sigma_px: float) -> Place:
+    """Find and describe the points of ``keyframe``; its landmarks are known to ``sigma_px`` in the image."""
     R_WC = keyframe.R_WB @ calibration.R_BC
     p_WC = keyframe.p_WB + keyframe.R_WB @ calibration.p_BC
     xy, descriptors, which = describer.describe(keyframe.image, keyframe.xy, R_WC)
     xy_normalised = calibration.camera.undistort(xy)
     seen = np.isfinite(xy_normalised).all(axis=1)
-    p_WF = np.full((len(xy), 3), np.nan)
-    tracked = which >= 0
-    p_WF[tracked] = keyframe.p_WF[which[tracked]]
+    xy_normalised, descriptors, which = xy_normalised[seen], descriptors[seen], which[seen]
+
+    p_WF = np.where(which[:, None] >= 0, keyframe.p_WF[which], np.nan)
+    known = np.flatnonzero(np.isfinite(p_WF[:, 0]))
+    sigma = sigma_px / calibration.camera.focal_px
+    R_WC, p_WC, fits = resect(p_WF[known], xy_normalised[known], R_WC, p_WC, sigma, _MAX_SIGMAS * sigma)
+    p_WF[known[~fits]] = np.nan
+    p_WB_seen = p_WC - keyframe.R_WB @ calibration.p_BC
     return Place(
         keyframe.t_ns,
         keyframe.segment,
         keyframe.R_WB,
         keyframe.p_WB,
+        p_WB_seen,
         R_WC,
         p_WC,
-        xy_normalised[seen],
-        p_WF[seen],
-        descriptors[seen],
+        xy_normalised,
+        p_WF,
+        descriptors,
     )

@@ -41,7 +41,7 @@ class Recogniser:
     def add(self, keyframe: Keyframe) -> None:
         """Look for the place of ``keyframe`` among the earlier ones, then remember it."""
         watch = Stopwatch()
-        place = describe(keyframe, self._describer, self._calibration)
+        place = describe(keyframe, self._describer, self._calibration, 0.5 * self._options.reprojection_px)
         watch.lap("describe")
         candidates = self._retrieve(place)
         self._index.add(place.descriptors)

@@ -6,7 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vioframe.trajectory.alignment import rotation_z
+from vioframe.geometry import so3
+from vioframe.trajectory.alignment import rotation_z, yaw_of
 from vioframe.types import Float, Int
 from vioframe_pose_graph.hamming import match
 from vioframe_pose_graph.place import Place
@@ -15,7 +16,11 @@ from vioframe_pose_graph.two_point import ransac
 _MAX_DISTANCE, _RATIO = 64, 0.85
 _APART_PX = 10.0
 _HYPOTHESES = 300
-_ITERATIONS = 10
+# The pairs know nothing of tilt, so their support is counted more generously than that of the fit.
+_COARSE = 2.0
+_TILT_SIGMA, _MAX_TILT = np.radians(0.5), np.radians(2.0)
+_LEAST_SIGMA = 0.2
+_ITERATIONS, _CONVERGED = 10, 1e-6
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -37,14 +42,14 @@ class Correspondences:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Relation:
-    """``p_A = R_z(yaw) p_B + t`` from the world B in which the later keyframe was placed to that of the earlier one.
+    """How the world B, in which the later keyframe was placed, lies to that of the earlier one, A.
 
-    ``cov`` (4, 4) is that of [t yaw] with t taken at the later keyframe's body: ``p_AB`` (3,) m is that body in A.
+    ``z`` (3,) m leads from the earlier body to the later one, along the axes of A, and B is turned by ``yaw`` rad;
+    ``cov`` (4, 4) is that of [z yaw], ``inliers`` the number of points that say so.
     """
 
+    z: Float
     yaw: float
-    t: Float
-    p_AB: Float
     cov: Float
     inliers: int
 
@@ -55,10 +60,12 @@ def relate(earlier: Place, later: Place, focal_px: float, reprojection_px: float
     seen = correspondences(earlier, later, _APART_PX / focal_px)
     if len(np.unique(seen.pairs[:, 1])) < min_inliers:
         return None
-    support, model = ransac(seen.points, seen.xy, seen.side, seen.R_WC, seen.p_WC, _draw_pairs(seen.side), tolerance)
+    support, model = ransac(
+        seen.points, seen.xy, seen.side, seen.R_WC, seen.p_WC, _draw_pairs(seen.side), _COARSE * tolerance
+    )
     if support < min_inliers:
         return None
-    return _refined(seen, model, later.p_WB, tolerance, min_inliers)
+    return _refined(seen, model, earlier.p_WB_seen, later.p_WB_seen, tolerance, min_inliers)
 
 
 def correspondences(earlier: Place, later: Place, apart: float) -> Correspondences:
@@ -92,18 +99,18 @@ def _draw_pairs(side: Int) -> Int:
     return np.column_stack([i, starts[i] + (i - starts[i] + step) % sizes[i]])
 
 
-def residuals(seen: Correspondences, yaw: float, t: Float) -> tuple[Float, Float]:
-    """(M, 2) on the z = 1 plane, and (M, 2, 4) their derivatives by [t yaw]; NaN for points behind the camera."""
-    R = rotation_z(yaw)
-    dR = rotation_z(yaw + np.pi / 2)
-    dR[2, 2] = 0.0
-    forward = seen.side == 0
-    there = np.where(forward[:, None], seen.points @ R.T + t, (seen.points - t) @ R)
+def residuals(seen: Correspondences, p_B: Float, p_AB: Float, R_AB: Float) -> tuple[Float, Float]:
+    """(M, 2) on the z = 1 plane, and (M, 2, 6) their derivatives by [p_AB, rotation]; NaN for points behind the camera.
+
+    ``p_A = R_AB (p - p_B) + p_AB``, with ``R_AB <- Exp(rotation) R_AB`` and ``p_B`` (3,) the later body in its world.
+    """
+    forward = (seen.side == 0)[:, None]
+    turned = np.where(forward, (seen.points - p_B) @ R_AB.T, seen.points - p_AB)
+    there = np.where(forward, turned + p_AB, turned @ R_AB + p_B)
     R_CW = np.swapaxes(seen.R_WC, 1, 2)[seen.side]
     p_C = np.einsum("mij,mj->mi", R_CW, there - seen.p_WC[seen.side])
-    d_there = np.empty((len(forward), 3, 4))
-    d_there[forward, :, :3], d_there[~forward, :, :3] = np.eye(3), -R.T
-    d_there[:, :, 3] = np.where(forward[:, None], seen.points @ dR.T, (seen.points - t) @ dR)
+    d_there = np.concatenate([np.broadcast_to(np.eye(3), (len(turned), 3, 3)), -so3.hat(turned)], axis=2)
+    d_there[seen.side == 1] = -R_AB.T @ d_there[seen.side == 1]
     z = np.where(p_C[:, 2] > 0.0, p_C[:, 2], np.nan)
     xy = p_C[:, :2] / z[:, None]
     J_C = R_CW @ d_there
@@ -111,25 +118,33 @@ def residuals(seen: Correspondences, yaw: float, t: Float) -> tuple[Float, Float
     return xy - seen.xy, J
 
 
-def _refined(seen: Correspondences, model: Float, p_B: Float, tolerance: float, min_inliers: int) -> Relation | None:
-    """Iterate to the least-squares fit of what lies within ``tolerance``, which is decided anew each time."""
-    yaw, t = float(model[0]), model[1:].copy()
+def _refined(
+    seen: Correspondences, model: Float, p_A: Float, p_B: Float, tolerance: float, min_inliers: int
+) -> Relation | None:
+    """Iterate to the least-squares fit of what lies within ``tolerance``, which is decided anew each time.
+
+    The tilt is free within what two attitudes of an odometry may disagree: forced to zero, half a degree of it would
+    become several centimetres of position, as the points are metres away.
+    """
+    R_AB = rotation_z(float(model[0]))
+    p_AB = R_AB @ p_B + model[1:]
     for _ in range(_ITERATIONS):
-        r, J = residuals(seen, yaw, t)
+        r, J = residuals(seen, p_B, p_AB, R_AB)
         inlier = np.linalg.norm(r, axis=1) < tolerance
         if inlier.sum() < min_inliers:
             return None
-        J_all = J[inlier].reshape(-1, 4)
-        step = np.linalg.lstsq(J_all, -r[inlier].ravel(), rcond=None)[0]
-        t, yaw = t + step[:3], yaw + float(step[3])
-        if np.abs(step).max() < 1e-6:
+        variance = max(float(np.mean(r[inlier] ** 2)), (_LEAST_SIGMA * tolerance) ** 2)
+        tilt = so3.log(R_AB @ rotation_z(float(yaw_of(R_AB))).T)[:2]
+        J_in = J[inlier].reshape(-1, 6)
+        H, g = J_in.T @ J_in / variance, J_in.T @ r[inlier].ravel() / variance
+        H[[3, 4], [3, 4]] += 1.0 / _TILT_SIGMA**2
+        g[3:5] += tilt / _TILT_SIGMA**2
+        step = np.linalg.solve(H, -g)
+        p_AB, R_AB = p_AB + step[:3], so3.exp(step[3:]) @ R_AB
+        if np.abs(step).max() < _CONVERGED:
             break
     supporting = len(np.unique(seen.pairs[inlier], axis=0))
-    if supporting < min_inliers:
+    if supporting < min_inliers or np.linalg.norm(tilt) > _MAX_TILT:
         return None
-    # t is taken at the body, where it is not tied to the yaw by a lever as long as the body's way from the origin.
-    lever = np.eye(4)
-    lever[:3, 3] = rotation_z(yaw + np.pi / 2) @ np.append(p_B[:2], 0.0)
-    variance = max(float(np.mean(r[inlier] ** 2)), (0.2 * tolerance) ** 2)
-    cov = lever @ (variance * np.linalg.inv(J_all.T @ J_all)) @ lever.T
-    return Relation(float(np.angle(np.exp(1j * yaw))), t, rotation_z(yaw) @ p_B + t, cov, supporting)
+    which = [0, 1, 2, 5]
+    return Relation(p_AB - p_A, float(yaw_of(R_AB)), np.linalg.inv(H)[np.ix_(which, which)], supporting)
