@@ -16,8 +16,8 @@ from vioframe_pose_graph.hamming import distance
 
 _TABLES, _VALUES = 16, 1 << 16
 _MAX_DISTANCE = 48
-# A longer list belongs to a word that says little: whatever the camera sees, some corners hold it.
-_MAX_LIST = 500
+# A word that more than one in so many descriptors hold says little, whatever the camera sees; it is not looked up.
+_COMMON, _NEVER_COMMON = 4096, 50
 
 
 class DescriptorIndex:
@@ -52,8 +52,19 @@ class DescriptorIndex:
         A descriptor found in many keyframes tells little about the place, and counts by its inverse frequency.
         """
         words = np.ascontiguousarray(descriptors).view(np.uint16).reshape(-1, _TABLES)
+        longest = max(self._size // _COMMON, _NEVER_COMMON)
         scores = np.zeros(before)
-        _vote(self._heads, self._lengths, self._next, self._descriptors, self._owners, descriptors, words, scores)
+        _vote(
+            self._heads,
+            self._lengths,
+            self._next,
+            self._descriptors,
+            self._owners,
+            descriptors,
+            words,
+            longest,
+            scores,
+        )
         return scores / max(len(descriptors), 1)
 
 
@@ -82,6 +93,7 @@ def _vote(
     owners: NDArray[np.int32],
     query: NDArray[np.uint64],
     words: NDArray[np.uint16],
+    longest: int,
     scores: Float,
 ) -> None:
     before = len(scores)
@@ -91,7 +103,7 @@ def _vote(
         count = 0
         for t in range(_TABLES):
             value = words[i, t]
-            if lengths[t, value] > _MAX_LIST:
+            if lengths[t, value] > longest:
                 continue
             entry = heads[t, value]
             while entry >= 0:

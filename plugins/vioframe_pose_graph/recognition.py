@@ -16,6 +16,8 @@ from vioframe_pose_graph.verification import Relation, relate
 
 # Keyframes this near to a candidate look the same, and are not compared as well.
 _NEIGHBOURS = 3
+# Enough points to know a place by; the tracked features come first.
+_ASKED = 300
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -65,7 +67,7 @@ class Recogniser:
         """Numbers of the earlier keyframes that look most like ``place``, no two of them neighbours."""
         gap_ns = round(self._options.min_gap_s * NS_PER_S)
         before = sum(earlier.t_ns <= place.t_ns - gap_ns for earlier in self.places)
-        scores = self._index.similarity(place.descriptors, before)
+        scores = self._index.similarity(place.descriptors[:_ASKED], before)
         return _peaks(scores, self._options.max_candidates)
 
 

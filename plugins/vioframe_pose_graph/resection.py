@@ -35,8 +35,8 @@ def resect(
 ) -> tuple[Float, Float, NDArray[np.bool_]]:
     """The camera's pose that fits the landmarks (M, 3) seen at ``xy`` (M, 2), and (M,) which of them then fit.
 
-    The pose given is the prior. A landmark is seen to ``sigma``, and counts less the further it lies off (Cauchy); it fits
-    if it lies within ``tolerance``. Both are lengths on the z = 1 plane.
+    The pose given is the prior. A landmark is seen to ``sigma``, counts less the further it lies off (Cauchy), and fits
+    if it lies within ``tolerance``; both are lengths on the z = 1 plane.
     """
     R, p = R_WC, p_WC
     prior = np.repeat([_SIGMA_TURN**-2, _SIGMA_M**-2], 3)
