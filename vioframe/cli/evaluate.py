@@ -39,7 +39,9 @@ def command(
     """Compare each RUN, a run folder or a trajectory file, with the ground truth.
 
     The landmarks of a run on a simulated recording are measured against the
-    surfaces of its world. The result is printed, and kept as `evaluation.json` in each run folder.
+    surfaces of its world. What loop closure made of a run has a column of its
+    own. The result is printed, and kept as `evaluation.json` (and
+    `evaluation_loop.json`) in each run folder.
     """
     from vioframe.recorder import write_json
     from vioframe.report.evaluated import evaluate_paths
@@ -60,5 +62,5 @@ def command(
         click.echo(f"note: {note}", err=True)
     # Last: what is read from a full or read-only disk is shown all the same.
     for run in evaluated:
-        if run.folder is not None:
-            write_json(run.folder.path / "evaluation.json", run.to_dict())
+        if run.kept_in is not None:
+            write_json(run.kept_in, run.to_dict())

@@ -8,10 +8,13 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from vioframe.errors import VioframeError
 from vioframe.report.map_quality import MapQuality
 from vioframe.report.run_folder import RunFolder
 from vioframe.trajectory import Trajectory, TrajectoryErrors, evaluate, load_trajectory
+from vioframe.types import NS_PER_S, Int
 
 _RUN_FIGURES = (
     "dataset",
@@ -25,6 +28,8 @@ _RUN_FIGURES = (
     "incidents",
     "finished",
 )
+# A line is not drawn over a time in which nothing was estimated.
+_GAP_NS = NS_PER_S
 
 
 @dataclass(frozen=True)
@@ -32,6 +37,8 @@ class Evaluated:
     """``folder`` is None for a bare trajectory file; ``errors`` where there is no pose or no ground truth.
 
     ``map_quality`` is there where :func:`~vioframe.report.map_quality.measure_maps` found a world to compare with.
+    ``segment_starts_ns`` are the stamps at which tracking began again after a reset. What loop closure made of a run is
+    an evaluation of its own, without a folder. ``kept_in`` is the file of the run folder that an evaluation belongs in.
     """
 
     name: str
@@ -40,10 +47,19 @@ class Evaluated:
     ground_truth: Trajectory | None
     errors: TrajectoryErrors | None
     map_quality: MapQuality | None = None
+    segment_starts_ns: tuple[int, ...] = ()
+    kept_in: Path | None = None
 
     @property
     def summary(self) -> Mapping[str, Any]:
         return self.folder.summary if self.folder else {}
+
+    def breaks(self, t_ns: Int) -> Int:
+        """Indices into the ascending stamps (N,) of poses that a line must not lead to: they begin a stretch anew."""
+        after_gap = np.flatnonzero(np.diff(t_ns) > _GAP_NS) + 1
+        after_reset = np.searchsorted(t_ns, np.array(self.segment_starts_ns, np.int64))
+        every = np.union1d(after_gap, after_reset)
+        return np.asarray(every[(every > 0) & (every < len(t_ns))])
 
     def stage_ms(self) -> dict[str, float]:
         """Mean milliseconds a frame by stage; the stages add up to the whole."""
@@ -66,10 +82,29 @@ def evaluate_path(path: Path, ground_truth: Trajectory | None, alignment: str = 
         ground_truth = ground_truth or folder.ground_truth()
     else:
         folder, name, estimate = None, path.name.split(".")[0], load_trajectory(path)
-    errors = None
-    if estimate is not None and ground_truth is not None:
-        errors = evaluate(estimate, ground_truth, alignment=alignment)
-    return Evaluated(name, folder, estimate, ground_truth, errors)
+    evaluated = Evaluated(name, folder, estimate, ground_truth, _errors(estimate, ground_truth, alignment))
+    if folder is None:
+        return evaluated
+    return replace(evaluated, segment_starts_ns=folder.segment_starts_ns(), kept_in=folder.path / "evaluation.json")
+
+
+def with_loop_closure(run: Evaluated, alignment: str = "posyaw") -> Evaluated | None:
+    """What loop closure made of ``run``, evaluated against the same ground truth; None where it had none."""
+    corrected = run.folder.loop_closed() if run.folder else None
+    if corrected is None or run.folder is None:
+        return None
+    return replace(
+        run,
+        name=f"{run.name} with loop closure",
+        folder=None,
+        estimate=corrected,
+        errors=_errors(corrected, run.ground_truth, alignment),
+        kept_in=run.folder.path / "evaluation_loop.json",
+    )
+
+
+def _errors(estimate: Trajectory | None, truth: Trajectory | None, alignment: str) -> TrajectoryErrors | None:
+    return None if estimate is None or truth is None else evaluate(estimate, truth, alignment=alignment)
 
 
 def evaluate_paths(
@@ -77,7 +112,7 @@ def evaluate_paths(
 ) -> list[Evaluated]:
     """Evaluate each of ``paths`` against ``ground_truth`` or its own; an error notes the path it came from.
 
-    Runs that would share a name are called by their paths.
+    A run with loop closure is followed by what that made of it. Runs that would share a name are called by their paths.
     """
     truth = None if ground_truth is None else load_trajectory(ground_truth)
     evaluated = []
@@ -88,6 +123,7 @@ def evaluate_paths(
             error.add_note(f"while evaluating {path}")
             raise
     times = Counter(run.name for run in evaluated)
-    return [
+    named = [
         replace(run, name=str(path)) if times[run.name] > 1 else run for path, run in zip(paths, evaluated, strict=True)
     ]
+    return [each for run in named for each in (run, with_loop_closure(run, alignment)) if each is not None]

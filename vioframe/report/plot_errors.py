@@ -16,8 +16,6 @@ from vioframe.types import Float
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-_GAP_S = 1.0
-
 
 def translation_error(runs: Sequence[Evaluated], band_m: float | None = None) -> Figure:
     """Position error along each axis of the world over time; ``band_m`` shades the range within plus or minus it."""
@@ -86,7 +84,10 @@ def _over_time(
             ax.axhspan(-band, band, color="#56B4E9", alpha=0.15, lw=0)
         for i, run in enumerate(runs):
             if run.errors:
-                time_s, values = _broken_at_gaps(_time_s(run, run.errors), series(run.errors)[:, k])
+                # With a NaN at every break, so that no line is drawn where nothing was estimated.
+                breaks = run.breaks(run.errors.estimate.t_ns)
+                time_s = np.insert(_time_s(run, run.errors), breaks, np.nan)
+                values = np.insert(series(run.errors)[:, k], breaks, np.nan)
                 handles[i] = ax.plot(time_s, values, **line(i), label=run.name)[0]
         ax.set_ylabel(name)
         ax.margins(x=0.01)
@@ -99,12 +100,6 @@ def _over_time(
 def _time_s(run: Evaluated, errors: TrajectoryErrors) -> Float:
     begin_ns = errors.truth.t_ns[0] if run.ground_truth is None else run.ground_truth.t_ns[0]
     return np.asarray((errors.estimate.t_ns - begin_ns) * 1e-9)
-
-
-def _broken_at_gaps(time_s: Float, values: Float) -> tuple[Float, Float]:
-    """With a NaN in every gap, so that a line is not drawn where nothing was estimated."""
-    gaps = np.flatnonzero(np.diff(time_s) > _GAP_S) + 1
-    return np.insert(time_s, gaps, np.nan), np.insert(values, gaps, np.nan)
 
 
 def _boxes(ax: Any, series: list[Float], places: list[float], width: float, face: str) -> None:

@@ -89,16 +89,20 @@ def _paths(runs: Sequence[Evaluated]) -> list[tuple[Float, dict[str, Any]]]:
 
 
 def _drawn(run: Evaluated) -> Float:
-    """The whole estimate (N, 3), also where the ground truth does not reach; in its frame where there is one."""
+    """The whole estimate (N, 3), also where the ground truth does not reach; in its frame where there is one.
+
+    NaN between segments, so that no line joins them.
+    """
     if run.estimate is None:
         return np.empty((0, 3))
-    return (run.errors.alignment.apply(run.estimate) if run.errors else run.estimate).p_WB
+    drawn = run.errors.alignment.apply(run.estimate) if run.errors else run.estimate
+    return np.insert(drawn.p_WB, run.breaks(drawn.t_ns), np.nan, axis=0)
 
 
 def _bounds(runs: Sequence[Evaluated]) -> tuple[Float, Float]:
     """Corners (3,) of a box around everything, with a margin, and not flat."""
     points = np.concatenate([p_W for p_W, _ in _paths(runs)])
-    low, high = (points.min(axis=0), points.max(axis=0)) if len(points) else (np.zeros(3), np.zeros(3))
+    low, high = (np.nanmin(points, axis=0), np.nanmax(points, axis=0)) if len(points) else (np.zeros(3), np.zeros(3))
     size = max(float((high - low).max()), 1e-3)
     thin = np.maximum(0.12 * size - (high - low), 0.0) / 2.0
     return low - thin - _MARGIN * size, high + thin + _MARGIN * size

@@ -32,6 +32,9 @@ def notes(runs: Sequence[Evaluated]) -> Iterator[str]:
     for run in runs:
         if run.folder and not run.summary.get("finished", False):
             yield f"{run.name}: the run was interrupted; these figures cover what it left"
+        if run.folder and run.segment_starts_ns:
+            segments = len(run.segment_starts_ns) + 1
+            yield f"{run.name}: {segments} segments between resets, measured as one trajectory"
         if run.estimate is None:
             yield f"{run.name}: never initialised, so there is no pose to evaluate"
         elif run.errors is None:

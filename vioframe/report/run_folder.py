@@ -85,6 +85,15 @@ class RunFolder:
         cov = self._pose_covariance(estimate.t_ns)
         return estimate if cov is None else Trajectory(estimate.t_ns, estimate.R_WB, estimate.p_WB, cov)
 
+    def loop_closed(self) -> Trajectory | None:
+        """The estimate as loop closure corrected it; None where the run had none, or did not get to its end."""
+        path = self.path / "trajectory_loop.tum"
+        return load_trajectory(path) if path.is_file() else None
+
+    def segment_starts_ns(self) -> tuple[int, ...]:
+        """Stamps at which tracking began again after a reset."""
+        return tuple(int(segment["first_t_ns"]) for segment in self.summary.get("segments", [])[1:])
+
     def ground_truth(self) -> Trajectory | None:
         """The ground truth that the run was given, if any."""
         path = self.path / "ground_truth.tum"

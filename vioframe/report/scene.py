@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from vioframe.report.evaluated import Evaluated
 from vioframe.report.landmarks import Landmarks, belonging
 from vioframe.trajectory import Trajectory
-from vioframe.types import Calibration, Float
+from vioframe.types import Calibration, Float, Int
 
 _NEAR_PERCENT = 80.0
 _AROUND = 1.6
@@ -18,13 +18,14 @@ _AROUND = 1.6
 
 @dataclass(frozen=True, eq=False)
 class Flight:
-    """One run: its ``number`` in the palette, its poses, and what is known beside them."""
+    """One run: its ``number`` in the palette, its poses and where its path is broken, and what is known beside them."""
 
     number: int
     name: str
     estimate: Trajectory
     landmarks: Landmarks | None
     calibration: Calibration | None
+    breaks: Int = field(default_factory=lambda: np.empty(0, np.int64))
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,7 +73,9 @@ def scene_of(runs: Sequence[Evaluated], world: Float | None = None) -> Scene:
     for number, run in enumerate(runs):
         if run.estimate is not None:
             calibration = run.folder.calibration() if run.folder else None
-            flights.append(Flight(number, run.name, aligned_estimate(run), aligned_landmarks(run), calibration))
+            estimate = aligned_estimate(run)
+            breaks = run.breaks(estimate.t_ns)
+            flights.append(Flight(number, run.name, estimate, aligned_landmarks(run), calibration, breaks))
     # Of runs on one recording the ground truth is shown once.
     truths = {run.ground_truth.t_ns.tobytes(): run.ground_truth for run in runs if run.errors and run.ground_truth}
     return Scene(flights, list(truths.values()), world)

@@ -22,7 +22,7 @@ from vioframe.report.scene_shapes import (
 from vioframe.report.scene_view import View
 from vioframe.report.style import colour
 from vioframe.trajectory import Trajectory
-from vioframe.types import NS_PER_S, Calibration, Float
+from vioframe.types import Calibration, Float
 
 TRUTH_RGB = (0.12, 0.12, 0.12)
 _EDGE_RGB = (0.62, 0.64, 0.68)
@@ -33,7 +33,6 @@ _PATH, _TRUTH, _EDGE, _GRID, _AXIS, _LANDMARK, _START = 5.0, 5.6, 1.7, 1.5, 4.0,
 _DASH_PERIOD = 30.0
 _FRUSTUM = 46.0
 _FRUSTA = 22
-_GAP_NS = NS_PER_S
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,8 +80,7 @@ def height_colours(heights: Float) -> Float:
 
 def _path(flight: Flight, px: float) -> Shape:
     estimate = flight.estimate
-    ends = np.flatnonzero(np.diff(estimate.t_ns) > _GAP_NS) + 1
-    pieces = [thinned(piece, 0.5 * _PATH * px) for piece in np.split(estimate.p_WB, ends)]
+    pieces = [thinned(piece, 0.5 * _PATH * px) for piece in np.split(estimate.p_WB, flight.breaks)]
     tubes = [polyline(piece, 0.5 * _PATH * px, rgb(flight.number)) for piece in pieces]
     return Shape.join([*tubes, balls(estimate.p_WB[:1], 0.5 * _START * px, rgb(flight.number), fine=True)])
 
@@ -127,7 +125,7 @@ def _landmarks(flight: Flight, heights: tuple[float, float] | None, view: View) 
 
 
 def _heights(scene: Scene) -> tuple[float, float] | None:
-    if len(scene.flights) != 1 or not len(scene.landmarks):
+    if sum(flight.landmarks is not None for flight in scene.flights) != 1:
         return None
     low, high = np.percentile(scene.near_landmarks[:, 2], [3.0, 97.0])
     return float(low), float(max(high, low + 0.1))
