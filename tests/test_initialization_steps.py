@@ -112,12 +112,18 @@ class TestGyroBias:
         assert np.nanmax(distance) < 0.1
 
     @pytest.mark.parametrize("plane", [False, True])
-    def test_good_enough_to_start_from_under_noise(self, plane: bool):
-        """A pixel of noise pulls it aside by up to 0.005 rad/s, on a plane; the bundle adjustment takes that out."""
-        for seed in range(8):
+    def test_noise_scatters_it_but_does_not_pull_it(self, plane: bool):
+        """A pixel of noise costs 0.005 rad/s on a plane and less elsewhere; the bundle adjustment takes that out."""
+        estimates = []
+        for seed in range(16):
             s = scene(1.0, seed, plane)
             bias, _ = estimate_gyro_bias(s.window, s.imu(ZERO, ZERO), CALIBRATION.R_BC, PIXEL, 0.2)
-            np.testing.assert_allclose(bias, BIAS_GYRO, atol=0.015)
+            estimates.append(bias)
+        off = np.stack(estimates) - BIAS_GYRO
+        scatter = off.std(axis=0)
+        assert np.all(scatter < 0.008)
+        assert np.all(np.abs(off.mean(axis=0)) < 3.5 * scatter / np.sqrt(len(off)) + 2e-4)
+        assert np.abs(off).max() < 0.02
 
     def test_wrong_tracks_show_and_do_not_harm(self):
         s = scene(0.5)

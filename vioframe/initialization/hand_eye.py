@@ -116,13 +116,7 @@ class RotationCalibrator:
                 "turn the vehicle about two axes"
             )
         sigma = options.pixel_sigma / self._calibration.camera.focal_px
-        found = self._judge(solve(chain, sigma, options.bias_gyro_sigma))
-        if not found.sigma_deg <= options.max_camera_rotation_sigma_deg:
-            raise RefusalError(
-                f"the camera's rotation is known to {found.sigma_deg:.2f} deg only (standard deviation); "
-                "turn the vehicle about two axes"
-            )
-        return found
+        return self._judge(solve(chain, sigma, options.bias_gyro_sigma))
 
     def _judge(self, solution: Solution) -> CameraRotation:
         """Refuse what the tracks contradict; the scatter they show stands in for the noise that was assumed."""
@@ -132,4 +126,12 @@ class RotationCalibrator:
         if not bias <= 3.0 * self._options.bias_gyro_sigma:
             raise RefusalError(f"gyroscope bias of {bias:.2f} rad/s is not plausible")
         scatter = max(solution.misfit, _LEAST_MISFIT) ** 2 * np.linalg.inv(solution.information)
-        return CameraRotation(solution.R_BC, scatter + np.eye(3) * np.deg2rad(_SYSTEMATIC_DEG) ** 2)
+        found = CameraRotation(solution.R_BC, scatter + np.eye(3) * np.deg2rad(_SYSTEMATIC_DEG) ** 2)
+        if not found.sigma_deg <= self._options.max_camera_rotation_sigma_deg:
+            raise RefusalError(
+                f"the camera's rotation is known to {found.sigma_deg:.2f} deg only (standard deviation); "
+                "turn the vehicle about two axes"
+            )
+        if not solution.settled:
+            raise RefusalError("the refinement of the camera's rotation did not settle")
+        return found

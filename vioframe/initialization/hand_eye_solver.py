@@ -77,13 +77,15 @@ class Pairs:
 class Solution:
     """``R_BC`` (3, 3) and ``bias_gyro_B`` (3,) rad/s; ``information`` (3, 3) about R_BC's right perturbation, 1/rad^2.
 
-    ``misfit`` is the typical distance of a track from its epipolar lines over the noise that was assumed.
+    ``misfit`` is the typical distance of a track from its epipolar lines over the noise that was assumed. The iteration
+    may not have ``settled``.
     """
 
     R_BC: Float
     bias_gyro_B: Float
     information: Float
     misfit: float
+    settled: bool
 
 
 def second_turn(chain: Chain) -> float:
@@ -100,7 +102,7 @@ def second_turn(chain: Chain) -> float:
 def solve(chain: Chain, sigma: float, bias_sigma: float) -> Solution:
     """From tracks with noise ``sigma`` on the z = 1 plane; ``bias_sigma`` is the bias's prior about zero, rad/s.
 
-    Raises :class:`RefusalError` where there are too few tracks, or where the refinement does not settle.
+    Raises :class:`RefusalError` where there are too few tracks.
     """
     pairs = chain.pairs(_STEPS)
     if len(pairs.first) < len(chain.tracks):
@@ -126,12 +128,11 @@ def solve(chain: Chain, sigma: float, bias_sigma: float) -> Solution:
             bias, R_BC, weight = bias + step[:3], R_BC @ so3.exp(step[3:]), equations.weight
             if np.linalg.norm(step) < _CONVERGED:
                 break
-    if not np.linalg.norm(step) < 100.0 * _CONVERGED:
-        raise RefusalError("the refinement of the camera's rotation did not settle")
+    settled = bool(np.linalg.norm(step) < 100.0 * _CONVERGED)
     information = H[3:, 3:] - H[3:, :3] @ np.linalg.solve(H[:3, :3], H[:3, 3:])
     common = used.bearings.common
     misfit = float(np.median(equations.distance[common])) / _MEDIAN
-    return Solution(R_BC, bias, information * _independent_share(chain, int(common.sum())), misfit)
+    return Solution(R_BC, bias, information * _independent_share(chain, int(common.sum())), misfit, settled)
 
 
 def _align_axes(chain: Chain, sigma: float, bias_sigma: float) -> tuple[Float, Float]:
