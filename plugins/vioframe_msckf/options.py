@@ -23,7 +23,7 @@ class MsckfOptions:
     """Evaluate Jacobians at first estimates, so that yaw and position stay unobservable."""
     unknown_camera_rotation: bool = False
     """Find how the camera is turned on the body before anything else (hand-eye calibration), whatever the calibration
-    says; needs turns about two axes. Best with frontend.predict_with_gyro=false."""
+    says; needs turns about two axes. With frontend.predict_with_gyro=false the front-end makes no wrong guesses."""
     calibrate_extrinsics: bool = True
     """Estimate the camera's pose on the body."""
     calibrate_time_offset: bool = True

@@ -31,12 +31,12 @@ class FrontendOptions:
     klt_levels: int = 4
     """Pyramid levels above the full image."""
     predict_with_gyro: bool = True
-    """Start each search where the gyroscope says that the point went."""
+    """Start each search where the gyroscope says that the point went; needs the camera's rotation on the body."""
     forward_backward_px: float = 1.0
     """A point tracked forth and back must return to within this of where it was."""
     rejection: Rejection = "magsac"
     """Epipolar outlier rejection: essential or fundamental matrix by RANSAC, magsac (essential matrix by MAGSAC++),
-    two_point (rotation from the gyroscope) or none."""
+    two_point (rotation from the gyroscope, hence needs the camera's rotation on the body) or none."""
     rejection_px: float = 0.7
     """Largest distance of an inlier from the epipolar geometry, scaled by the focal length."""
     refill_below: float = 0.9
