@@ -67,9 +67,11 @@ class Experiment:
 
     def close_loops(self) -> LoopClosure | None:
         """What the loop closer, if any, made of all steps; to be called once they are through."""
+        from threadpoolctl import threadpool_limits
+
         if self.loop_closer is None:
             return None
-        with self._blaming_plugins():
+        with threadpool_limits(1), self._blaming_plugins():
             return self.loop_closer.finish()
 
     @contextmanager

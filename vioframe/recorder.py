@@ -37,7 +37,7 @@ STATE_COLUMNS = (
     *(f"cov_{i}" for i in range(15)),
 )
 POSE_COV_COLUMNS = ("t_ns", *(f"c{i}{j}" for i in range(6) for j in range(i, 6)))
-LOOP_COLUMNS = ("earlier_t_ns", "later_t_ns", "x_m", "y_m", "z_m", "yaw_rad", "inliers", "accepted", "weight")
+LOOP_COLUMNS = ("earlier_t_ns", "later_t_ns", "x_m", "y_m", "z_m", "yaw_rad", "inliers", "accepted")
 _UPPER = np.triu_indices(6)
 
 
@@ -145,8 +145,9 @@ class Recorder:
             write_tum(result.trajectory, self.folder / "trajectory_loop.tum")
         self._append("loops.csv", ",".join(LOOP_COLUMNS) + "\n")
         for loop in result.loops:
-            row = [loop.later_t_ns, *(f"{x:.9g}" for x in (*loop.p_L, loop.yaw)), loop.inliers, int(loop.accepted)]
-            self._append("loops.csv", f"{loop.earlier_t_ns},{','.join(map(str, row))},{loop.weight:.9g}\n")
+            pose = ",".join(f"{x:.9g}" for x in (*loop.p_L, loop.yaw))
+            row = f"{loop.earlier_t_ns},{loop.later_t_ns},{pose},{loop.inliers},{int(loop.accepted)}\n"
+            self._append("loops.csv", row)
         accepted = sum(loop.accepted for loop in result.loops)
         self.summary["loop_closure"] = {
             "keyframes": len(result.keyframe_t_ns),

@@ -186,7 +186,7 @@ class Loop:
     """A place seen again: two keyframes, and where the later body is as seen from the earlier one.
 
     ``p_L`` (3,) m and ``yaw`` rad are in the earlier body's levelled frame L: z is up and x has the body's heading.
-    ``inliers`` is the number of points that support it, ``weight`` what was made of it, from 0 (rejected) to 1.
+    ``inliers`` is the number of points that support it, ``accepted`` whether it was believed in the end.
     """
 
     earlier_t_ns: int
@@ -194,11 +194,7 @@ class Loop:
     p_L: Float
     yaw: float
     inliers: int
-    weight: float
-
-    @property
-    def accepted(self) -> bool:
-        return self.weight > 0.5
+    accepted: bool
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,7 +15,7 @@ import numpy as np
 from vioframe.trajectory import Trajectory
 from vioframe.trajectory.alignment import rotation_z, yaw_of
 from vioframe.types import Calibration, Float, Int, Loop, LoopClosure, NavState, Status, Step
-from vioframe_pose_graph.consistency import GATE, believable, sighting_cov
+from vioframe_pose_graph.consistency import GATE, agreed, measured, within_drift
 from vioframe_pose_graph.correction import carry
 from vioframe_pose_graph.drift import Odometry
 from vioframe_pose_graph.graph import Edges, root_of
@@ -67,15 +67,16 @@ class PoseGraph:
         segment = np.array([place.segment for place in places])
         odometry = Odometry.of(t_ns, np.array([place.p_WB for place in places]), segment, self._options)
 
-        believed = believable(sightings, odometry, t_ns)
-        loops = _edges([s for s, good in zip(sightings, believed, strict=True) if good])
-        p, yaw, weights = solve_robustly(odometry.p, odometry.edges(), loops, GATE)
+        i, j, z, turn, cov = measured(sightings)
+        edges, sound = Edges(i, j, z, turn, root_of(cov)), agreed(sightings, odometry, t_ns)
+        trusted = sound & within_drift(sightings, odometry)
+        accepted = np.zeros(len(sightings), bool)
+        p, yaw, accepted[sound] = solve_robustly(
+            odometry.p, odometry.edges(), edges.select(sound), trusted[sound], GATE
+        )
         trajectory = self._corrected(t_ns, segment, odometry.p, p, yaw)
-
-        weight_of = np.zeros(len(sightings))
-        weight_of[believed] = weights
-        found = tuple(_loop(s, places, weight) for s, weight in zip(sightings, weight_of.tolist(), strict=True))
-        return LoopClosure(trajectory, t_ns, found, {**self._recogniser.seconds, "solve": perf_counter() - begin})
+        loops = tuple(_loop(s, places, good) for s, good in zip(sightings, accepted.tolist(), strict=True))
+        return LoopClosure(trajectory, t_ns, loops, {**self._recogniser.seconds, "solve": perf_counter() - begin})
 
     def _corrected(self, t_ns: Int, segment: Int, key_p: Float, p: Float, yaw: Float) -> Trajectory:
         stamps = np.array([state.t_ns for state in self._states])
@@ -88,21 +89,11 @@ class PoseGraph:
         return Trajectory(stamps, *carry(frames, (t_ns, segment, key_p), p, yaw))
 
 
-def _edges(sightings: Sequence[Sighting]) -> Edges:
-    """What the sightings say, as edges of the graph."""
-    earlier = np.array([s.earlier for s in sightings], np.int64)
-    later = np.array([s.later for s in sightings], np.int64)
-    z = np.array([s.relation.z for s in sightings]).reshape(-1, 3)
-    turn = np.array([s.relation.yaw for s in sightings])
-    cov = np.array([sighting_cov(s) for s in sightings]).reshape(-1, 4, 4)
-    return Edges(earlier, later, z, turn, root_of(cov))
-
-
-def _loop(sighting: Sighting, places: Sequence[Place], weight: float) -> Loop:
+def _loop(sighting: Sighting, places: Sequence[Place], accepted: bool) -> Loop:
     """The sighting as it leaves the plug-in: the later body seen from the earlier one, levelled."""
     earlier, later, relation = places[sighting.earlier], places[sighting.later], sighting.relation
     heading = float(yaw_of(earlier.R_WB))
     p_L = rotation_z(heading).T @ relation.z
     yaw = float(yaw_of(later.R_WB)) + relation.yaw - heading
     yaw = float(np.arctan2(np.sin(yaw), np.cos(yaw)))
-    return Loop(earlier.t_ns, later.t_ns, p_L, yaw, relation.inliers, weight)
+    return Loop(earlier.t_ns, later.t_ns, p_L, yaw, relation.inliers, accepted)

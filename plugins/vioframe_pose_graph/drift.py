@@ -15,7 +15,7 @@ _SPAN = 4
 # Position also drifts where nothing moves, as far as it would along this many metres a second.
 _HOVERING_M_S = 0.1
 # Between two segments nothing is known but that the body cannot have gone far.
-_LOST_SPEED_M_S, _LOST_M, _LOST_YAW = 2.0, 2.0, 1.0
+_LOST_SPEED_M_S, _LOST_M, _LOST_YAW = 5.0, 5.0, 1.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -56,11 +56,24 @@ class Odometry:
         cov[:, 3, 3] = share * (sum_yaw[j] - sum_yaw[i])
         return Edges(i, j, self.p[j] - self.p[i], np.zeros(len(i)), root_of(cov))
 
-    def cov(self, i: int, j: int) -> Float:
-        """(4, 4) covariance of [position yaw] of keyframe j as seen from keyframe i < j."""
-        steps = slice(i + 1, j + 1)
-        lever = self.p[j] - self.p[steps]
-        J = np.stack([-lever[:, 1], lever[:, 0], np.zeros(len(lever)), np.ones(len(lever))], axis=1)
-        cov = np.einsum("n,ni,nj->ij", self.var_yaw[steps], J, J)
-        cov[:3, :3] += np.eye(3) * self.var_p[steps].sum()
-        return np.asarray(cov)
+    def cov(self, i: Int, j: Int) -> Float:
+        """(M, 4, 4) covariance of [position yaw] of keyframes j (M,) as seen from keyframes i (M,), i <= j.
+
+        A yaw error of step k swings keyframe j around keyframe k: with J_k = [-(y_j - y_k), x_j - x_k, 0, 1] it adds
+        var_yaw_k J_k J_k^T. The sums over k from i + 1 to j are differences of running sums.
+        """
+        xy = self.p[:, :2] - self.p[:, :2].mean(axis=0)  # near the origin, where no digits are lost
+        moments = np.column_stack([np.ones(len(xy)), xy, xy**2, xy[:, 0] * xy[:, 1]])
+        running = np.cumsum(self.var_yaw[:, None] * moments, axis=0)
+        v, vx, vy, vxx, vyy, vxy = (running[j] - running[i]).T
+        x, y = xy[j].T
+        var_p = np.cumsum(self.var_p)
+        cov = np.zeros((len(i), 4, 4))
+        cov[:, [0, 1, 2], [0, 1, 2]] = (var_p[j] - var_p[i])[:, None]
+        cov[:, 0, 0] += v * y * y - 2.0 * y * vy + vyy
+        cov[:, 1, 1] += v * x * x - 2.0 * x * vx + vxx
+        cov[:, 0, 1] = cov[:, 1, 0] = -(v * x * y - x * vy - y * vx + vxy)
+        cov[:, 0, 3] = cov[:, 3, 0] = vy - v * y
+        cov[:, 1, 3] = cov[:, 3, 1] = v * x - vx
+        cov[:, 3, 3] = v
+        return cov

@@ -12,13 +12,17 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.sparse import csc_array
-from scipy.sparse.linalg import splu
+from scipy.sparse.linalg import SuperLU, splu
 
 from vioframe.types import Float, Int
 
 _ITERATIONS = 50
 _CONVERGED = 1e-6
+_MAX_DAMPING = 1e6
+# Edges whose uncertainty is solved for at once: the right-hand sides are dense.
+_AT_A_TIME = 64
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -40,6 +44,10 @@ class Edges:
 
     def __len__(self) -> int:
         return len(self.i)
+
+    def select(self, which: NDArray[np.bool_]) -> Edges:
+        """The edges that ``which`` (E,) marks."""
+        return Edges(self.i[which], self.j[which], self.z[which], self.turn[which], self.root[which])
 
 
 def root_of(cov: Float) -> Float:
@@ -64,24 +72,24 @@ def residuals(p: Float, yaw: Float, edges: Edges) -> tuple[Float, Float, Float]:
     return np.einsum("eij,ej->ei", edges.root, r), edges.root @ J_i, edges.root @ J_j
 
 
-def solve(p: Float, yaw: Float, edges: Edges, weights: Float) -> tuple[Float, Float]:
-    """Positions (N, 3) and yaws (N,) that minimise the weighted squares, from a first guess; node 0 is held.
+def solve(p: Float, yaw: Float, edges: Edges) -> tuple[Float, Float]:
+    """Positions (N, 3) and yaws (N,) of least squares, from a first guess; node 0 is held.
 
-    Levenberg-Marquardt on the normal equations, which a sparse factorisation solves. ``weights`` (E,) are those of the
-    squared residuals.
+    Levenberg-Marquardt on the normal equations, which a sparse factorisation solves.
     """
-    structure = _Structure(len(p), edges)
+    blocks = _Blocks(len(p), edges)
     damping = 1e-6
     r, J_i, J_j = residuals(p, yaw, edges)
-    cost = _cost(r, weights)
+    cost = float(np.sum(r**2))
     for _ in range(_ITERATIONS):
-        step = structure.step(r, J_i, J_j, weights, damping)
-        new_p, new_yaw = p + step[:, :3], yaw + step[:, 3]
+        step = -blocks.factorised(J_i, J_j, damping).solve(blocks.gradient(r, J_i, J_j)).reshape(-1, 4)
+        new_p, new_yaw = p.copy(), yaw.copy()
+        new_p[1:], new_yaw[1:] = p[1:] + step[:, :3], yaw[1:] + step[:, 3]
         new = residuals(new_p, new_yaw, edges)
-        new_cost = _cost(new[0], weights)
+        new_cost = float(np.sum(new[0] ** 2))
         if new_cost > cost:
-            damping = max(10.0 * damping, 1e-6)
-            if damping > 1e6:
+            damping *= 10.0
+            if damping > _MAX_DAMPING:
                 break
             continue
         done = cost - new_cost <= _CONVERGED * cost
@@ -92,35 +100,48 @@ def solve(p: Float, yaw: Float, edges: Edges, weights: Float) -> tuple[Float, Fl
     return p, yaw
 
 
-def _cost(r: Float, weights: Float) -> float:
-    return float(weights @ np.sum(r**2, axis=1))
+def uncertainty(p: Float, yaw: Float, edges: Edges, of: Edges) -> Float:
+    """(M, 4, 4) covariance of what the edges ``of`` measure, by the solution of ``edges``; whitened as ``of`` are."""
+    _, J_i, J_j = residuals(p, yaw, edges)
+    factor = _Blocks(len(p), edges).factorised(J_i, J_j, 0.0)
+    _, J_i, J_j = residuals(p, yaw, of)
+    cov = np.empty((len(of), 4, 4))
+    for begin in range(0, len(of), _AT_A_TIME):
+        part = slice(begin, begin + _AT_A_TIME)
+        count = len(of.i[part])
+        # The rows of the Jacobian as columns: (4 N, 4 count).
+        J_T = np.zeros((len(p), 4, count, 4))
+        number = np.arange(count)
+        J_T[of.i[part], :, number] += J_i[part].transpose(0, 2, 1)
+        J_T[of.j[part], :, number] += J_j[part].transpose(0, 2, 1)
+        columns = J_T[1:].reshape(4 * (len(p) - 1), 4 * count)
+        solved = factor.solve(columns).reshape(-1, count, 4)
+        cov[part] = np.einsum("nka,nkb->kab", columns.reshape(-1, count, 4), solved)
+    return cov
 
 
-class _Structure:
-    """Where the blocks of the normal equations go, which does not change between iterations."""
+class _Blocks:
+    """Where the blocks of the normal equations go, which does not change between iterations; node 0 has none."""
 
     def __init__(self, nodes: int, edges: Edges) -> None:
         self._size, self._i, self._j = 4 * nodes, edges.i, edges.j
         block = np.arange(4)
-        row_of = {"i": 4 * edges.i[:, None] + block, "j": 4 * edges.j[:, None] + block}
-        pairs = (("i", "i"), ("i", "j"), ("j", "i"), ("j", "j"))
-        self._rows = np.concatenate([np.repeat(row_of[a], 4, axis=1).ravel() for a, _ in pairs])
-        self._columns = np.concatenate([np.tile(row_of[b], 4).ravel() for _, b in pairs])
+        rows_i, rows_j = 4 * edges.i[:, None] + block, 4 * edges.j[:, None] + block
+        pairs = [(a, b) for a in (rows_i, rows_j) for b in (rows_i, rows_j)]
+        self._rows = np.concatenate([np.repeat(a, 4, axis=1).ravel() for a, _ in pairs])
+        self._columns = np.concatenate([np.tile(b, 4).ravel() for _, b in pairs])
 
-    def step(self, r: Float, J_i: Float, J_j: Float, weights: Float, damping: float) -> Float:
-        """(N, 4) the damped Gauss-Newton step; zero for node 0."""
-        WJ_i, WJ_j = weights[:, None, None] * J_i, weights[:, None, None] * J_j
-        blocks = [np.einsum("eki,ekj->eij", a, b) for a in (WJ_i, WJ_j) for b in (J_i, J_j)]
-        H = csc_array(
-            (np.concatenate([block.ravel() for block in blocks]), (self._rows, self._columns)),
-            shape=(self._size, self._size),
-        )
+    def factorised(self, J_i: Float, J_j: Float, damping: float) -> SuperLU:
+        """The factors of J^T J, its diagonal raised by the part ``damping``."""
+        blocks = [np.einsum("eki,ekj->eij", a, b).ravel() for a in (J_i, J_j) for b in (J_i, J_j)]
+        whole = csc_array((np.concatenate(blocks), (self._rows, self._columns)), shape=(self._size, self._size))
+        H = whole[4:, 4:].tocsc()
+        H.setdiag(H.diagonal() * (1.0 + damping))
+        return splu(H, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True})
+
+    def gradient(self, r: Float, J_i: Float, J_j: Float) -> Float:
+        """(4 (N - 1),) J^T r."""
         g = np.zeros((self._size // 4, 4))
-        np.add.at(g, self._i, np.einsum("eki,ek->ei", WJ_i, r))
-        np.add.at(g, self._j, np.einsum("eki,ek->ei", WJ_j, r))
-        free = H[4:, 4:]
-        free.setdiag(free.diagonal() * (1.0 + damping))
-        out = np.zeros(self._size)
-        factor = splu(free.tocsc(), permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True})
-        out[4:] = -factor.solve(g.ravel()[4:])
-        return out.reshape(-1, 4)
+        np.add.at(g, self._i, np.einsum("eki,ek->ei", J_i, r))
+        np.add.at(g, self._j, np.einsum("eki,ek->ei", J_j, r))
+        return g.ravel()[4:]

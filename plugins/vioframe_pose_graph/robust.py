@@ -1,54 +1,60 @@
-"""The pose graph where some loops may be wrong: graduated non-convexity.
+"""The pose graph where some loops may be wrong: each must agree with all that the others and the odometry say.
 
-Yang, Antonante, Tzoumas, Carlone, "Graduated non-convexity for robust spatial perception" (RA-L 2020), with truncated
-least squares (their section IV): a loop that the others leave further than the gate from where it would be is worth the
-gate, no more, and so has no pull. That cost is not convex; it is approached from one that is, so that the loops that
-agree settle the matter before the others are let go. Edges of the odometry are always believed.
+The residual that is left in the solution cannot tell: an odometry that drifts is soft, and bends to wherever a wrong
+loop wants it. What tells is how far the loop lies from where the rest of the graph, without it, has its two keyframes.
+That innovation need not be computed by leaving out one loop after the other. With r the residual that is left and S the
+covariance of what the loop measures in the solution with it, both whitened, its squared Mahalanobis distance is
+``r^T (I - S)^-1 r``; ``docs/derivations/pose_graph.md``, section 4.
 """
 
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from vioframe.types import Float
-from vioframe_pose_graph.graph import Edges, residuals, solve
+from vioframe_pose_graph.graph import Edges, residuals, solve, uncertainty
 
-_GROWTH = 1.4
-_DECIDED = 1e-3
-_MAX_ROUNDS = 60
+# A wrong loop bends the graph, so that right ones disagree with it as well: only the worst are let go at a time.
+_WORST = 0.5
 
 
-def solve_robustly(p: Float, odometry: Edges, loops: Edges, gate: float) -> tuple[Float, Float, Float]:
-    """Positions (N, 3), yaws (N,) and the weights (L,) of the loops: 1 believed, 0 let go.
+def solve_robustly(
+    p: Float, odometry: Edges, loops: Edges, trusted: NDArray[np.bool_], gate: float
+) -> tuple[Float, Float, NDArray[np.bool_]]:
+    """Positions (N, 3), yaws (N,) and which of the ``loops`` (L,) were believed.
 
-    ``p`` (N, 3) are the positions by the odometry alone; ``gate`` is the squared whitened residual at which a loop
-    starts to be worth no more.
+    ``p`` (N, 3) are the positions by the odometry alone. The ``trusted`` loops (L,) are used until they prove wrong,
+    the others only if they agree with what came of those: lie within ``gate``, a squared Mahalanobis distance.
     """
-    edges = odometry + loops
-    weights = np.ones(len(edges))
-    p, yaw = solve(p, np.zeros(len(p)), edges, weights)
-    squares = _squares(p, yaw, loops)
-    largest = float(squares.max(initial=0.0))
-    if largest <= gate:
-        return p, yaw, weights[len(odometry) :]
-    mu = gate / (2.0 * largest - gate)
-    for _ in range(_MAX_ROUNDS):
-        loop_weights = _weights(squares, gate, mu)
-        weights[len(odometry) :] = loop_weights
-        p, yaw = solve(p, yaw, edges, weights)
-        squares = _squares(p, yaw, loops)
-        if np.abs(loop_weights - np.round(loop_weights)).max() < _DECIDED and mu > 1.0:
-            break
-        mu *= _GROWTH
-    return p, yaw, loop_weights
+    used = trusted.copy()
+    q, yaw = _eliminate(p, odometry, loops, used, gate)
+    doubted = ~used
+    if doubted.any() and used.any():
+        edges, asked = odometry + loops.select(used), loops.select(doubted)
+        r = residuals(q, yaw, asked)[0]
+        cov = np.eye(4) + uncertainty(q, yaw, edges, asked)
+        used[doubted] = _squares(r, cov) < gate
+        if used[doubted].any():
+            q, yaw = _eliminate(p, odometry, loops, used, gate)
+    return q, yaw, used
 
 
-def _squares(p: Float, yaw: Float, loops: Edges) -> Float:
-    return np.asarray(np.sum(residuals(p, yaw, loops)[0] ** 2, axis=1))
+def _eliminate(p: Float, odometry: Edges, loops: Edges, used: NDArray[np.bool_], gate: float) -> tuple[Float, Float]:
+    """Solve, and let go of the loops that the rest contradicts (``used`` is changed) until there are none."""
+    q, yaw = p, np.zeros(len(p))
+    while used.any():
+        chosen = loops.select(used)
+        edges = odometry + chosen
+        q, yaw = solve(q, yaw, edges)
+        r = residuals(q, yaw, chosen)[0]
+        rest = np.linalg.inv(np.eye(4) - uncertainty(q, yaw, edges, chosen))
+        squares = np.einsum("ei,eij,ej->e", r, rest, r)
+        if squares.max() < gate:
+            return q, yaw
+        used[np.flatnonzero(used)[squares > max(gate, _WORST * squares.max())]] = False
+    return p, np.zeros(len(p))
 
 
-def _weights(squares: Float, gate: float, mu: float) -> Float:
-    """(L,) their eq. (14)."""
-    between = np.sqrt(gate * mu * (mu + 1.0) / np.maximum(squares, 1e-300)) - mu
-    inside, outside = squares <= mu / (mu + 1.0) * gate, squares >= (mu + 1.0) / mu * gate
-    return np.where(inside, 1.0, np.where(outside, 0.0, between))
+def _squares(r: Float, cov: Float) -> Float:
+    return np.asarray(np.einsum("ei,ei->e", r, np.linalg.solve(cov, r[..., None])[..., 0]))

@@ -113,6 +113,11 @@ def _report(folder: Path, summary: dict[str, Any]) -> None:
     estimate, truth = run.trajectory(), run.ground_truth()
     if estimate is not None and truth is not None:
         click.echo(_accuracy(estimate, truth))
+    if closed := summary.get("loop_closure"):
+        click.echo(f"{closed['loops']} loops closed, {closed['rejected']} rejected")
+        corrected = run.loop_closed()
+        if corrected is not None and truth is not None:
+            click.echo(f"with loop closure: {_accuracy(corrected, truth)}")
     click.echo(f"written to {folder}; next:\n  vioframe evaluate {folder}\n  vioframe plot {folder}")
 
 

@@ -11,5 +11,6 @@ from vioframe.testing.backend import check_backend
 from vioframe.testing.dataset import check_dataset
 from vioframe.testing.detector import check_detector
 from vioframe.testing.flight import check_flight
+from vioframe.testing.loop_closer import check_loop_closer
 
-__all__ = ["check_backend", "check_dataset", "check_detector", "check_flight"]
+__all__ = ["check_backend", "check_dataset", "check_detector", "check_flight", "check_loop_closer"]

@@ -1,0 +1,326 @@
+"""The pose graph: its mathematics, what it does with drift and with wrong loops, and the frames between keyframes."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from vioframe.trajectory.alignment import rotation_z
+from vioframe_pose_graph.correction import carry
+from vioframe_pose_graph.drift import Odometry
+from vioframe_pose_graph.graph import Edges, residuals, root_of, solve, uncertainty
+from vioframe_pose_graph.options import PoseGraphOptions
+from vioframe_pose_graph.robust import solve_robustly
+
+OPTIONS = PoseGraphOptions()
+GATE = float(chi2.ppf(0.999, 4))
+
+
+def circle(laps: int, per_lap: int = 40, radius: float = 5.0):
+    """Stamps, true positions (N, 3) and yaws (N,) of a flight round a circle that climbs and sinks."""
+    angle = np.arange(laps * per_lap + 1) * (2.0 * np.pi / per_lap)
+    p = np.column_stack([radius * np.cos(angle), radius * np.sin(angle), 0.5 * np.sin(2.0 * angle)])
+    t_ns = 10**9 + np.arange(len(p)) * 400_000_000
+    return t_ns, p, angle
+
+
+def drifted(p, rng, sigma_m=0.05, sigma_yaw=0.004):
+    """``p`` as an odometry sees it, and the yaw (N,) that it is off by."""
+    yaw = np.concatenate([[0.0], np.cumsum(rng.normal(0.0, sigma_yaw, len(p) - 1))])
+    steps = np.einsum("nij,nj->ni", np.array([rotation_z(a) for a in yaw[:-1]]), np.diff(p, axis=0))
+    steps += rng.normal(0.0, sigma_m, steps.shape)
+    return np.concatenate([p[:1], p[0] + np.cumsum(steps, axis=0)]), yaw
+
+
+def true_loops(p, yaw_error, pairs, sigma=(0.02, 0.003), rng=None):
+    """Edges that say where ``pairs`` (L, 2) truly lie to one another, in the axes of the odometry at the first."""
+    i, j = np.array(pairs).T
+    z = np.array([rotation_z(yaw_error[a]) @ (p[b] - p[a]) for a, b in pairs])
+    turn = yaw_error[i] - yaw_error[j]
+    if rng is not None:
+        z, turn = z + rng.normal(0.0, sigma[0], z.shape), turn + rng.normal(0.0, sigma[1], turn.shape)
+    cov = np.diag([sigma[0] ** 2] * 3 + [sigma[1] ** 2])
+    return Edges(i, j, z, turn, root_of(np.repeat(cov[None], len(i), axis=0)))
+
+
+def every(loops):
+    return np.ones(len(loops), bool)
+
+
+def random_edges(rng, nodes=6, count=12):
+    i = rng.integers(0, nodes, count)
+    j = (i + rng.integers(1, nodes, count)) % nodes
+    A = rng.standard_normal((count, 4, 4))
+    cov = A @ A.transpose(0, 2, 1) + 0.1 * np.eye(4)
+    return Edges(i, j, rng.standard_normal((count, 3)), rng.uniform(-3.0, 3.0, count), root_of(cov))
+
+
+def test_the_whitened_square_is_the_mahalanobis_distance():
+    rng = np.random.default_rng(0)
+    A = rng.standard_normal((4, 4))
+    cov = A @ A.T + np.eye(4)
+    e = rng.standard_normal(4)
+    assert np.sum((root_of(cov[None])[0] @ e) ** 2) == pytest.approx(e @ np.linalg.solve(cov, e), rel=1e-12)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_jacobians_are_the_derivatives_on_the_manifold(seed):
+    rng = np.random.default_rng(seed)
+    edges = random_edges(rng)
+    p, yaw = rng.normal(0.0, 5.0, (6, 3)), rng.uniform(-np.pi, np.pi, 6)
+    _, J_i, J_j = residuals(p, yaw, edges)
+    h = 1e-6
+    for k in range(4):
+        for nodes, J in ((edges.i, J_i), (edges.j, J_j)):
+            numeric = np.empty((len(edges), 4))
+            for e, node in enumerate(nodes):
+                moved = []
+                for sign in (1.0, -1.0):
+                    q, turned = p.copy(), yaw.copy()
+                    if k < 3:
+                        q[node, k] += sign * h
+                    else:
+                        turned[node] += sign * h
+                    moved.append(residuals(q, turned, edges)[0][e])
+                numeric[e] = (moved[0] - moved[1]) / (2.0 * h)
+            np.testing.assert_allclose(J[:, :, k], numeric, atol=1e-6)
+
+
+def test_turning_and_moving_everything_changes_no_residual():
+    """The four directions that no edge can see are those of the odometry: position and yaw of the whole."""
+    rng = np.random.default_rng(1)
+    edges = random_edges(rng)
+    p, yaw = rng.normal(0.0, 5.0, (6, 3)), rng.uniform(-np.pi, np.pi, 6)
+    R = rotation_z(0.7)
+    moved = residuals(p @ R.T + [3.0, -2.0, 1.0], yaw + 0.7, edges)[0]
+    np.testing.assert_allclose(moved, residuals(p, yaw, edges)[0], atol=1e-12)
+
+
+def test_exact_loops_restore_the_truth():
+    t_ns, p, _ = circle(laps=1)
+    rng = np.random.default_rng(2)
+    odometry, yaw_error = drifted(p, rng)
+    # Every keyframe tied to the first leaves nothing open.
+    loops = true_loops(p, yaw_error, [(0, j) for j in range(1, len(p))], sigma=(1e-4, 1e-5))
+    graph = Odometry.of(t_ns, odometry, np.zeros(len(p), int), OPTIONS)
+    edges = graph.edges() + loops
+    q, yaw = solve(odometry, np.zeros(len(p)), edges)
+    np.testing.assert_allclose(q, p, atol=1e-3)
+    np.testing.assert_allclose(yaw, -yaw_error, atol=1e-3)
+
+
+def test_the_graph_finds_its_minimum_from_afar():
+    """Yaw errors of a radian, as after a reset: the gradient vanishes where it ends."""
+    t_ns, p, _ = circle(laps=1)
+    rng = np.random.default_rng(3)
+    odometry, yaw_error = drifted(p, rng, sigma_yaw=0.1)
+    loops = true_loops(p, yaw_error, [(0, 40), (1, 39), (2, 38)])
+    edges = Odometry.of(t_ns, odometry, np.zeros(len(p), int), OPTIONS).edges() + loops
+    q, yaw = solve(odometry, np.zeros(len(p)), edges)
+    r, J_i, J_j = residuals(q, yaw, edges)
+    gradient = np.zeros((len(p), 4))
+    np.add.at(gradient, edges.i, np.einsum("eki,ek->ei", J_i, r))
+    np.add.at(gradient, edges.j, np.einsum("eki,ek->ei", J_j, r))
+    begin, B_i, B_j = residuals(odometry, np.zeros(len(p)), edges)
+    first = np.zeros((len(p), 4))
+    np.add.at(first, edges.i, np.einsum("eki,ek->ei", B_i, begin))
+    np.add.at(first, edges.j, np.einsum("eki,ek->ei", B_j, begin))
+    assert np.abs(gradient[1:]).max() < 1e-3 * np.abs(first[1:]).max()
+    assert np.array_equal(q[0], odometry[0])
+    assert yaw[0] == 0.0
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_three_laps_lose_most_of_their_drift(seed):
+    """A circle flown three times: the last keyframe, seen again, is where it belongs to within a fifth of the drift."""
+    t_ns, p, _ = circle(laps=3)
+    rng = np.random.default_rng(seed)
+    odometry, yaw_error = drifted(p, rng)
+    pairs = [(j - 40, j) for j in range(45, len(p), 5)] + [(0, len(p) - 1)]
+    loops = true_loops(p, yaw_error, pairs, rng=rng)
+    graph = Odometry.of(t_ns, odometry, np.zeros(len(p), int), OPTIONS)
+    q, _, used = solve_robustly(odometry, graph.edges(), loops, every(loops), GATE)
+    assert used.all()
+    before, after = (np.linalg.norm(x[-1] - p[-1]) for x in (odometry, q))
+    assert after < 0.2 * before
+    rms = [np.sqrt(np.mean(np.sum((x - p) ** 2, axis=1))) for x in (odometry, q)]
+    assert rms[1] < 0.5 * rms[0]
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_wrong_loops_are_let_go(seed):
+    """Ten right loops and five wrong ones, of which no two agree."""
+    t_ns, p, _ = circle(laps=2)
+    rng = np.random.default_rng(seed)
+    odometry, yaw_error = drifted(p, rng)
+    right = true_loops(p, yaw_error, [(j - 40, j) for j in range(40, 80, 4)], rng=rng)
+    wrong = true_loops(p, yaw_error, [(j - 30, j) for j in range(42, 80, 8)])
+    wrong.z[:] += rng.choice([-1.0, 1.0], wrong.z.shape) * rng.uniform(1.0, 3.0, wrong.z.shape)
+    graph = Odometry.of(t_ns, odometry, np.zeros(len(p), int), OPTIONS)
+    both = right + wrong
+    q, yaw, used = solve_robustly(odometry, graph.edges(), both, every(both), GATE)
+    assert used.tolist() == [True] * len(right) + [False] * len(wrong)
+    alone, alone_yaw, _ = solve_robustly(odometry, graph.edges(), right, every(right), GATE)
+    np.testing.assert_allclose(q, alone, atol=1e-3)
+    np.testing.assert_allclose(yaw, alone_yaw, atol=1e-3)
+
+
+def test_the_distance_to_the_rest_is_that_of_leaving_the_loop_out():
+    """``r^T (I - S)^-1 r`` of the solution with the loop, against solving without it: equal where all is linear."""
+    t_ns, p, _ = circle(laps=2)
+    rng = np.random.default_rng(7)
+    odometry, yaw_error = drifted(p, rng, sigma_m=0.005, sigma_yaw=0.0)
+    loops = true_loops(p, yaw_error, [(0, 40), (10, 50), (20, 60), (30, 70)], rng=rng)
+    graph = Odometry.of(t_ns, odometry, np.zeros(len(p), int), OPTIONS).edges()
+    q, yaw = solve(odometry, np.zeros(len(p)), graph + loops)
+    for k in range(len(loops)):
+        one = loops.select(np.arange(len(loops)) == k)
+        rest = graph + loops.select(np.arange(len(loops)) != k)
+        r = residuals(q, yaw, one)[0][0]
+        within = uncertainty(q, yaw, graph + loops, one)[0]
+        q_rest, yaw_rest = solve(odometry, np.zeros(len(p)), rest)
+        innovation = residuals(q_rest, yaw_rest, one)[0][0]
+        left_out = np.eye(4) + uncertainty(q_rest, yaw_rest, rest, one)[0]
+        expected = innovation @ np.linalg.solve(left_out, innovation)
+        assert r @ np.linalg.solve(np.eye(4) - within, r) == pytest.approx(expected, rel=0.02)
+
+
+def test_a_doubted_loop_is_used_if_the_others_bear_it_out():
+    t_ns, p, _ = circle(laps=2)
+    rng = np.random.default_rng(8)
+    odometry, yaw_error = drifted(p, rng)
+    loops = true_loops(p, yaw_error, [(2, 42), (4, 44), (6, 46), (8, 48)], rng=rng)
+    loops.z[3] += [2.0, 0.0, 0.0]
+    graph = Odometry.of(t_ns, odometry, np.zeros(len(p), int), OPTIONS)
+    trusted = np.array([True, True, False, False])
+    _, _, used = solve_robustly(odometry, graph.edges(), loops, trusted, GATE)
+    assert used.tolist() == [True, True, True, False]
+
+
+def test_without_loops_nothing_moves():
+    t_ns, p, _ = circle(laps=1)
+    graph = Odometry.of(t_ns, p, np.zeros(len(p), int), OPTIONS)
+    nothing = np.empty(0, np.int64)
+    empty = Edges(nothing, nothing, np.empty((0, 3)), np.empty(0), np.empty((0, 4, 4)))
+    q, yaw, _ = solve_robustly(p, graph.edges(), empty, every(empty), GATE)
+    assert np.array_equal(q, p)
+    assert not yaw.any()
+
+
+def test_four_edges_are_as_stiff_as_the_random_walk():
+    """The covariance of the end of a long straight chain of edges is that of the walk, but for its two ends."""
+    n = 200
+    p = np.column_stack([np.linspace(0.0, 100.0, n), np.zeros((n, 2))])
+    graph = Odometry.of(10**9 * np.arange(1, n + 1), p, np.zeros(n, int), OPTIONS)
+    edges = graph.edges()
+    _, J_i, J_j = residuals(p, np.zeros(n), edges)
+    H = np.zeros((n, n))  # of the heights, which no other coordinate has a part in
+    for e, (i, j) in enumerate(zip(edges.i, edges.j, strict=True)):
+        a, b = J_i[e, :, 2], J_j[e, :, 2]
+        H[i, i] += a @ a
+        H[j, j] += b @ b
+        H[i, j] += a @ b
+        H[j, i] += a @ b
+    variance = np.linalg.inv(H[1:, 1:])[-1, -1]
+    assert variance == pytest.approx(graph.var_p.sum(), rel=0.05)
+
+
+def test_the_covariance_of_the_odometry_is_that_of_a_simulated_one():
+    t_ns, p, _ = circle(laps=1)
+    graph = Odometry.of(t_ns, p, np.zeros(len(p), int), OPTIONS)
+    rng = np.random.default_rng(4)
+    i, j, trials = 5, 33, 20_000
+    steps = np.diff(p, axis=0)[i:j]
+    yaw = np.cumsum(rng.standard_normal((trials, j - i)) * np.sqrt(graph.var_yaw[i + 1 : j + 1]), axis=1)
+    # A step is turned by what the yaw was off before it.
+    before = np.concatenate([np.zeros((trials, 1)), yaw[:, :-1]], axis=1)
+    cos, sin = np.cos(before), np.sin(before)
+    x = (cos * steps[:, 0] - sin * steps[:, 1]).sum(axis=1)
+    y = (sin * steps[:, 0] + cos * steps[:, 1]).sum(axis=1)
+    noise = rng.standard_normal((trials, 3)) * np.sqrt(graph.var_p[i + 1 : j + 1].sum())
+    ends = np.column_stack([x, y, np.full(trials, steps[:, 2].sum())]) + noise
+    measured = np.cov(np.column_stack([ends, yaw[:, -1]]).T)
+    expected = graph.cov(np.array([i]), np.array([j]))[0]
+    scale = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
+    np.testing.assert_allclose(measured / scale, expected / scale, atol=0.05)
+
+
+def test_a_segment_after_a_reset_is_hardly_tied_to_the_one_before():
+    t_ns, p, _ = circle(laps=1)
+    segment = (np.arange(len(p)) >= 20).astype(int)
+    graph = Odometry.of(t_ns, p, segment, OPTIONS)
+    tied, across = graph.cov(np.array([0, 19]), np.array([19, 20]))
+    assert np.sqrt(across[0, 0]) > 2.0 > 4.0 * np.sqrt(tied[0, 0])
+    assert np.sqrt(across[3, 3]) >= 1.0
+
+
+def test_loops_bring_a_lost_segment_home():
+    """After a reset the second lap lies 4 m off and turned by half a radian; three loops put it right."""
+    t_ns, p, _ = circle(laps=2)
+    R, shift, turned = rotation_z(0.5), np.array([4.0, -1.0, 0.3]), 0.5
+    odometry, segment = p.copy(), (np.arange(len(p)) >= 40).astype(int)
+    odometry[40:] = p[40:] @ R.T + shift
+    yaw_error = turned * segment
+    loops = true_loops(p, yaw_error, [(2, 42), (10, 50), (30, 70)])
+    graph = Odometry.of(t_ns, odometry, segment, OPTIONS)
+    q, yaw, used = solve_robustly(odometry, graph.edges(), loops, every(loops), GATE)
+    assert used.all()
+    np.testing.assert_allclose(q, p, atol=0.02)
+    np.testing.assert_allclose(yaw, -yaw_error, atol=0.01)
+
+
+def frames_between(keys_t_ns, keys_p, per_key=10):
+    t_ns = np.concatenate([np.linspace(a, b, per_key, endpoint=False) for a, b in pairwise(keys_t_ns)])
+    t_ns = t_ns.astype(np.int64)
+    p = np.column_stack([np.interp(t_ns, keys_t_ns, keys_p[:, k]) for k in range(3)])
+    return t_ns, p
+
+
+def test_frames_move_with_their_keyframes_and_smoothly():
+    key_t_ns, key_p, angle = circle(laps=1)
+    t_ns, p = frames_between(key_t_ns, key_p)
+    R = np.array([rotation_z(a) for a in np.interp(t_ns, key_t_ns, angle)])
+    rng = np.random.default_rng(5)
+    yaw = np.cumsum(rng.normal(0.0, 0.01, len(key_p)))
+    moved = key_p + np.cumsum(rng.normal(0.0, 0.02, key_p.shape), axis=0)
+    zeros = np.zeros(len(t_ns), int)
+    R_new, p_new = carry((t_ns, zeros, R, p), (key_t_ns, np.zeros(len(key_p), int), key_p), moved, yaw)
+    at_keys = np.isin(t_ns, key_t_ns)
+    np.testing.assert_allclose(p_new[at_keys], moved[:-1], atol=1e-9)
+    np.testing.assert_allclose(R_new[at_keys], np.array([rotation_z(a) for a in yaw[:-1]]) @ R[at_keys], atol=1e-9)
+    # No step of the corrected path differs from the odometry's by more than the correction moves from frame to frame.
+    change = np.abs(np.diff(p_new, axis=0)) - np.abs(np.diff(p, axis=0))
+    assert np.abs(change).max() < 0.03
+
+
+def test_a_rigid_correction_moves_every_frame_rigidly():
+    key_t_ns, key_p, angle = circle(laps=1)
+    t_ns, p = frames_between(key_t_ns, key_p)
+    R = np.array([rotation_z(a) for a in np.interp(t_ns, key_t_ns, angle)])
+    G, shift = rotation_z(0.8), np.array([1.0, 2.0, 3.0])
+    zeros, key_zeros = np.zeros(len(t_ns), int), np.zeros(len(key_p), int)
+    R_new, p_new = carry(
+        (t_ns, zeros, R, p), (key_t_ns, key_zeros, key_p), key_p @ G.T + shift, np.full(len(key_p), 0.8)
+    )
+    np.testing.assert_allclose(p_new, p @ G.T + shift, atol=1e-12)
+    np.testing.assert_allclose(R_new, G @ R, atol=1e-12)
+
+
+def test_frames_go_with_the_keyframes_of_their_own_segment():
+    key_t_ns = np.array([0, 10, 20, 30]) * 10**8
+    key_p, segment = np.zeros((4, 3)), np.array([0, 0, 1, 1])
+    moved = np.array([[0.0, 0, 0], [0, 0, 0], [5, 0, 0], [5, 0, 0]])
+    t_ns = np.array([5, 14, 16, 25, 35]) * 10**8
+    frames = (t_ns, np.array([0, 0, 1, 1, 1]), np.repeat(np.eye(3)[None], 5, axis=0), np.zeros((5, 3)))
+    _, p = carry(frames, (key_t_ns, segment, key_p), moved, np.zeros(4))
+    assert p[:, 0].tolist() == [0.0, 0.0, 5.0, 5.0, 5.0]
+
+
+def test_the_shorter_way_round_is_taken_where_yaw_wraps():
+    key_t_ns, segment, key_p = np.array([0, 10]), np.zeros(2, int), np.zeros((2, 3))
+    frames = (np.array([5]), np.zeros(1, int), np.eye(3)[None], np.zeros((1, 3)))
+    R, _ = carry(frames, (key_t_ns, segment, key_p), key_p, np.array([np.pi - 0.1, -np.pi + 0.1]))
+    np.testing.assert_allclose(R[0], rotation_z(np.pi), atol=1e-12)

@@ -1,0 +1,96 @@
+"""Checks a loop closer on a simulated flight of which only landmarks and pictures of noise are known."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from vioframe.interfaces import LoopCloser, LoopCloserFactory
+from vioframe.simulation import TrackSequence, simulated_sequence
+from vioframe.testing.require import fail, require
+from vioframe.types import Estimate, Frame, LoopClosure, NavState, Status, Step
+
+_DURATION_S = 26.0
+_EVERY, _LOST = 4, range(50, 60)
+_MOST_M, _MOST_RAD = 1e-6, 1e-6
+
+
+def check_loop_closer(factory: LoopCloserFactory, **options: Any) -> None:
+    """Check ``factory(calibration, **options)`` against :class:`vioframe.interfaces.LoopCloser`.
+
+    That a trajectory without a place seen again comes out as it went in, one pose for each tracked frame, also where
+    tracking was lost in between; that pictures and arrays are left alone; that the same steps give the same result; and
+    that a run without a single pose ends well.
+    """
+    sequence = simulated_sequence("figure_eight", duration_s=_DURATION_S, max_points=60)
+    steps = _steps(sequence)
+    closure = _run(factory(sequence.calibration, **options), steps)
+    _check_closure(closure, steps)
+    again = _run(factory(sequence.calibration, **options), steps)
+    require(_same(closure, again), "the same steps gave another result the second time")
+    blank = [Step(s.frame, s.tracks, Estimate(Status.INITIALISING), {}) for s in steps[:20]]
+    nothing = _run(factory(sequence.calibration, **options), blank)
+    require(
+        nothing.trajectory is None and not nothing.loops, "there is a trajectory or a loop where nothing was tracked"
+    )
+
+
+def _steps(sequence: TrackSequence) -> list[Step]:
+    """The true poses as an estimate, lost for a while; every picture is noise of its own, so that none is alike."""
+    rng = np.random.default_rng(0)
+    width, height = sequence.calibration.camera.resolution
+    truth = sequence.ground_truth
+    steps = []
+    for k, (_, tracks) in enumerate(sequence.packets[::_EVERY]):
+        image = rng.integers(0, 256, (height, width), dtype=np.uint8)
+        pose = truth.at(np.array([tracks.t_ns]), max_gap_s=1.0)
+        zero = np.zeros(3)
+        for array in (image, tracks.ids, tracks.xy, tracks.xy_normalised):
+            array.flags.writeable = False
+        estimate = Estimate(Status.LOST)
+        if k not in _LOST:
+            state = NavState(tracks.t_ns, pose.R_WB[0], pose.p_WB[0], zero, zero, zero)
+            ahead_C = np.column_stack([tracks.xy_normalised, np.ones(len(tracks.ids))]) * 4.0
+            R_WC = state.R_WB @ sequence.calibration.R_BC
+            p_WC = state.p_WB + state.R_WB @ sequence.calibration.p_BC
+            estimate = Estimate(Status.TRACKING, state, tracks.ids, ahead_C @ R_WC.T + p_WC, is_keyframe=True)
+        steps.append(Step(Frame(tracks.t_ns, image), tracks, estimate, {}))
+    return steps
+
+
+def _run(closer: LoopCloser, steps: list[Step]) -> LoopClosure:
+    try:
+        for step in steps:
+            closer.add(step)
+        closure = closer.finish()
+    except Exception as error:
+        fail(f"the loop closer raised {error!r}")
+    require(isinstance(closure, LoopClosure), f"finish() returned a {type(closure).__name__}, not a LoopClosure")
+    return closure
+
+
+def _check_closure(closure: LoopClosure, steps: list[Step]) -> None:
+    states = [s.estimate.state for s in steps if s.estimate.state is not None]
+    trajectory = closure.trajectory
+    if trajectory is None:
+        fail("there is no trajectory although frames were tracked")
+    t_ns = np.array([state.t_ns for state in states])
+    require(np.array_equal(trajectory.t_ns, t_ns), "the trajectory must have one pose for each tracked frame")
+    require(np.isin(closure.keyframe_t_ns, t_ns).all(), "a keyframe is not among the tracked frames")
+    require(not any(loop.accepted for loop in closure.loops), "pictures of noise were taken for a place seen again")
+    moved = np.abs(trajectory.p_WB - np.array([state.p_WB for state in states])).max()
+    turned = np.abs(trajectory.R_WB - np.array([state.R_WB for state in states])).max()
+    require(
+        moved < _MOST_M and turned < _MOST_RAD, f"without a loop the path moved by {moved:.2g} m, turned {turned:.2g}"
+    )
+    require(all(seconds >= 0.0 for seconds in closure.stage_seconds.values()), "negative stage_seconds")
+
+
+def _same(a: LoopClosure, b: LoopClosure) -> bool:
+    if a.trajectory is None or b.trajectory is None:
+        return a.trajectory is b.trajectory
+    poses = np.array_equal(a.trajectory.p_WB, b.trajectory.p_WB) and np.array_equal(
+        a.trajectory.R_WB, b.trajectory.R_WB
+    )
+    return poses and [loop.later_t_ns for loop in a.loops] == [loop.later_t_ns for loop in b.loops]
