@@ -6,6 +6,8 @@ estimates kept in the prior and landmarks of three degrees of freedom. Derivatio
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from vioframe.inertial.preintegration import join_segments, preintegrate
@@ -33,8 +35,10 @@ class SlidingWindow:
         options: SlidingWindowOptions | None = None,
         initial_state: NavState | None = None,
     ) -> None:
-        self._calibration = calibration
         self._options = options or SlidingWindowOptions()
+        noise, factor = calibration.imu, self._options.imu_noise_factor
+        in_flight = replace(noise, gyro_density=factor * noise.gyro_density, accel_density=factor * noise.accel_density)
+        self._calibration = replace(calibration, imu=in_flight)
         self._initializer = Initializer(calibration)
         self._standstill = StandstillDetector(self._options.standstill_disparity_px)
         self._window: Window | None = None

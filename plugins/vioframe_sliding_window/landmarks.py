@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from vioframe.geometry.triangulation import triangulate
+from vioframe.geometry.triangulation import MIN_DEPTH_M, triangulate
 from vioframe.inertial.imu_factors import StateArrays
 from vioframe.jit import kernel
 from vioframe.types import Float
@@ -26,6 +26,15 @@ def positions(states: StateArrays, camera: Calibrated, hosts: Rows, landmarks: F
     R_WC, p_WC = camera_poses(states, camera)
     p_C = np.column_stack([landmarks[:, :2], np.ones(len(landmarks))]) / landmarks[:, 2:]
     return (R_WC[hosts] @ p_C[..., None])[..., 0] + p_WC[hosts]
+
+
+def in_hosts(states: StateArrays, camera: Calibrated, hosts: Rows, p_WF: Float) -> tuple[Float, Bool]:
+    """[x y rho] (L, 3) of points (L, 3) m in the frames ``hosts`` (L,), and which of them lie well in front (L,)."""
+    R_WC, p_WC = camera_poses(states, camera)
+    p_C = (np.swapaxes(R_WC[hosts], -1, -2) @ (p_WF - p_WC[hosts])[..., None])[..., 0]
+    in_front = p_C[:, 2] > MIN_DEPTH_M
+    z = np.where(in_front, p_C[:, 2], 1.0)
+    return np.column_stack([p_C[:, 0] / z, p_C[:, 1] / z, 1.0 / z]), in_front
 
 
 def camera_poses(states: StateArrays, camera: Calibrated) -> tuple[Float, Float]:

@@ -12,7 +12,7 @@ class SlidingWindowOptions:
     """Keyframes in the window beside the newest frame."""
     max_rate_hz: float = 10.0
     """Frames that are optimised a second, at most; those between are predicted from the readings."""
-    keyframe_parallax_px: float = 10.0
+    keyframe_parallax_px: float = 20.0
     """Mean motion of the tracks since the last keyframe, rotation taken out, that makes a frame a keyframe ..."""
     keyframe_min_tracks: int = 20
     """... as do fewer tracks than this in common with it ..."""
@@ -24,10 +24,12 @@ class SlidingWindowOptions:
     """Where reprojection errors are measured: on the normalised image plane, or on the unit sphere."""
     pixel_sigma: float = 1.0
     """Standard deviation of a tracked feature's position, px."""
-    cauchy_sigmas: float = 1.0
+    cauchy_sigmas: float = 3.0
     """Where Cauchy's robust loss begins to discount an observation, standard deviations."""
     outlier_px: float = 3.0
     """Tracks that are off by more than this on average are dropped."""
+    imu_noise_factor: float = 4.0
+    """How many times the calibration's IMU noise is assumed: in flight, a frame that shakes adds to the sensor's own."""
     max_iterations: int = 8
     """Steps of the solver a frame, at most."""
     max_solve_ms: float = 0.0
@@ -56,6 +58,7 @@ class SlidingWindowOptions:
             "pixel_sigma": self.pixel_sigma,
             "cauchy_sigmas": self.cauchy_sigmas,
             "outlier_px": self.outlier_px,
+            "imu_noise_factor": self.imu_noise_factor,
             "max_blind_s": self.max_blind_s,
             "max_jump_m": self.max_jump_m,
         }

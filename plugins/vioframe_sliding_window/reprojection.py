@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from vioframe.geometry.kernels import cross
+from vioframe.geometry.kernels import cross, distort
 from vioframe.jit import kernel
 from vioframe.types import Float
 
@@ -50,12 +50,14 @@ class Poses:
 class Sightings:
     """What was seen of L landmarks in K frames, as in the track table, with its noise and robust loss.
 
-    ``sigma`` is the standard deviation on the z = 1 plane, ``cauchy`` the loss' scale in standard deviations.
+    ``to_px`` (L, K, 2, 2) turns residuals into pixels, in which ``sigma`` is the standard deviation; ``cauchy`` is the
+    scale of the robust loss, in standard deviations.
     """
 
     seen: NDArray[np.bool_]
     xy: Float
     velocity: Float
+    to_px: Float
     sigma: float
     cauchy: float
     on_sphere: bool
@@ -72,6 +74,7 @@ class Sightings:
                 self.seen,
                 self.xy,
                 self.velocity,
+                self.to_px,
                 landmarks,
                 self.sigma,
                 self.cauchy,
@@ -90,6 +93,7 @@ class Sightings:
             self.seen,
             self.xy,
             self.velocity,
+            self.to_px,
             landmarks,
             self.sigma,
             self.on_sphere,
@@ -115,11 +119,32 @@ class Sightings:
             self.seen,
             self.xy,
             self.velocity,
+            self.to_px,
             landmarks,
             self.sigma,
             self.cauchy,
             self.on_sphere,
         )
+
+
+@kernel
+def pixels_by_residual(model, k, xy, on_sphere):
+    """(N, 2, 2) px of the distorted image by the residual at points (N, 2) of the z = 1 plane."""
+    out = np.empty((len(xy), 2, 2))
+    T = np.empty((2, 3))
+    for i in range(len(xy)):
+        x, y = xy[i]
+        _, J = distort(model, k, x, y)
+        if on_sphere:
+            # A step across the ray, seen on the plane: |m| (T_xy - m_xy T_z).
+            _tangents(x, y, T)
+            length = math.sqrt(1.0 + x * x + y * y)
+            S = np.empty((2, 2))
+            for j in range(2):
+                S[0, j], S[1, j] = length * (T[j, 0] - x * T[j, 2]), length * (T[j, 1] - y * T[j, 2])
+            J = J @ S
+        out[i] = J
+    return out
 
 
 @kernel
@@ -186,20 +211,22 @@ def _tangents(x, y, T):
 
 
 @kernel
-def _residual(X, x, y, on_sphere, T, r):
-    """``r`` (2,) between the direction ``X`` (3,) and the observation [x y 1]; across ``T`` on the sphere."""
+def _residual(X, x, y, to_px, on_sphere, T, r):
+    """``r`` (2,) px between the direction ``X`` (3,) and the observation [x y 1]; across ``T`` on the sphere."""
     if on_sphere:
         length = math.sqrt(X[0] * X[0] + X[1] * X[1] + X[2] * X[2])
         _tangents(x, y, T)
-        for i in range(2):  # the observation itself has no part across itself
-            r[i] = (T[i, 0] * X[0] + T[i, 1] * X[1] + T[i, 2] * X[2]) / length
+        # The observation itself has no part across itself.
+        u = (T[0, 0] * X[0] + T[0, 1] * X[1] + T[0, 2] * X[2]) / length
+        v = (T[1, 0] * X[0] + T[1, 1] * X[1] + T[1, 2] * X[2]) / length
     else:
         depth = max(X[2], _LEAST_DEPTH_RATIO)
-        r[0], r[1] = X[0] / depth - x, X[1] / depth - y
+        u, v = X[0] / depth - x, X[1] / depth - y
+    r[0], r[1] = to_px[0, 0] * u + to_px[0, 1] * v, to_px[1, 0] * u + to_px[1, 1] * v
 
 
 @kernel
-def _residual_jacobian(X, vx, vy, on_sphere, T, D, by_offset):
+def _residual_jacobian(X, vx, vy, to_px, on_sphere, T, D, by_offset):
     """``D`` (2, 3) by ``X``, and ``by_offset`` (2,) by the time offset, where the image moves by (vx, vy)."""
     if on_sphere:
         length = math.sqrt(X[0] * X[0] + X[1] * X[1] + X[2] * X[2])
@@ -219,6 +246,11 @@ def _residual_jacobian(X, vx, vy, on_sphere, T, D, by_offset):
         else:
             D[0, 0] = D[1, 1] = 1.0 / _LEAST_DEPTH_RATIO
         by_offset[0], by_offset[1] = vx, vy
+    for k in range(3):
+        u, v = D[0, k], D[1, k]
+        D[0, k], D[1, k] = to_px[0, 0] * u + to_px[0, 1] * v, to_px[1, 0] * u + to_px[1, 1] * v
+    u, v = by_offset[0], by_offset[1]
+    by_offset[0], by_offset[1] = to_px[0, 0] * u + to_px[0, 1] * v, to_px[1, 0] * u + to_px[1, 1] * v
 
 
 @kernel
@@ -230,7 +262,7 @@ def _times(A, M, out):
 
 
 @kernel
-def _cost(R_fh, t_fh, R_BC, p_BC, offset_s, seen, xy, velocity, landmarks, sigma, cauchy, on_sphere):
+def _cost(R_fh, t_fh, R_BC, p_BC, offset_s, seen, xy, velocity, to_px, landmarks, sigma, cauchy, on_sphere):
     q, b, X, r, T = np.empty(3), np.empty(3), np.empty(3), np.empty(2), np.empty((2, 3))
     count, frames = seen.shape
     total = 0.0
@@ -243,14 +275,14 @@ def _cost(R_fh, t_fh, R_BC, p_BC, offset_s, seen, xy, velocity, landmarks, sigma
             host = f if host < 0 else host
             x, y = xy[i, f, 0] - offset_s * velocity[i, f, 0], xy[i, f, 1] - offset_s * velocity[i, f, 1]
             _in_camera(R_fh[f, host], t_fh[f, host], R_BC, p_BC, landmarks[i, 2], q, b, X)
-            _residual(X, x, y, on_sphere, T, r)
+            _residual(X, x, y, to_px[i, f], on_sphere, T, r)
             s = (r[0] * r[0] + r[1] * r[1]) / (sigma * sigma * cauchy * cauchy)
             total += 0.5 * cauchy * cauchy * math.log(1.0 + s)
     return total
 
 
 @kernel
-def _errors(R_fh, t_fh, R_BC, p_BC, offset_s, seen, xy, velocity, landmarks, sigma, on_sphere):
+def _errors(R_fh, t_fh, R_BC, p_BC, offset_s, seen, xy, velocity, to_px, landmarks, sigma, on_sphere):
     q, b, X, r, T = np.empty(3), np.empty(3), np.empty(3), np.empty(2), np.empty((2, 3))
     count, frames = seen.shape
     out = np.empty(count)
@@ -263,7 +295,7 @@ def _errors(R_fh, t_fh, R_BC, p_BC, offset_s, seen, xy, velocity, landmarks, sig
             host = f if host < 0 else host
             x, y = xy[i, f, 0] - offset_s * velocity[i, f, 0], xy[i, f, 1] - offset_s * velocity[i, f, 1]
             _in_camera(R_fh[f, host], t_fh[f, host], R_BC, p_BC, landmarks[i, 2], q, b, X)
-            _residual(X, x, y, on_sphere, T, r)
+            _residual(X, x, y, to_px[i, f], on_sphere, T, r)
             total += (r[0] * r[0] + r[1] * r[1]) / (sigma * sigma)
             if X[2] <= _LEAST_DEPTH_RATIO:
                 total = np.inf
@@ -285,6 +317,7 @@ def _linearise(
     seen,
     xy,
     velocity,
+    to_px,
     landmarks,
     sigma,
     cauchy,
@@ -316,12 +349,12 @@ def _linearise(
             vx, vy = velocity[i, f, 0], velocity[i, f, 1]
             x, y = xy[i, f, 0] - offset_s * vx, xy[i, f, 1] - offset_s * vy
             _in_camera(R_fh[f, host], t_fh[f, host], R_BC, p_BC, rho, q, b, X)
-            _residual(X, x, y, on_sphere, T, r)
+            _residual(X, x, y, to_px[i, f], on_sphere, T, r)
             weight = 1.0 / (1.0 + (r[0] * r[0] + r[1] * r[1]) / (sigma * sigma * cauchy * cauchy))
             scale = math.sqrt(weight) / sigma
 
             _in_camera(R_fh_first[f, host], t_fh_first[f, host], R_BC, p_BC, rho, q, b, X)
-            _residual_jacobian(X, vx, vy, on_sphere, T, D, by_offset)
+            _residual_jacobian(X, vx, vy, to_px[i, f], on_sphere, T, D, by_offset)
             _times(D, R_CB, A)
             _times(A, R_fh_first[f, host], B)
             _times(B, R_BC, C)

@@ -25,6 +25,7 @@ class TrackTable:
         self.seen: Bool = np.empty((0, 0), dtype=bool)
         self.xy: Float = np.empty((0, 0, 2))
         self.velocity: Float = np.empty((0, 0, 2))
+        self.to_px: Float = np.empty((0, 0, 2, 2))
         self.landmarks: Float = np.empty((0, 3))
         self.known: Bool = np.empty(0, dtype=bool)
 
@@ -33,18 +34,20 @@ class TrackTable:
         """(F,) first frame that sees each track."""
         return self.seen.argmax(axis=1)
 
-    def add_frame(self, tracks: FrameTracks, velocity: Float) -> None:
-        """Append a frame with the image motion (N, 2) 1/s of its tracks."""
+    def add_frame(self, tracks: FrameTracks, velocity: Float, to_px: Float) -> None:
+        """Append a frame with the image motion (N, 2) 1/s of its tracks, and pixels by residual (N, 2, 2)."""
         ids = np.union1d(self.ids, tracks.ids)
         old, new = np.searchsorted(ids, self.ids), np.searchsorted(ids, tracks.ids)
         frames = self.seen.shape[1]
         seen = np.zeros((len(ids), frames + 1), dtype=bool)
         xy, rate = np.zeros((len(ids), frames + 1, 2)), np.zeros((len(ids), frames + 1, 2))
+        px = np.zeros((len(ids), frames + 1, 2, 2))
+        px[old, :frames], px[new, frames] = self.to_px, to_px
         seen[old, :frames], xy[old, :frames], rate[old, :frames] = self.seen, self.xy, self.velocity
         seen[new, frames], xy[new, frames], rate[new, frames] = True, tracks.xy_normalised, velocity
         landmarks, known = np.zeros((len(ids), 3)), np.zeros(len(ids), dtype=bool)
         landmarks[old], known[old] = self.landmarks, self.known
-        self.ids, self.seen, self.xy, self.velocity = ids, seen, xy, rate
+        self.ids, self.seen, self.xy, self.velocity, self.to_px = ids, seen, xy, rate, px
         self.landmarks, self.known = landmarks, known
 
     def drop_frame(self, frame: int) -> None:
@@ -52,15 +55,11 @@ class TrackTable:
         self.known &= self.hosts != frame
         self.seen = np.delete(self.seen, frame, axis=1)
         self.xy, self.velocity = np.delete(self.xy, frame, axis=1), np.delete(self.velocity, frame, axis=1)
+        self.to_px = np.delete(self.to_px, frame, axis=1)
         self.keep(self.seen.any(axis=1))
-
-    def forget(self, rows: Rows) -> None:
-        """Let go of what tracks have been seen as; they begin anew with the next frame."""
-        keep = np.ones(len(self.ids), dtype=bool)
-        keep[rows] = False
-        self.keep(keep)
 
     def keep(self, keep: Bool) -> None:
         """Only the tracks ``keep`` (F,)."""
         self.ids, self.seen, self.known = self.ids[keep], self.seen[keep], self.known[keep]
-        self.xy, self.velocity, self.landmarks = self.xy[keep], self.velocity[keep], self.landmarks[keep]
+        self.xy, self.velocity, self.to_px = self.xy[keep], self.velocity[keep], self.to_px[keep]
+        self.landmarks = self.landmarks[keep]

@@ -7,17 +7,18 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from vioframe.geometry.kernels import intrinsics_of
 from vioframe.inertial.imu_factors import ImuFactors, StateArrays
 from vioframe.inertial.preintegration import Preintegrated, join_segments, preintegrate
 from vioframe.recovery import noise_over
 from vioframe.standstill import Standstill
 from vioframe.types import NS_PER_S, Calibration, Float, FrameTracks, ImuSegment, Int, NavState
 from vioframe_sliding_window.keyframes import parallax
-from vioframe_sliding_window.landmarks import positions, triangulate_tracks
+from vioframe_sliding_window.landmarks import in_hosts, positions, triangulate_tracks
 from vioframe_sliding_window.marginalisation import marginalise_oldest
 from vioframe_sliding_window.options import SlidingWindowOptions
 from vioframe_sliding_window.problem import STATE_SIZE, Calibrated, Prior, Problem, Variables
-from vioframe_sliding_window.reprojection import CALIBRATION_SIZE, Poses, Sightings
+from vioframe_sliding_window.reprojection import CALIBRATION_SIZE, Poses, Sightings, pixels_by_residual
 from vioframe_sliding_window.solver import solve, solve_positive
 from vioframe_sliding_window.tracks import Rows, TrackTable
 
@@ -54,8 +55,9 @@ class Window:
         self._still: dict[int, Standstill] = {}
         self._newest_is_keyframe = True
         self._cov = state.cov
+        self._camera_model, self._intrinsics = intrinsics_of(calibration.camera)
         self.tracks = TrackTable()
-        self.tracks.add_frame(tracks, velocity)
+        self._add_tracks(tracks, velocity)
 
     def __len__(self) -> int:
         return len(self._t_ns)
@@ -87,8 +89,13 @@ class Window:
         self._t_ns.append(predicted.t_ns)
         self._states = self._states.append(StateArrays.stack([predicted]))
         self._prior = self._prior.with_state(self._states)
-        self.tracks.add_frame(tracks, velocity)
+        self._add_tracks(tracks, velocity)
         self._newest_is_keyframe = False
+
+    def _add_tracks(self, tracks: FrameTracks, velocity: Float) -> None:
+        on_sphere = self._options.residual == "sphere"
+        to_px = pixels_by_residual(self._camera_model, self._intrinsics, tracks.xy_normalised, on_sphere)
+        self.tracks.add_frame(tracks, velocity, to_px)
 
     @property
     def is_full(self) -> bool:
@@ -175,17 +182,30 @@ class Window:
         return self.tracks.ids[rows], p_WF
 
     def marginalise_oldest(self) -> None:
-        """Turn what the oldest state and its landmarks say about the rest into the prior, and let go of them."""
+        """Turn what the oldest state and the landmarks it hosts say about the rest into the prior, and let go of it.
+
+        Landmarks that are still in sight move to the next frame that saw them, with all that frames still in the window
+        saw of them.
+        """
         tracks = self.tracks
         rows = np.flatnonzero(tracks.known & (tracks.hosts == 0))
         problem = self._problem(rows, readings=1, oldest_only=True)
         self._prior = marginalise_oldest(problem, self._variables(rows))
-        tracks.forget(rows)
+        ids, p_WF = tracks.ids[rows], positions(self._states, self._camera, tracks.hosts[rows], tracks.landmarks[rows])
         tracks.drop_frame(0)
         self._t_ns.pop(0)
         self._readings.pop(0)
         self._states = self._states[1:]
         self._still = {k - 1: still for k, still in self._still.items() if k > 0}
+        self._host_again(ids, p_WF)
+
+    def _host_again(self, ids: Int, p_WF: Float) -> None:
+        """Express landmarks at ``p_WF`` (N, 3) m in the frames that now host their tracks, where two or more are left."""
+        tracks = self.tracks
+        _, rows, of = np.intersect1d(tracks.ids, ids, assume_unique=True, return_indices=True)
+        enough = tracks.seen[rows].sum(axis=1) >= 2
+        rows, p_WF = rows[enough], p_WF[of[enough]]
+        tracks.landmarks[rows], tracks.known[rows] = in_hosts(self._states, self._camera, tracks.hosts[rows], p_WF)
 
     def _variables(self, rows: Rows) -> Variables:
         return Variables(self._states, self._camera, self.tracks.landmarks[rows])
@@ -206,7 +226,8 @@ class Window:
             tracks.seen[rows],
             tracks.xy[rows],
             tracks.velocity[rows],
-            self._sigma,
+            tracks.to_px[rows],
+            options.pixel_sigma,
             options.cauchy_sigmas,
             options.residual == "sphere",
         )
