@@ -1,0 +1,301 @@
+"""Recognising places: its steps one by one, whole flights in rendered worlds, and the files of a run."""
+
+from __future__ import annotations
+
+import csv
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from loop_helpers import CALIBRATION, fly, hall, path_along, tiled_corridor
+from rendered_flight import rendered_flight
+
+from vioframe.cli import main
+from vioframe.geometry import so3
+from vioframe.testing import check_loop_closer
+from vioframe.trajectory import evaluate
+from vioframe.trajectory.alignment import rotation_z
+from vioframe.types import Estimate, Status
+from vioframe_pose_graph import vioframe_loop_closers
+from vioframe_pose_graph.closer import PoseGraph
+from vioframe_pose_graph.descriptors import image_angle_deg
+from vioframe_pose_graph.hamming import distance, match
+from vioframe_pose_graph.index import DescriptorIndex
+from vioframe_pose_graph.resection import reprojection, resect
+from vioframe_pose_graph.two_point import ransac, solve
+from vioframe_pose_graph.verification import Correspondences, residuals
+
+FOCAL_PX = CALIBRATION.camera.focal_px
+
+
+def random_descriptors(rng, count):
+    return rng.integers(0, 2**64, (count, 4), dtype=np.uint64)
+
+
+def flipped(descriptors, bits, rng):
+    """The same with ``bits`` of their 256 bits changed."""
+    out = np.unpackbits(descriptors.view(np.uint8).reshape(-1, 32), axis=1)
+    for row in out:
+        row[rng.choice(256, bits, replace=False)] ^= 1
+    return np.packbits(out, axis=1).view(np.uint64)
+
+
+def test_the_distance_of_descriptors_is_the_number_of_bits():
+    rng = np.random.default_rng(0)
+    a, b = random_descriptors(rng, 50), random_descriptors(rng, 50)
+    expected = np.unpackbits((a ^ b).view(np.uint8).reshape(50, 32), axis=1).sum(axis=1)
+    assert [distance(x, y) for x, y in zip(a, b, strict=True)] == expected.tolist()
+
+
+def test_a_match_must_be_near_and_unrivalled():
+    rng = np.random.default_rng(1)
+    target = random_descriptors(rng, 4)
+    target[3] = flipped(target[2:3], 4, rng)[0]
+    xy = np.array([[0.0, 0.0], [50.0, 0.0], [0.0, 50.0], [200.0, 200.0]])
+    query = np.concatenate([flipped(target[:1], 20, rng), flipped(target[1:2], 90, rng), flipped(target[2:3], 40, rng)])
+    # The second is too far from its original; the third has two originals in different places.
+    assert match(query, target, xy, 64, 0.85, 10.0).tolist() == [0, -1, -1]
+    xy[3] = xy[2] + 3.0  # one corner, described twice
+    assert match(query, target, xy, 64, 0.85, 10.0)[2] in (2, 3)
+
+
+def test_the_index_finds_the_keyframe_that_holds_the_descriptors():
+    rng = np.random.default_rng(2)
+    keyframes = [random_descriptors(rng, 300) for _ in range(30)]
+    index = DescriptorIndex()
+    for descriptors in keyframes:
+        index.add(descriptors)
+    # Twelve of a hundred bits wrong, as between two views of a place.
+    scores = index.similarity(flipped(keyframes[7], 30, rng), before=30)
+    assert scores.argmax() == 7
+    assert scores[7] > 20.0 * np.sort(scores)[-2]
+    assert not index.similarity(flipped(keyframes[7], 30, rng), before=7).any()
+
+
+def test_a_descriptor_that_is_everywhere_counts_little():
+    rng = np.random.default_rng(3)
+    common = random_descriptors(rng, 10)
+    index = DescriptorIndex()
+    for _ in range(40):
+        index.add(np.concatenate([common, random_descriptors(rng, 20)]))
+    own = random_descriptors(rng, 10)
+    index.add(own)
+    assert index.similarity(own, 41)[40] > 10.0 * index.similarity(common, 41).max()
+
+
+def test_two_points_and_gravity_give_the_pose():
+    rng = np.random.default_rng(4)
+    for _ in range(200):
+        yaw, t = rng.uniform(-np.pi, np.pi), rng.normal(0.0, 5.0, 3)
+        p = rng.normal(0.0, 5.0, (2, 3))
+        centre = rng.normal(0.0, 2.0, 3)
+        rays = p @ rotation_z(yaw).T + t - centre
+        count, models = solve(p[0], p[1], rays[0] / rays[0, 1], rays[1] / np.abs(rays[1]).max(), centre)
+        rays_ahead = rays[0, 1] > 0.0
+        errors = [np.abs(m[1:] - t).max() + abs(np.angle(np.exp(1j * (m[0] - yaw)))) for m in models[:count]]
+        assert (min(errors, default=np.inf) < 1e-6) == rays_ahead
+
+
+def two_views(rng, count=80, outliers=0.0):
+    """Points of both sides, seen by two cameras whose worlds are turned and shifted to one another."""
+    yaw, t = 0.3, np.array([1.0, -2.0, 0.5])
+    look = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])  # level, along x
+    R_A, p_A = look, np.array([0.0, 0.0, 0.0])
+    R_B = rotation_z(-yaw) @ rotation_z(0.1) @ look
+    p_B = rotation_z(yaw).T @ (np.array([0.5, 0.3, 0.1]) - t)
+    in_A = np.column_stack([rng.uniform(4.0, 10.0, count), rng.uniform(-3.0, 3.0, (count, 2))])
+    in_B = (in_A - t) @ rotation_z(yaw)
+    half = count // 2
+    points = np.concatenate([in_B[:half], in_A[half:]])
+    seen_A = (in_A[:half] - p_A) @ R_A
+    seen_B = (in_B[half:] - p_B) @ R_B
+    seen = np.concatenate([seen_A, seen_B])
+    xy = seen[:, :2] / seen[:, 2:]
+    wrong = rng.random(count) < outliers
+    xy[wrong] = rng.uniform(-0.6, 0.6, (wrong.sum(), 2))
+    side = np.repeat([0, 1], [half, count - half])
+    pairs = np.column_stack([np.arange(count), np.arange(count)])
+    R_WC, p_WC = np.stack([R_A, R_B]), np.stack([p_A, p_B])
+    return Correspondences(points, xy, side, R_WC, p_WC, pairs), yaw, t, wrong
+
+
+def test_ransac_finds_the_pose_among_wrong_matches():
+    rng = np.random.default_rng(5)
+    seen, yaw, t, wrong = two_views(rng, outliers=0.6)
+    picks = np.array([[i, j] for i in range(0, 80, 3) for j in range(1, 80, 5) if i != j and (i < 40) == (j < 40)])
+    support, model = ransac(seen.points, seen.xy, seen.side, seen.R_WC, seen.p_WC, picks, 0.005)
+    assert support >= np.sum(~wrong)
+    np.testing.assert_allclose(model, [yaw, *t], atol=1e-6)
+
+
+def test_the_jacobian_of_the_relation_is_its_derivative():
+    rng = np.random.default_rng(6)
+    seen, yaw, t, _ = two_views(rng, count=20)
+    p_B = np.array([1.0, 2.0, 0.5])
+    R_AB = so3.exp(np.array([0.02, -0.01, 0.0])) @ rotation_z(yaw)
+    p_AB = rotation_z(yaw) @ p_B + t + 0.05
+    _, J = residuals(seen, p_B, p_AB, R_AB)
+    for k, d in enumerate(1e-6 * np.eye(6)):
+        plus = residuals(seen, p_B, p_AB + d[:3], so3.exp(d[3:]) @ R_AB)[0]
+        minus = residuals(seen, p_B, p_AB - d[:3], so3.exp(-d[3:]) @ R_AB)[0]
+        np.testing.assert_allclose(J[:, :, k], (plus - minus) / 2e-6, atol=1e-7)
+
+
+def test_a_camera_is_put_where_its_landmarks_say():
+    rng = np.random.default_rng(7)
+    p_WF = np.column_stack([rng.uniform(-3.0, 3.0, (100, 2)), rng.uniform(4.0, 10.0, 100)])
+    R_true, p_true = so3.exp(np.array([0.004, -0.006, 0.003])), np.array([0.03, -0.04, 0.02])
+    xy = reprojection(p_WF, np.zeros((100, 2)), R_true, p_true)[0] + rng.normal(0.0, 0.1 / FOCAL_PX, (100, 2))
+    xy[:10] += 0.1
+    R, p, fits = resect(p_WF, xy, np.eye(3), np.zeros(3), 0.3 / FOCAL_PX, 1.5 / FOCAL_PX)
+    assert np.degrees(np.linalg.norm(so3.log(R_true.T @ R))) < 0.1
+    assert np.linalg.norm(p - p_true) < 0.005
+    assert fits.tolist() == [False] * 10 + [True] * 90
+
+
+def test_the_jacobian_of_the_resection_is_its_derivative():
+    rng = np.random.default_rng(8)
+    p_WF = np.column_stack([rng.uniform(-3.0, 3.0, (9, 2)), rng.uniform(4.0, 10.0, 9)])
+    R, p = so3.exp(np.array([0.1, -0.2, 0.3])), np.array([0.2, 0.1, -0.3])
+    _, J = reprojection(p_WF, np.zeros((9, 2)), R, p)
+    for k, d in enumerate(1e-6 * np.eye(6)):
+        plus = reprojection(p_WF, np.zeros((9, 2)), R @ so3.exp(d[:3]), p + d[3:])[0]
+        minus = reprojection(p_WF, np.zeros((9, 2)), R @ so3.exp(-d[:3]), p - d[3:])[0]
+        np.testing.assert_allclose(J[:, :, k], (plus - minus) / 2e-6, atol=1e-7)
+
+
+def test_descriptors_turn_with_the_camera():
+    """Rolled by 40 degrees, the direction that stands for down is turned by that in the image."""
+    level = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+    assert image_angle_deg(level) == pytest.approx(90.0)
+    rolled = level @ so3.exp(np.array([0.0, 0.0, np.radians(40.0)]))
+    assert image_angle_deg(rolled) == pytest.approx(50.0)
+
+
+def closure_of(flown, steps=None):
+    closer = PoseGraph(CALIBRATION)
+    for step in flown.steps if steps is None else steps:
+        closer.add(step)
+    return closer.finish()
+
+
+def there_and_back(frames=22):
+    """12 m ahead and back again, the camera ahead all the time: every place is seen twice."""
+    x = np.concatenate([np.linspace(0.0, 12.0, frames), np.linspace(11.8, 0.2, frames)])
+    p = np.column_stack([x, 0.5 * np.sin(x / 3.0), 0.2 * np.sin(x)])
+    return path_along(p, np.zeros(len(p)), interval_s=0.8)
+
+
+@pytest.fixture(scope="module")
+def revisit():
+    truth = there_and_back()
+    return fly(truth, hall(truth, 1), np.random.default_rng(1))
+
+
+def test_places_seen_again_take_out_the_drift(revisit):
+    closure = closure_of(revisit)
+    accepted = [loop for loop in closure.loops if loop.accepted]
+    assert len(accepted) >= 5
+    truth = revisit.truth
+    for loop in accepted:
+        i, j = np.searchsorted(truth.t_ns, [loop.earlier_t_ns, loop.later_t_ns])
+        # The path is flown level and without turning, so the levelled frame has the axes of the world.
+        assert np.linalg.norm(loop.p_L) == pytest.approx(np.linalg.norm(truth.p_WB[j] - truth.p_WB[i]), abs=0.1)
+        assert abs(loop.yaw) < np.radians(0.5)
+    before, after = evaluate(revisit.odometry, truth), evaluate(closure.trajectory, truth)
+    assert after.ate_m.rmse < 0.6 * before.ate_m.rmse
+    ends = [
+        np.linalg.norm((t.p_WB[-1] - t.p_WB[0]) - (truth.p_WB[-1] - truth.p_WB[0]))
+        for t in (revisit.odometry, closure.trajectory)
+    ]
+    assert ends[1] < 0.3 * ends[0]
+
+
+def test_the_result_does_not_depend_on_time(revisit):
+    first, second = closure_of(revisit), closure_of(revisit)
+    assert np.array_equal(first.trajectory.p_WB, second.trajectory.p_WB)
+    assert [loop.earlier_t_ns for loop in first.loops] == [loop.earlier_t_ns for loop in second.loops]
+
+
+def test_a_reset_in_between_is_joined_by_loops(revisit):
+    """After a reset the odometry goes on 3 m beside where it was, turned by 20 degrees."""
+    R, shift = rotation_z(np.radians(20.0)), np.array([3.0, -1.0, 0.4])
+    steps, half = [], len(revisit.steps) // 2
+    for k, step in enumerate(revisit.steps):
+        estimate = step.estimate
+        if half <= k < half + 2:
+            estimate = Estimate(Status.LOST)
+        elif k >= half + 2:
+            state = replace(estimate.state, R_WB=R @ estimate.state.R_WB, p_WB=R @ estimate.state.p_WB + shift)
+            estimate = replace(estimate, state=state, p_WF=estimate.p_WF @ R.T + shift)
+        steps.append(replace(step, estimate=estimate))
+    closure = closure_of(revisit, steps)
+    assert len(closure.trajectory) == len(steps) - 2
+    assert sum(loop.accepted for loop in closure.loops) >= 5
+    assert evaluate(closure.trajectory, revisit.truth, association="nearest").ate_m.max < 0.5
+
+
+def test_one_texture_all_over_closes_no_loop():
+    """In a corridor tiled with one picture every place looks like many others."""
+    truth = there_and_back()
+    flown = fly(truth, tiled_corridor(12.0, 2.0, 3), np.random.default_rng(2))
+    closure = closure_of(flown)
+    assert closure.loops, "no place resembled another: the world is too easy"
+    assert not any(loop.accepted for loop in closure.loops)
+    np.testing.assert_allclose(closure.trajectory.p_WB, flown.odometry.p_WB, atol=1e-9)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(10))
+def test_no_place_is_recognised_on_a_way_without_return(seed):
+    x = np.linspace(0.0, 30.0, 30)
+    truth = path_along(np.column_stack([x, 3.0 * np.sin(x / 6.0 + seed), 0.4 * np.sin(x / 3.0)]), interval_s=1.0)
+    closure = closure_of(fly(truth, hall(truth, seed), np.random.default_rng(seed)))
+    assert not any(loop.accepted for loop in closure.loops)
+
+
+def test_it_conforms():
+    check_loop_closer(vioframe_loop_closers()["pose_graph"])
+
+
+def test_a_run_writes_its_loops(tmp_path):
+    flight = rendered_flight()
+    bag, truth, out = flight.write(tmp_path / "f.bag"), flight.write_ground_truth(tmp_path / "t.tum"), tmp_path / "run"
+    arguments = ["run", str(bag), "--ground-truth", str(truth), "--out", str(out), "--loop-closure", "pose_graph"]
+    result = CliRunner().invoke(main, [*arguments, "-o", "min_gap_s=5"])
+    assert result.exit_code == 0, result.output
+    assert "with loop closure: ATE" in result.output
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary["loop_closer"] == "pose_graph"
+    assert {"keyframes", "loops", "rejected", "seconds_beside"} == set(summary["loop_closure"])
+    assert summary["mean_ms"]["loop_closure"] > 0.0
+    assert [s["poses"] for s in summary["segments"]] == [len((out / "trajectory.tum").read_text().splitlines()) - 1]
+    stamps = [
+        [line.split()[0] for line in (out / name).read_text().splitlines() if line[0] != "#"]
+        for name in ("trajectory.tum", "trajectory_loop.tum")
+    ]
+    assert stamps[0] == stamps[1]
+    with (out / "loops.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert sum(int(row["accepted"]) for row in rows) == summary["loop_closure"]["loops"]
+    assert "min_gap_s: 5.0" in (out / "config.yaml").read_text()
+    again = CliRunner().invoke(main, ["evaluate", str(out), "--format", "csv"])
+    assert "run with loop closure" in again.output
+    assert (out / "evaluation_loop.json").is_file()
+
+
+def test_a_run_without_a_loop_closer_writes_none(tmp_path):
+    bag, out = rendered_flight().write(tmp_path / "f.bag"), tmp_path / "run"
+    result = CliRunner().invoke(main, ["run", str(bag), "--out", str(out), "--duration", "3", "--quiet"])
+    assert result.exit_code == 0, result.output
+    assert not (out / "loops.csv").exists()
+    assert "loop_closure: null" in (out / "config.yaml").read_text()
+
+
+def test_an_unknown_loop_closer_is_one_line(tmp_path):
+    bag = rendered_flight().write(tmp_path / "f.bag")
+    result = CliRunner().invoke(main, ["run", str(bag), "--loop-closure", "pose_grph", "--out", str(tmp_path / "run")])
+    assert result.exit_code == 2
+    assert "no loop closer is called 'pose_grph' (did you mean 'pose_graph'?)" in result.output
