@@ -23,9 +23,9 @@ Bad input ends with one line on stderr and exit code 2, Ctrl-C with 130; `viofra
 _PARTS = """\
 ## Options of the parts
 
-What `-o NAME=VALUE` sets; write `-o SECTION.NAME=VALUE`, with the section `detector`, `backend`, `dataset` or
-`frontend`, where several parts have such an option. `vioframe plugins NAME` prints the same for every installed part,
-yours included.
+What `-o NAME=VALUE` sets; write `-o SECTION.NAME=VALUE`, with the section `detector`, `backend`, `loop_closure`,
+`dataset` or `frontend`, where several parts have such an option. `vioframe plugins NAME` prints the same for every
+installed part, yours included.
 """
 
 

@@ -15,7 +15,10 @@ from vioframe.options import REQUIRED, did_you_mean, summary_of
 @click.command("plugins")
 @click.argument("name", required=False)
 def command(name: str | None) -> None:
-    """List every detector, back-end, data-set reader, flight and world; with NAME, show the options of that part."""
+    """List every part: detectors, back-ends, loop closers, data-set readers, flights and worlds.
+
+    With NAME, show the options of that part.
+    """
     installed = registry.load()
     console = Console()
     if name is None:
