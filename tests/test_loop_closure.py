@@ -14,6 +14,10 @@ from rendered_flight import rendered_flight
 
 from vioframe.cli import main
 from vioframe.geometry import so3
+from vioframe.incidents import Incidents
+from vioframe.recorder import Recorder
+from vioframe.report.evaluated import Evaluated
+from vioframe.report.run_folder import RunFolder
 from vioframe.testing import check_loop_closer
 from vioframe.trajectory import evaluate
 from vioframe.trajectory.alignment import rotation_z
@@ -299,3 +303,25 @@ def test_an_unknown_loop_closer_is_one_line(tmp_path):
     result = CliRunner().invoke(main, ["run", str(bag), "--loop-closure", "pose_grph", "--out", str(tmp_path / "run")])
     assert result.exit_code == 2
     assert "no loop closer is called 'pose_grph' (did you mean 'pose_graph'?)" in result.output
+
+
+def test_lines_break_at_resets_and_gaps():
+    """A reset that took less than a second, and a gap without one, each begin a line of their own."""
+    t_ns = np.array([0, 1, 2, 3, 4, 30, 31]) * 100_000_000
+    run = Evaluated("run", None, None, None, None, segment_starts_ns=(300_000_000,))
+    assert run.breaks(t_ns).tolist() == [3, 5]
+    assert replace(run, segment_starts_ns=(0, 9_000_000_000)).breaks(t_ns).tolist() == [5]
+
+
+def test_the_summary_lists_the_segments(revisit, tmp_path):
+    statuses = [Status.INITIALISING, Status.TRACKING, Status.TRACKING, Status.LOST, Status.TRACKING]
+    with Recorder(tmp_path, {}, Incidents(), 0.0) as recorder:
+        for status, step in zip(statuses, revisit.steps, strict=False):
+            estimate = step.estimate if status is Status.TRACKING else Estimate(status)
+            recorder.add(replace(step, estimate=estimate))
+    t_ns = [step.frame.t_ns for step in revisit.steps]
+    assert recorder.summary["segments"] == [
+        {"first_t_ns": t_ns[1], "last_t_ns": t_ns[2], "poses": 2},
+        {"first_t_ns": t_ns[4], "last_t_ns": t_ns[4], "poses": 1},
+    ]
+    assert RunFolder.open(tmp_path).segment_starts_ns() == (t_ns[4],)
