@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from vioframe.initialization import InitializationOptions, Initializer
-from vioframe.recovery import DivergedError, check_plausible, continued_from, noise_over
+from vioframe.initialization import Starter
+from vioframe.recovery import DivergedError, check_plausible, noise_over
 from vioframe.standstill import StandstillDetector
 from vioframe.stopwatch import Stopwatch
 from vioframe.types import Calibration, Estimate, FrameTracks, ImuSegment, NavState, Status
@@ -34,16 +34,14 @@ class Msckf:
     ) -> None:
         self._calibration = calibration
         self._options = options or MsckfOptions()
-        unknown_rotation = self._options.unknown_camera_rotation
-        if unknown_rotation and initial_state is not None:
+        if self._options.unknown_camera_rotation and initial_state is not None:
             raise ValueError("unknown_camera_rotation is found while initialising; leave out initial_state")
-        self._initializer = Initializer(calibration, InitializationOptions(unknown_camera_rotation=unknown_rotation))
+        self._starter = Starter(calibration, unknown_camera_rotation=self._options.unknown_camera_rotation)
         dof = np.arange(1, 2 * self._options.max_clones + 3)
         self._gate = np.concatenate([[0.0], chi2.ppf(self._options.gate_quantile, dof)])
         self._state: FilterState | None = None
         self._observations = ObservationTable()
         self._standstill = StandstillDetector(self._options.standstill_disparity_px)
-        self._last: NavState | None = None
         self._seeing_ns = 0
         if initial_state is not None:
             self._begin(initial_state)
@@ -61,8 +59,10 @@ class Msckf:
             estimate = self._filter(self._state, imu, tracks)
             self._check(self._state.nav_state(tracks.t_ns))
         except DivergedError as error:
-            return self._lose(str(error))
-        self._last = estimate.state
+            self._state = None
+            return self._starter.lose(str(error))
+        assert estimate.state is not None
+        self._starter.follow(estimate.state)
         return estimate
 
     def _filter(self, state: FilterState, imu: ImuSegment, tracks: FrameTracks) -> Estimate:
@@ -111,31 +111,22 @@ class Msckf:
         return hold_still(state, imu, self._calibration.imu, options.first_estimate_jacobians)
 
     def _initialise(self, imu: ImuSegment, tracks: FrameTracks) -> Estimate:
-        watch = Stopwatch()
         self._standstill.sees_standstill(tracks)
-        initial = self._initializer.add(imu, tracks)
-        watch.lap("initialise")
-        if initial is None:
-            refusal = self._initializer.refusal
-            events = (f"initialisation refused: {refusal}",) if refusal else ()
-            return Estimate(Status.INITIALISING, events=events, stage_seconds=watch.seconds)
-        nav = initial.states[-1] if self._last is None else continued_from(self._last, initial.states[-1])
-        self._begin(nav)
-        self._last = nav
-        found = self._initializer.camera_rotation
-        notes = [f"initialised ({initial.method})"] + ([] if found is None else [str(found)])
-        return Estimate(Status.TRACKING, nav, events=tuple(notes), stage_seconds=watch.seconds)
+        estimate = self._starter.begin(imu, tracks)
+        if estimate.state is not None:
+            self._begin(estimate.state)
+        return estimate
 
     def _begin(self, nav: NavState) -> None:
         options = self._options
         self._state = FilterState(
             nav,
-            self._initializer.calibration,
+            self._starter.calibration,
             extrinsics=options.calibrate_extrinsics,
             offset=options.calibrate_time_offset,
             intrinsics=options.calibrate_intrinsics,
         )
-        found = self._initializer.camera_rotation
+        found = self._starter.camera_rotation
         if found is not None and options.calibrate_extrinsics:
             rotation = slice(EXTRINSICS.start, EXTRINSICS.start + 3)
             self._state.cov[rotation, rotation] = found.cov
@@ -147,11 +138,6 @@ class Msckf:
         blind_s = (state.t_ns - self._seeing_ns) * 1e-9
         if blind_s > self._options.max_blind_s:
             raise DivergedError(f"nothing usable was seen for {blind_s:.1f} s")
-
-    def _lose(self, why: str) -> Estimate:
-        self._state = None
-        self._initializer.reset()
-        return Estimate(Status.LOST, events=(f"lost: {why}",))
 
 
 def _without(tracks: FrameTracks, ids: NDArray[np.int64]) -> FrameTracks:

@@ -1,7 +1,7 @@
 """The optimiser as a recipe: :meth:`SlidingWindow.process` and :meth:`SlidingWindow._estimate` read top to bottom.
 
 Qin, Li, Shen, "VINS-Mono: A Robust and Versatile Monocular Visual-Inertial State Estimator", T-RO 2018, with first
-estimates kept in the prior and landmarks of three degrees of freedom. Derivation: ``docs/derivations/sliding_window.md``.
+estimates kept in the prior and landmarks of three degrees of freedom. See ``docs/derivations/sliding_window.md``.
 """
 
 from __future__ import annotations
@@ -11,8 +11,8 @@ from dataclasses import replace
 import numpy as np
 
 from vioframe.inertial.preintegration import join_segments, preintegrate
-from vioframe.initialization import Initializer
-from vioframe.recovery import DivergedError, check_plausible, continued_from, noise_over
+from vioframe.initialization import Starter
+from vioframe.recovery import DivergedError, check_plausible, noise_over
 from vioframe.standstill import STANDSTILL_GATE, Standstill, StandstillDetector
 from vioframe.stopwatch import Stopwatch
 from vioframe.types import NS_PER_S, Calibration, Estimate, Float, FrameTracks, ImuSegment, NavState, Status
@@ -26,7 +26,8 @@ _MIN_LANDMARKS = 5
 class SlidingWindow:
     """One frame at a time; settings in :class:`SlidingWindowOptions`.
 
-    ``initial_state``, with covariance, stands for the state at the first frame and spares the initialisation.
+    ``initial_state``, with covariance, stands for the state at the first frame and spares the initialisation; it needs
+    a camera whose rotation on the body is known.
     """
 
     def __init__(
@@ -36,17 +37,21 @@ class SlidingWindow:
         initial_state: NavState | None = None,
     ) -> None:
         self._options = options or SlidingWindowOptions()
+        if self._options.unknown_camera_rotation and initial_state is not None:
+            raise ValueError("unknown_camera_rotation is found while initialising; leave out initial_state")
+        self._starter = Starter(calibration, unknown_camera_rotation=self._options.unknown_camera_rotation)
         noise, factor = calibration.imu, self._options.imu_noise_factor
-        in_flight = replace(noise, gyro_density=factor * noise.gyro_density, accel_density=factor * noise.accel_density)
-        self._calibration = replace(calibration, imu=in_flight)
-        self._initializer = Initializer(calibration)
+        self._noise = replace(
+            noise, gyro_density=factor * noise.gyro_density, accel_density=factor * noise.accel_density
+        )
         self._standstill = StandstillDetector(self._options.standstill_disparity_px)
         self._window: Window | None = None
-        self._initial_state = initial_state
         self._before: FrameTracks | None = None
         self._pending: list[ImuSegment] = []
-        self._last: NavState | None = None
         self._seeing_ns = 0
+        if initial_state is not None:
+            nothing = FrameTracks(initial_state.t_ns, np.empty(0, np.int64), *np.empty((2, 0, 2)))
+            self._begin(initial_state, nothing, np.empty((0, 2)))
 
     @property
     def window(self) -> Window | None:
@@ -64,8 +69,9 @@ class SlidingWindow:
             check_plausible(estimate.state)
             self._check_sight(tracks.t_ns)
         except (DivergedError, np.linalg.LinAlgError) as error:
-            return self._lose(str(error))
-        self._last = estimate.state
+            self._window = None
+            return self._starter.lose(str(error))
+        self._starter.follow(estimate.state)
         return estimate
 
     def _estimate(self, window: Window, imu: ImuSegment, tracks: FrameTracks, velocity: Float) -> Estimate:
@@ -106,33 +112,25 @@ class SlidingWindow:
         if not (self._standstill.sees_standstill(tracks) and self._options.zero_velocity_update):
             return False
         assert predicted.cov is not None
-        still = Standstill.over(imu, self._calibration.imu)
+        still = Standstill.over(imu, self._noise)
         residual = still.residual(predicted.R_WB, predicted.v_WB, predicted.bias_gyro_B, predicted.bias_accel_B)
         H = still.jacobian(predicted.R_WB)
         S = H @ predicted.cov @ H.T + np.diag(still.sigma**2)
         return bool(residual @ np.linalg.solve(S, residual) < STANDSTILL_GATE)
 
     def _initialise(self, imu: ImuSegment, tracks: FrameTracks, velocity: Float) -> Estimate:
-        watch = Stopwatch()
         self._standstill.sees_standstill(tracks)
-        if self._initial_state is not None:
-            nav, method = self._initial_state, "given"
-            self._initial_state = None
-        else:
-            initial = self._initializer.add(imu, tracks)
-            watch.lap("initialise")
-            if initial is None:
-                refusal = self._initializer.refusal
-                events = (f"initialisation refused: {refusal}",) if refusal else ()
-                return Estimate(Status.INITIALISING, events=events, stage_seconds=watch.seconds)
-            nav, method = initial.states[-1], initial.method
-        if self._last is not None:
-            nav = continued_from(self._last, nav)
-        self._window = Window(nav, tracks, velocity, self._calibration, self._options)
+        estimate = self._starter.begin(imu, tracks)
+        if estimate.state is not None:
+            self._begin(estimate.state, tracks, velocity)
+        return estimate
+
+    def _begin(self, state: NavState, tracks: FrameTracks, velocity: Float) -> None:
+        calibration, found = self._starter.calibration, self._starter.camera_rotation
+        self._calibration = replace(calibration, imu=self._noise)
+        self._window = Window(state, tracks, velocity, self._calibration, self._options, found)
         self._pending.clear()
-        self._seeing_ns = nav.t_ns
-        self._last = nav
-        return Estimate(Status.TRACKING, nav, events=(f"initialised ({method})",), stage_seconds=watch.seconds)
+        self._seeing_ns = state.t_ns
 
     def _image_velocity(self, tracks: FrameTracks) -> Float:
         """(N, 2) motion of the tracks on the z = 1 plane since the frame before, 1/s; zero for new ones."""
@@ -152,12 +150,6 @@ class SlidingWindow:
         jump = float(np.linalg.norm(newest.p_WB - predicted.p_WB))
         if not jump < self._options.max_jump_m:
             raise DivergedError(f"images moved the position by {jump:.1f} m from where the readings put it")
-
-    def _lose(self, why: str) -> Estimate:
-        self._window = None
-        self._pending.clear()
-        self._initializer.reset()
-        return Estimate(Status.LOST, events=(f"lost: {why}",))
 
 
 def _predict(state: NavState, imu: ImuSegment, calibration: Calibration) -> NavState:

@@ -29,7 +29,7 @@ class SlidingWindowOptions:
     outlier_px: float = 3.0
     """Tracks that are off by more than this on average are dropped."""
     imu_noise_factor: float = 4.0
-    """How many times the calibration's IMU noise is assumed: in flight, a frame that shakes adds to the sensor's own."""
+    """How many times the calibration's IMU noise is assumed: in flight, vibration adds to the sensor's own."""
     max_iterations: int = 8
     """Steps of the solver a frame, at most."""
     max_solve_ms: float = 0.0
@@ -40,6 +40,8 @@ class SlidingWindowOptions:
     """Estimate the camera's pose on the body."""
     calibrate_time_offset: bool = True
     """Estimate what is left of the time offset between camera and IMU."""
+    unknown_camera_rotation: bool = False
+    """The camera's rotation on the body is not known: find it while initialising, whatever the calibration says."""
     zero_velocity_update: bool = True
     """Recognise standstill and use it."""
     standstill_disparity_px: float = 0.7

@@ -16,7 +16,8 @@ from vioframe.geometry import so3
 from vioframe.inertial.imu_factors import ImuFactors, StateArrays
 from vioframe.standstill import Standstill
 from vioframe.types import Float, NavState
-from vioframe_sliding_window.reprojection import CALIBRATION_SIZE, Poses, Sightings, eliminate
+from vioframe_sliding_window.reprojection import Poses, Sightings
+from vioframe_sliding_window.reprojection_kernels import CALIBRATION_SIZE, eliminate
 
 STATE_SIZE = 15
 
@@ -63,12 +64,12 @@ class Prior:
     frozen: NDArray[np.bool_]
 
     @staticmethod
-    def of(state: NavState, camera: Calibrated, camera_sigma: Float) -> Prior:
-        """On a single state with covariance, and on the calibration with standard deviations (7,)."""
+    def of(state: NavState, camera: Calibrated, camera_cov: Float) -> Prior:
+        """On a single state with covariance, and on the calibration with covariance (7, 7)."""
         assert state.cov is not None
         H = np.zeros((STATE_SIZE + CALIBRATION_SIZE, STATE_SIZE + CALIBRATION_SIZE))
         H[:STATE_SIZE, :STATE_SIZE] = np.linalg.inv(state.cov)
-        H[STATE_SIZE:, STATE_SIZE:] = np.diag(camera_sigma**-2.0)
+        H[STATE_SIZE:, STATE_SIZE:] = np.linalg.inv(camera_cov)
         return Prior(H, np.zeros(len(H)), StateArrays.stack([state]), camera, np.ones(1, dtype=bool))
 
     def with_state(self, states: StateArrays) -> Prior:

@@ -1,4 +1,4 @@
-"""The window: its states, readings and tracks, and what they say together. Frames come and go here, and nowhere else."""
+"""The window: its states, readings and tracks, and what they say together. Frames come and go here and nowhere else."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from vioframe.geometry.kernels import intrinsics_of
 from vioframe.inertial.imu_factors import ImuFactors, StateArrays
 from vioframe.inertial.preintegration import Preintegrated, join_segments, preintegrate
+from vioframe.initialization.hand_eye import CameraRotation
 from vioframe.recovery import noise_over
 from vioframe.standstill import Standstill
 from vioframe.types import NS_PER_S, Calibration, Float, FrameTracks, ImuSegment, Int, NavState
@@ -18,7 +19,8 @@ from vioframe_sliding_window.landmarks import in_hosts, positions, triangulate_t
 from vioframe_sliding_window.marginalisation import marginalise_oldest
 from vioframe_sliding_window.options import SlidingWindowOptions
 from vioframe_sliding_window.problem import STATE_SIZE, Calibrated, Prior, Problem, Variables
-from vioframe_sliding_window.reprojection import CALIBRATION_SIZE, Poses, Sightings, pixels_by_residual
+from vioframe_sliding_window.reprojection import Poses, Sightings
+from vioframe_sliding_window.reprojection_kernels import CALIBRATION_SIZE, pixels_by_residual
 from vioframe_sliding_window.solver import solve, solve_positive
 from vioframe_sliding_window.tracks import Rows, TrackTable
 
@@ -32,7 +34,8 @@ class Window:
     """K states, the newest last, and all factors between them.
 
     It begins with one state, whose covariance is the first prior, and the tracks of its frame. ``velocity`` (N, 2) 1/s
-    is the motion of tracks on the z = 1 plane, here and in :meth:`add_frame`.
+    is the motion of tracks on the z = 1 plane, here and in :meth:`add_frame`. ``camera_rotation`` is what the hand-eye
+    calibration found, where there was one.
     """
 
     def __init__(
@@ -42,6 +45,7 @@ class Window:
         velocity: Float,
         calibration: Calibration,
         options: SlidingWindowOptions,
+        camera_rotation: CameraRotation | None = None,
     ) -> None:
         self._noise = calibration.imu
         self._options = options
@@ -50,7 +54,10 @@ class Window:
         self._t_ns = [state.t_ns]
         self._states = StateArrays.stack([state])
         self._camera = Calibrated(calibration.R_BC, calibration.p_BC, 0.0)
-        self._prior = Prior.of(state, self._camera, _SIGMA_CALIBRATION)
+        camera_cov = np.diag(_SIGMA_CALIBRATION**2)
+        if camera_rotation is not None:
+            camera_cov[:3, :3] = camera_rotation.cov
+        self._prior = Prior.of(state, self._camera, camera_cov)
         self._readings: list[Preintegrated] = []
         self._still: dict[int, Standstill] = {}
         self._newest_is_keyframe = True
@@ -200,7 +207,7 @@ class Window:
         self._host_again(ids, p_WF)
 
     def _host_again(self, ids: Int, p_WF: Float) -> None:
-        """Express landmarks at ``p_WF`` (N, 3) m in the frames that now host their tracks, where two or more are left."""
+        """Express landmarks at ``p_WF`` (N, 3) m in the frames that now host them, where two or more see them."""
         tracks = self.tracks
         _, rows, of = np.intersect1d(tracks.ids, ids, assume_unique=True, return_indices=True)
         enough = tracks.seen[rows].sum(axis=1) >= 2

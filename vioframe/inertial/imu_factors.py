@@ -88,7 +88,10 @@ class ImuFactors:
     @staticmethod
     def stack(measurements: Sequence[Preintegrated]) -> ImuFactors:
         if not measurements:
-            return _NO_FACTORS
+            none = np.empty((0, 3))
+            return ImuFactors(
+                np.empty(0), np.empty((0, 3, 3)), none, none, none, none, np.empty((0, 9, 6)), np.empty((0, 15, 15))
+            )
         cov = np.stack([m.cov for m in measurements])
         return ImuFactors(
             np.array([m.dt_s for m in measurements]),
@@ -146,12 +149,3 @@ class ImuFactors:
         r[:, DBG] = j.bias_gyro_B - i.bias_gyro_B
         r[:, DBA] = j.bias_accel_B - i.bias_accel_B
         return r, R_BiW, p_i, v_i, correction
-
-
-_NO_FACTORS = ImuFactors(
-    np.empty(0),
-    np.empty((0, 3, 3)),
-    *np.empty((4, 0, 3)),
-    np.empty((0, 9, 6)),
-    np.empty((0, 15, 15)),
-)

@@ -4,5 +4,6 @@ from vioframe.initialization.estimate import InitialEstimate
 from vioframe.initialization.hand_eye import CameraRotation, RotationCalibrator
 from vioframe.initialization.initializer import Initializer
 from vioframe.initialization.options import InitializationOptions
+from vioframe.initialization.starter import Starter
 
-__all__ = ["CameraRotation", "InitialEstimate", "InitializationOptions", "Initializer", "RotationCalibrator"]
+__all__ = ["CameraRotation", "InitialEstimate", "InitializationOptions", "Initializer", "RotationCalibrator", "Starter"]

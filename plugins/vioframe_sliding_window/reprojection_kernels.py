@@ -1,0 +1,282 @@
+"""Compiled loops over all sightings of all landmarks: see :mod:`vioframe_sliding_window.reprojection`."""
+
+import math
+
+import numpy as np
+
+from vioframe.geometry.kernels import distort
+from vioframe.jit import kernel
+
+# Depth in a frame over depth in the host: a landmark nearer than this is beside the camera, and cannot be seen.
+_LEAST_DEPTH_RATIO = 0.05
+CALIBRATION_SIZE = 7
+"""Error of the calibration: [dtheta_BC dp_BC d_offset]."""
+
+
+@kernel
+def pixels_by_residual(model, k, xy, on_sphere):
+    """(N, 2, 2) px of the distorted image by the residual at points (N, 2) of the z = 1 plane."""
+    out = np.empty((len(xy), 2, 2))
+    T = np.empty((2, 3))
+    for i in range(len(xy)):
+        x, y = xy[i]
+        _, J = distort(model, k, x, y)
+        if on_sphere:
+            # A step across the ray, seen on the plane: |m| (T_xy - m_xy T_z).
+            _tangents(x, y, T)
+            length = math.sqrt(1.0 + x * x + y * y)
+            S = np.empty((2, 2))
+            for j in range(2):
+                S[0, j], S[1, j] = length * (T[j, 0] - x * T[j, 2]), length * (T[j, 1] - y * T[j, 2])
+            J = J @ S
+        out[i] = J
+    return out
+
+
+@kernel
+def eliminate(V, W, c, damping):
+    """Y (L, 3, n), z (L, 3) and inverse factors (L, 3, 3) with Y^T Y = W^T V^-1 W, Y^T z = W^T V^-1 c, V damped."""
+    count, _, n = W.shape
+    Y = np.empty((count, 3, n))
+    z = np.empty((count, 3))
+    inverse = np.zeros((count, 3, 3))
+    for i in range(count):
+        # Cholesky's factor of V, inverted. The constant keeps a landmark without parallax solvable.
+        a = V[i, 0, 0] * (1.0 + damping) + 1e-9
+        b = V[i, 1, 1] * (1.0 + damping) + 1e-9
+        d = V[i, 2, 2] * (1.0 + damping) + 1e-9
+        l00 = math.sqrt(a)
+        l10, l20 = V[i, 1, 0] / l00, V[i, 2, 0] / l00
+        l11 = math.sqrt(b - l10 * l10)
+        l21 = (V[i, 2, 1] - l20 * l10) / l11
+        l22 = math.sqrt(max(d - l20 * l20 - l21 * l21, 1e-9))
+        i00, i11, i22 = 1.0 / l00, 1.0 / l11, 1.0 / l22
+        i10, i21 = -l10 * i00 * i11, -l21 * i11 * i22
+        i20 = -(l20 * i00 + l21 * i10) * i22
+        inverse[i, 0, 0], inverse[i, 1, 0], inverse[i, 1, 1] = i00, i10, i11
+        inverse[i, 2, 0], inverse[i, 2, 1], inverse[i, 2, 2] = i20, i21, i22
+        for j in range(n):
+            w0, w1, w2 = W[i, 0, j], W[i, 1, j], W[i, 2, j]
+            Y[i, 0, j] = i00 * w0
+            Y[i, 1, j] = i10 * w0 + i11 * w1
+            Y[i, 2, j] = i20 * w0 + i21 * w1 + i22 * w2
+        z[i, 0] = i00 * c[i, 0]
+        z[i, 1] = i10 * c[i, 0] + i11 * c[i, 1]
+        z[i, 2] = i20 * c[i, 0] + i21 * c[i, 1] + i22 * c[i, 2]
+    return Y, z, inverse
+
+
+@kernel
+def _in_body(R_BC, p_BC, m, q):
+    """``q`` (3,): rho times the landmark's position in the host's body."""
+    for i in range(3):
+        q[i] = R_BC[i, 0] * m[0] + R_BC[i, 1] * m[1] + R_BC[i, 2] + m[2] * p_BC[i]
+
+
+@kernel
+def _in_camera(R_fh, t_fh, R_BC, p_BC, rho, q, b, X):
+    """``b`` and ``X`` (3,): rho times the landmark's position in the frame's body, and in its camera."""
+    for i in range(3):
+        b[i] = R_fh[i, 0] * q[0] + R_fh[i, 1] * q[1] + R_fh[i, 2] * q[2] + rho * t_fh[i]
+    for i in range(3):
+        X[i] = 0.0
+        for k in range(3):
+            X[i] += R_BC[k, i] * (b[k] - rho * p_BC[k])
+
+
+@kernel
+def _tangents(x, y, T):
+    """``T`` (2, 3): two orthonormal directions across the ray [x y 1]."""
+    length = math.sqrt(1.0 + x * x)
+    T[0, 0], T[0, 1], T[0, 2] = 1.0 / length, 0.0, -x / length
+    # The ray times the first.
+    across = math.sqrt(x * x + y * y + 1.0)
+    T[1, 0] = y * T[0, 2] / across
+    T[1, 1] = (T[0, 0] - x * T[0, 2]) / across
+    T[1, 2] = -y * T[0, 0] / across
+
+
+@kernel
+def _residual(X, x, y, to_px, on_sphere, T, r):
+    """``r`` (2,) px between the direction ``X`` (3,) and the observation [x y 1]; across ``T`` on the sphere."""
+    if on_sphere:
+        length = math.sqrt(X[0] * X[0] + X[1] * X[1] + X[2] * X[2])
+        _tangents(x, y, T)
+        # The observation itself has no part across itself.
+        u = (T[0, 0] * X[0] + T[0, 1] * X[1] + T[0, 2] * X[2]) / length
+        v = (T[1, 0] * X[0] + T[1, 1] * X[1] + T[1, 2] * X[2]) / length
+    else:
+        depth = max(X[2], _LEAST_DEPTH_RATIO)
+        u, v = X[0] / depth - x, X[1] / depth - y
+    r[0], r[1] = to_px[0, 0] * u + to_px[0, 1] * v, to_px[1, 0] * u + to_px[1, 1] * v
+
+
+@kernel
+def _residual_jacobian(X, vx, vy, to_px, on_sphere, T, D, by_offset):
+    """``D`` (2, 3) by ``X``, and ``by_offset`` (2,) by the time offset, where the image moves by (vx, vy)."""
+    if on_sphere:
+        length = math.sqrt(X[0] * X[0] + X[1] * X[1] + X[2] * X[2])
+        for i in range(2):
+            along = (T[i, 0] * X[0] + T[i, 1] * X[1] + T[i, 2] * X[2]) / (length * length)
+            for k in range(3):
+                D[i, k] = (T[i, k] - along * X[k]) / length
+            by_offset[i] = D[i, 0] * vx + D[i, 1] * vy
+            by_offset[i] *= X[2]
+    else:
+        for i in range(2):
+            for k in range(3):
+                D[i, k] = 0.0
+        if X[2] > _LEAST_DEPTH_RATIO:
+            D[0, 0] = D[1, 1] = 1.0 / X[2]
+            D[0, 2], D[1, 2] = -X[0] / (X[2] * X[2]), -X[1] / (X[2] * X[2])
+        else:
+            D[0, 0] = D[1, 1] = 1.0 / _LEAST_DEPTH_RATIO
+        by_offset[0], by_offset[1] = vx, vy
+    for k in range(3):
+        u, v = D[0, k], D[1, k]
+        D[0, k], D[1, k] = to_px[0, 0] * u + to_px[0, 1] * v, to_px[1, 0] * u + to_px[1, 1] * v
+    u, v = by_offset[0], by_offset[1]
+    by_offset[0], by_offset[1] = to_px[0, 0] * u + to_px[0, 1] * v, to_px[1, 0] * u + to_px[1, 1] * v
+
+
+@kernel
+def _times(A, M, out):
+    """``out`` = A M, (2, 3) times (3, 3)."""
+    for i in range(2):
+        for k in range(3):
+            out[i, k] = A[i, 0] * M[0, k] + A[i, 1] * M[1, k] + A[i, 2] * M[2, k]
+
+
+@kernel
+def cost(R_fh, t_fh, R_BC, p_BC, offset_s, seen, xy, velocity, to_px, landmarks, sigma, cauchy, on_sphere):
+    q, b, X, r, T = np.empty(3), np.empty(3), np.empty(3), np.empty(2), np.empty((2, 3))
+    count, frames = seen.shape
+    total = 0.0
+    for i in range(count):
+        host = -1
+        _in_body(R_BC, p_BC, landmarks[i], q)
+        for f in range(frames):
+            if not seen[i, f]:
+                continue
+            host = f if host < 0 else host
+            x, y = xy[i, f, 0] - offset_s * velocity[i, f, 0], xy[i, f, 1] - offset_s * velocity[i, f, 1]
+            _in_camera(R_fh[f, host], t_fh[f, host], R_BC, p_BC, landmarks[i, 2], q, b, X)
+            _residual(X, x, y, to_px[i, f], on_sphere, T, r)
+            s = (r[0] * r[0] + r[1] * r[1]) / (sigma * sigma * cauchy * cauchy)
+            total += 0.5 * cauchy * cauchy * math.log(1.0 + s)
+    return total
+
+
+@kernel
+def errors(R_fh, t_fh, R_BC, p_BC, offset_s, seen, xy, velocity, to_px, landmarks, sigma, on_sphere):
+    q, b, X, r, T = np.empty(3), np.empty(3), np.empty(3), np.empty(2), np.empty((2, 3))
+    count, frames = seen.shape
+    out = np.empty(count)
+    for i in range(count):
+        host, views, total = -1, 0, 0.0
+        _in_body(R_BC, p_BC, landmarks[i], q)
+        for f in range(frames):
+            if not seen[i, f]:
+                continue
+            host = f if host < 0 else host
+            x, y = xy[i, f, 0] - offset_s * velocity[i, f, 0], xy[i, f, 1] - offset_s * velocity[i, f, 1]
+            _in_camera(R_fh[f, host], t_fh[f, host], R_BC, p_BC, landmarks[i, 2], q, b, X)
+            _residual(X, x, y, to_px[i, f], on_sphere, T, r)
+            total += (r[0] * r[0] + r[1] * r[1]) / (sigma * sigma)
+            if X[2] <= _LEAST_DEPTH_RATIO:
+                total = np.inf
+            views += 1
+        out[i] = math.sqrt(0.5 * total / max(views, 1))
+    return out
+
+
+@kernel
+def linearise(
+    R_fh,
+    t_fh,
+    R_first,
+    R_fh_first,
+    t_fh_first,
+    R_BC,
+    p_BC,
+    offset_s,
+    seen,
+    xy,
+    velocity,
+    to_px,
+    landmarks,
+    sigma,
+    cauchy,
+    on_sphere,
+):
+    count, frames = seen.shape
+    n = 6 * frames + CALIBRATION_SIZE
+    H, g = np.zeros((n, n)), np.zeros(n)
+    V, W, c = np.zeros((count, 3, 3)), np.zeros((count, 3, n)), np.zeros((count, 3))
+    q, b, X, r, T = np.empty(3), np.empty(3), np.empty(3), np.empty(2), np.empty((2, 3))
+    D, A, B, C, E = np.empty((2, 3)), np.empty((2, 3)), np.empty((2, 3)), np.empty((2, 3)), np.empty((2, 3))
+    R_CB = np.ascontiguousarray(R_BC.T)
+    by_offset = np.empty(2)
+    J = np.empty((2, 19))  # host, frame, calibration
+    J_m = np.empty((2, 3))
+    columns = np.empty(19, np.int64)
+    for k in range(CALIBRATION_SIZE):
+        columns[12 + k] = 6 * frames + k
+    ray = np.ones(3)
+    for i in range(count):
+        host = -1
+        rho = landmarks[i, 2]
+        ray[0], ray[1] = landmarks[i, 0], landmarks[i, 1]
+        _in_body(R_BC, p_BC, landmarks[i], q)
+        for f in range(frames):
+            if not seen[i, f]:
+                continue
+            host = f if host < 0 else host
+            vx, vy = velocity[i, f, 0], velocity[i, f, 1]
+            x, y = xy[i, f, 0] - offset_s * vx, xy[i, f, 1] - offset_s * vy
+            _in_camera(R_fh[f, host], t_fh[f, host], R_BC, p_BC, rho, q, b, X)
+            _residual(X, x, y, to_px[i, f], on_sphere, T, r)
+            weight = 1.0 / (1.0 + (r[0] * r[0] + r[1] * r[1]) / (sigma * sigma * cauchy * cauchy))
+            scale = math.sqrt(weight) / sigma
+
+            _in_camera(R_fh_first[f, host], t_fh_first[f, host], R_BC, p_BC, rho, q, b, X)
+            _residual_jacobian(X, vx, vy, to_px[i, f], on_sphere, T, D, by_offset)
+            _times(D, R_CB, A)
+            _times(A, R_fh_first[f, host], B)
+            _times(B, R_BC, C)
+            _times(A, R_first[f].T, E)
+            for a in range(2):
+                r[a] *= scale
+                moved = host != f
+                by_rho = 0.0
+                for k in range(3):
+                    i1, i2 = (k + 1) % 3, (k + 2) % 3  # a x b in its component k
+                    by_host = q[i1] * B[a, i2] - q[i2] * B[a, i1]
+                    by_frame = A[a, i1] * b[i2] - A[a, i2] * b[i1]
+                    by_camera = D[a, i1] * X[i2] - D[a, i2] * X[i1] + ray[i1] * C[a, i2] - ray[i2] * C[a, i1]
+                    J[a, k] = scale * by_host if moved else 0.0
+                    J[a, 3 + k] = scale * rho * E[a, k] if moved else 0.0
+                    J[a, 6 + k] = scale * by_frame if moved else 0.0
+                    J[a, 9 + k] = -J[a, 3 + k]
+                    J[a, 12 + k] = scale * by_camera if moved else 0.0
+                    J[a, 15 + k] = scale * rho * (B[a, k] - A[a, k]) if moved else 0.0
+                    by_rho += A[a, k] * t_fh_first[f, host, k] + (B[a, k] - A[a, k]) * p_BC[k]
+                J[a, 18] = scale * by_offset[a]
+                J_m[a, 0], J_m[a, 1] = scale * C[a, 0], scale * C[a, 1]
+                J_m[a, 2] = scale * by_rho if moved else 0.0
+            for k in range(6):
+                columns[k], columns[6 + k] = 6 * host + k, 6 * f + k
+
+            begin = 0 if host != f else 12
+            for u in range(begin, 19):
+                cu = columns[u]
+                g[cu] += J[0, u] * r[0] + J[1, u] * r[1]
+                for v in range(begin, 19):
+                    H[cu, columns[v]] += J[0, u] * J[0, v] + J[1, u] * J[1, v]
+                for k in range(3):
+                    W[i, k, cu] += J_m[0, k] * J[0, u] + J_m[1, k] * J[1, u]
+            for k in range(3):
+                c[i, k] += J_m[0, k] * r[0] + J_m[1, k] * r[1]
+                for v in range(3):
+                    V[i, k, v] += J_m[0, k] * J_m[0, v] + J_m[1, k] * J_m[1, v]
+    return H, g, V, W, c
