@@ -80,7 +80,7 @@ def backend_rows(
 def present(
     name: str, title: str, rows: Iterable[Row], columns: Mapping[str, str], settings: Mapping[str, Any], keep: bool
 ) -> None:
-    """Print the table, and write ``results/NAME.json`` if asked to."""
+    """Print the table, and write it to :func:`results_file` if asked to."""
     console = Console()
     if not console.is_terminal:
         console = Console(width=160)  # a file or pipe has no width of its own
@@ -91,6 +91,12 @@ def present(
             status.update(f"{name}: {len(done)} done")
     console.print(table(title, done, columns))
     if keep:
-        path = HERE / "results" / f"{name}.json"
+        path = results_file(name, settings)
         record(path, done, settings)
         console.print(f"written to {path.relative_to(HERE.parent)}")
+
+
+def results_file(name: str, settings: Mapping[str, Any]) -> Path:
+    """``results/NAME_BACKEND.json``, or without the back-end where none takes part."""
+    parts = [name, settings["backend"]] if "backend" in settings else [name]
+    return HERE / "results" / f"{'_'.join(parts)}.json"

@@ -9,7 +9,7 @@ an NEES far outside without first-estimate Jacobians. 25 flights of 60 s each, E
 from pathlib import Path
 
 import click
-from common import HERE, benchmark
+from common import benchmark, results_file
 from rich.console import Console
 
 from vioframe import registry
@@ -42,7 +42,7 @@ def main(
     Console(width=200).print(to_rich(outcomes))
     if keep:
         settings = {"backend": backend, "options": list(assignments), "against": against, "seeds": seeds}
-        record(HERE / "results" / "montecarlo.json", [outcome.to_dict() for outcome in outcomes], settings)
+        record(results_file("montecarlo", settings), [outcome.to_dict() for outcome in outcomes], settings)
 
 
 if __name__ == "__main__":
