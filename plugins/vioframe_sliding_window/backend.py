@@ -21,6 +21,8 @@ from vioframe_sliding_window.window import Window
 
 # Landmarks without which a frame counts as blind.
 _MIN_LANDMARKS = 5
+# A body that turns no faster than this, rad/s, does not lose sight of this many tracks from one frame to the next.
+_SLOW_TURN, _MANY_TRACKS = 1.0, 20
 
 
 class SlidingWindow:
@@ -60,10 +62,12 @@ class SlidingWindow:
 
     def process(self, imu: ImuSegment, tracks: FrameTracks) -> Estimate:
         """Initialise, or estimate one frame; where that fails it says so and starts again from where it was."""
-        velocity = self._image_velocity(tracks)
+        before, self._before = self._before, tracks
+        velocity = _image_velocity(before, tracks)
         if self._window is None:
             return self._initialise(imu, tracks, velocity)
         try:
+            _check_continuity(before, tracks, imu)
             estimate = self._estimate(self._window, imu, tracks, velocity)
             assert estimate.state is not None
             check_plausible(estimate.state)
@@ -82,7 +86,7 @@ class SlidingWindow:
         still = self._stands_still(predicted, since, tracks)
         due = since.duration_s > 1.0 / options.max_rate_hz - 0.5 * imu.duration_s
         watch.lap("propagate")
-        if not (still or due):
+        if not due:
             return Estimate(Status.TRACKING, predicted, stage_seconds=watch.seconds)
 
         self._pending.clear()
@@ -94,14 +98,14 @@ class SlidingWindow:
         window.triangulate()
         watch.lap("triangulate")
         window.optimise()
-        used = window.reject_outliers()
+        window.reject_outliers()
         watch.lap("optimise")
         ids, p_WF = window.landmarks()
         newest = window.newest
         self._check_jump(predicted, newest)
-        if len(used) >= _MIN_LANDMARKS or still:
+        if window.in_sight >= _MIN_LANDMARKS or still:
             self._seeing_ns = tracks.t_ns
-        is_keyframe = window.choose_keyframe()
+        is_keyframe = not still and window.choose_keyframe()
         if window.is_full:
             window.marginalise_oldest()
         watch.lap("marginalise")
@@ -132,15 +136,6 @@ class SlidingWindow:
         self._pending.clear()
         self._seeing_ns = state.t_ns
 
-    def _image_velocity(self, tracks: FrameTracks) -> Float:
-        """(N, 2) motion of the tracks on the z = 1 plane since the frame before, 1/s; zero for new ones."""
-        velocity = np.zeros((len(tracks.ids), 2))
-        before, self._before = self._before, tracks
-        if before is not None and tracks.t_ns > before.t_ns:
-            _, i, j = np.intersect1d(before.ids, tracks.ids, assume_unique=True, return_indices=True)
-            velocity[j] = (tracks.xy_normalised[j] - before.xy_normalised[i]) / (tracks.t_ns - before.t_ns) * NS_PER_S
-        return velocity
-
     def _check_sight(self, t_ns: int) -> None:
         blind_s = (t_ns - self._seeing_ns) * 1e-9
         if blind_s > self._options.max_blind_s:
@@ -150,6 +145,28 @@ class SlidingWindow:
         jump = float(np.linalg.norm(newest.p_WB - predicted.p_WB))
         if not jump < self._options.max_jump_m:
             raise DivergedError(f"images moved the position by {jump:.1f} m from where the readings put it")
+
+
+def _image_velocity(before: FrameTracks | None, tracks: FrameTracks) -> Float:
+    """(N, 2) motion of ``tracks`` on the z = 1 plane since the frame ``before``, 1/s; zero for new ones."""
+    velocity = np.zeros((len(tracks.ids), 2))
+    if before is not None and tracks.t_ns > before.t_ns:
+        _, i, j = np.intersect1d(before.ids, tracks.ids, assume_unique=True, return_indices=True)
+        velocity[j] = (tracks.xy_normalised[j] - before.xy_normalised[i]) / (tracks.t_ns - before.t_ns) * NS_PER_S
+    return velocity
+
+
+def _check_continuity(before: FrameTracks | None, tracks: FrameTracks, imu: ImuSegment) -> None:
+    """Raise :class:`DivergedError` where nothing is seen of what was seen just before, though the body hardly turned.
+
+    The camera is then somewhere else, or sees something else: what images and readings say no longer belongs together.
+    """
+    if before is None or min(len(before.ids), len(tracks.ids)) < _MANY_TRACKS:
+        return
+    if np.isin(tracks.ids, before.ids, assume_unique=True).any():
+        return
+    if np.linalg.norm(imu.gyro_B, axis=1).max() < _SLOW_TURN:
+        raise DivergedError("everything in sight changed at once, though the body hardly turned")
 
 
 def _predict(state: NavState, imu: ImuSegment, calibration: Calibration) -> NavState:

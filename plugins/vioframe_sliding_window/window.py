@@ -168,8 +168,8 @@ class Window:
         self._cov = self._newest_covariance(S)
         return solution.iterations
 
-    def reject_outliers(self) -> Rows:
-        """Drop tracks that do not fit; returns the rows of those that do."""
+    def reject_outliers(self) -> None:
+        """Drop tracks that do not fit."""
         tracks = self.tracks
         rows = np.flatnonzero(tracks.known)
         x = self._variables(rows)
@@ -180,7 +180,11 @@ class Window:
         keep = np.ones(len(tracks.ids), dtype=bool)
         keep[rows[bad]] = False
         tracks.keep(keep)
-        return np.flatnonzero(tracks.known)
+
+    @property
+    def in_sight(self) -> int:
+        """Number of known landmarks that the newest frame sees."""
+        return int((self.tracks.known & self.tracks.seen[:, -1]).sum())
 
     def landmarks(self) -> tuple[Int, Float]:
         """Ids (L,) and positions p_WF (L, 3) m of the known landmarks."""
