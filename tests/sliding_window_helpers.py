@@ -1,0 +1,150 @@
+"""Small windows on a simulated flight, with every kind of factor, whose parts can be looked at one by one."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+from msckf_helpers import random_covariance
+from numpy.typing import NDArray
+
+from vioframe.calibration import packaged_calibration
+from vioframe.geometry.cameras import Camera
+from vioframe.geometry.kernels import intrinsics_of
+from vioframe.inertial.imu_factors import ImuFactors, StateArrays
+from vioframe.inertial.preintegration import join_segments, preintegrate
+from vioframe.simulation import simulated_sequence
+from vioframe.standstill import Standstill
+from vioframe.types import Float
+from vioframe_sliding_window.landmarks import camera_poses, in_hosts, positions
+from vioframe_sliding_window.problem import STATE_SIZE, Calibrated, Prior, Problem, Variables
+from vioframe_sliding_window.reprojection import Sightings
+from vioframe_sliding_window.reprojection_kernels import CALIBRATION_SIZE, pixels_by_residual
+
+CAMERA = packaged_calibration("euroc").camera
+NATURAL = np.repeat([0.01, 0.05, 0.1, 0.005, 0.05], 3)
+"""Errors of a state that are large but linear enough: rad, m, m/s, rad/s, m/s^2."""
+NATURAL_CALIBRATION = np.repeat([0.005, 0.01, 0.002], [3, 3, 1])
+
+
+def flown_window(
+    frames: int = 5,
+    landmarks: int = 24,
+    seed: int = 0,
+    *,
+    on_sphere: bool = False,
+    noise_px: float = 2.0,
+    offset_s: float = 0.003,
+    camera: Camera = CAMERA,
+    first_estimates: bool = True,
+) -> tuple[Problem, Variables]:
+    """States a quarter of a second apart, landmarks seen by two frames or more, a prior on the first two states.
+
+    The truth, but for biases and time offset, satisfies all but the prior; each of the states hosts some landmarks.
+    """
+    rng = np.random.default_rng(seed)
+    sequence = simulated_sequence("figure_eight", seed=seed, duration_s=0.25 * frames + 0.1)
+    at = 1 + 5 * np.arange(frames)
+    states = StateArrays.stack([sequence.true_states[k] for k in at])
+    readings = []
+    for k in at[:-1]:
+        imu = join_segments([imu for imu, _ in sequence.packets[k + 1 : k + 6]])
+        readings.append(
+            preintegrate(imu, 0.002 * rng.normal(size=3), 0.02 * rng.normal(size=3), sequence.calibration.imu)
+        )
+    calibrated = Calibrated(sequence.calibration.R_BC, sequence.calibration.p_BC, offset_s)
+    sightings, points = _sightings(states, calibrated, camera, landmarks, noise_px, on_sphere, rng)
+    x = Variables(states, calibrated, points)
+    problem = Problem(prior_on(x, 2, rng), ImuFactors.stack(readings), {}, sightings, first_estimates)
+    return problem, x
+
+
+def prior_on(x: Variables, frozen: int, rng: np.random.Generator) -> Prior:
+    """A random prior on the first ``frozen`` states and the calibration, about ``x``."""
+    n, known = STATE_SIZE * len(x.states), STATE_SIZE * frozen
+    index = np.r_[0:known, n : n + CALIBRATION_SIZE]
+    sigma = np.concatenate([np.tile(NATURAL, frozen), NATURAL_CALIBRATION])
+    H, b = np.zeros((n + CALIBRATION_SIZE, n + CALIBRATION_SIZE)), np.zeros(n + CALIBRATION_SIZE)
+    H[np.ix_(index, index)] = random_covariance(rng, len(index)) / np.outer(sigma, sigma)
+    b[index] = rng.normal(size=len(index)) / sigma
+    return Prior(H, b, x.states, x.camera, np.arange(len(x.states)) < frozen)
+
+
+def standing(problem: Problem, state: int) -> Problem:
+    """The same, with readings by which the body stood still at a state (which it did not)."""
+    noise = packaged_calibration("euroc").imu
+    still = Standstill(np.array([0.01, -0.02, 0.03]), np.array([9.7, 0.2, -0.4]), 0.5, noise)
+    return replace(problem, still={state: still})
+
+
+def without_sightings(problem: Problem) -> Problem:
+    return replace(problem, sightings=only(problem.sightings, slice(0, 0)))
+
+
+def only(sightings: Sightings, rows: slice | NDArray[np.bool_]) -> Sightings:
+    s = sightings
+    return replace(s, seen=s.seen[rows], xy=s.xy[rows], velocity=s.velocity[rows], to_px=s.to_px[rows])
+
+
+def moved(x: Variables, rng: np.random.Generator, scale: float) -> Variables:
+    """``x`` off by ``scale`` of what is natural, in everything."""
+    return x.retract(
+        scale * natural(x) * rng.normal(size=natural(x).shape), 0.01 * scale * rng.normal(size=x.landmarks.shape)
+    )
+
+
+def natural(x: Variables) -> Float:
+    """(n,) natural sizes of the error of states and calibration."""
+    return np.concatenate([np.tile(NATURAL, len(x.states)), NATURAL_CALIBRATION])
+
+
+def retracted(x: Variables, d: Float) -> Variables:
+    """``x`` moved by ``d``: states and calibration, then landmarks."""
+    n = STATE_SIZE * len(x.states) + CALIBRATION_SIZE
+    return x.retract(d[:n], d[n:].reshape(-1, 3))
+
+
+def numeric(function: Callable[[Float], Float], sizes: Float, eps: float = 1e-4) -> Float:
+    """Derivatives (..., n) of ``function`` at zero by central differences of fourth order of ``eps * sizes`` (n,)."""
+    columns = []
+    for e in np.diag(eps * sizes):
+        near = np.asarray(function(e)) - np.asarray(function(-e))
+        far = np.asarray(function(2.0 * e)) - np.asarray(function(-2.0 * e))
+        columns.append((8.0 * near - far) / (12.0 * e.sum()))
+    return np.stack(columns, axis=-1)
+
+
+def _sightings(
+    states: StateArrays,
+    calibrated: Calibrated,
+    camera: Camera,
+    count: int,
+    noise_px: float,
+    on_sphere: bool,
+    rng: np.random.Generator,
+) -> tuple[Sightings, Float]:
+    """Of random landmarks by random frames, two of them at least, and [x y rho] of the landmarks."""
+    frames, drawn = len(states), 4 * count
+    hosts = np.arange(drawn) % (frames - 1)
+    xy_rho = np.column_stack([rng.uniform(-0.5, 0.5, (drawn, 2)), 1.0 / rng.uniform(3.0, 10.0, drawn)])
+    p_WF = positions(states, calibrated, hosts, xy_rho)
+    R_WC, p_WC = camera_poses(states, calibrated)
+    p_CF = np.einsum("kji,lkj->lki", R_WC, p_WF[:, None] - p_WC)
+    in_view = (p_CF[..., 2] > 1.0) & (np.abs(p_CF[..., :2]) < 0.7 * p_CF[..., 2:]).all(axis=2)
+    seen = in_view & (rng.random((drawn, frames)) < 0.7) & (np.arange(frames) > hosts[:, None])
+    seen[np.arange(drawn), hosts] = True
+    chosen = np.flatnonzero(seen.sum(axis=1) >= 2)[:count]
+    assert len(chosen) == count
+    hosts, p_WF, p_CF, seen = hosts[chosen], p_WF[chosen], p_CF[chosen], seen[chosen]
+    exact = p_CF[..., :2] / p_CF[..., 2:]
+    exact[~seen] = 0.0
+    velocity = np.where(seen[..., None], rng.normal(0.0, 0.3, exact.shape), 0.0)
+    xy = np.zeros_like(exact)
+    pixels = camera.distort(exact[seen]) + rng.normal(0.0, noise_px, (seen.sum(), 2))
+    xy[seen] = camera.undistort(pixels) + calibrated.offset_s * velocity[seen]
+    to_px = np.zeros((count, frames, 2, 2))
+    to_px[seen] = pixels_by_residual(*intrinsics_of(camera), xy[seen], on_sphere)
+    landmarks, in_front = in_hosts(states, calibrated, hosts, p_WF)
+    assert in_front.all()
+    return Sightings(seen, xy, velocity, to_px, 0.8, 2.0, on_sphere), landmarks
