@@ -22,7 +22,7 @@ from vioframe_sliding_window.problem import STATE_SIZE, Calibrated, Prior, Probl
 from vioframe_sliding_window.reprojection import Poses, Sightings
 from vioframe_sliding_window.reprojection_kernels import CALIBRATION_SIZE, pixels_by_residual
 from vioframe_sliding_window.solver import solve, solve_positive
-from vioframe_sliding_window.tracks import Rows, TrackTable
+from vioframe_sliding_window.tracks import Bool, Rows, TrackTable
 
 # Prior standard deviations of the calibration: rad, m, s. Those of OpenVINS on EuRoC.
 _SIGMA_CALIBRATION = np.repeat([0.005, 0.015, 0.01], [3, 3, 1])
@@ -195,12 +195,14 @@ class Window:
     def marginalise_oldest(self) -> None:
         """Turn what the oldest state and the landmarks it hosts say about the rest into the prior, and let go of it.
 
-        Landmarks that are still in sight move to the next frame that saw them, with all that frames still in the window
-        saw of them.
+        Landmarks that are still in sight move to the next frame that saw them. What the newer half of the window saw of
+        them is left for later: the prior would freeze those states at estimates that have hardly begun.
         """
         tracks = self.tracks
         rows = np.flatnonzero(tracks.known & (tracks.hosts == 0))
-        problem = self._problem(rows, readings=1, oldest_only=True)
+        seen = tracks.seen[rows]
+        seen[seen[:, -1], (len(self) + 1) // 2 :] = False
+        problem = self._oldest_problem(rows, seen)
         self._prior = marginalise_oldest(problem, self._variables(rows))
         ids, p_WF = tracks.ids[rows], positions(self._states, self._camera, tracks.hosts[rows], tracks.landmarks[rows])
         tracks.drop_frame(0)
@@ -221,14 +223,19 @@ class Window:
     def _variables(self, rows: Rows) -> Variables:
         return Variables(self._states, self._camera, self.tracks.landmarks[rows])
 
-    def _problem(self, rows: Rows, readings: int | None = None, *, oldest_only: bool = False) -> Problem:
-        still = {k: s for k, s in self._still.items() if k == 0} if oldest_only else self._still
-        return Problem(
-            self._prior,
-            ImuFactors.stack(self._readings[:readings]),
-            still,
-            self._sightings(rows),
-            self._options.first_estimate_jacobians,
+    def _problem(self, rows: Rows) -> Problem:
+        """All factors of the window, with the landmarks of ``rows``."""
+        first_estimates = self._options.first_estimate_jacobians
+        readings = ImuFactors.stack(self._readings)
+        return Problem(self._prior, readings, self._still, self._sightings(rows), first_estimates)
+
+    def _oldest_problem(self, rows: Rows, seen: Bool) -> Problem:
+        """The factors that touch the oldest state; ``seen`` (L, K) is what counts of the sightings of ``rows``."""
+        return replace(
+            self._problem(rows),
+            readings=ImuFactors.stack(self._readings[:1]),
+            still={k: still for k, still in self._still.items() if k == 0},
+            sightings=replace(self._sightings(rows), seen=seen),
         )
 
     def _sightings(self, rows: Rows) -> Sightings:
