@@ -19,7 +19,7 @@ class PoseGraphOptions:
     """Distance, px, within which a point of one keyframe must be seen in the other to support a loop."""
     min_inliers: int = 25
     """Points that must support a loop."""
-    position_drift: float = 0.1
+    position_drift: float = 0.03
     """Drift of the odometry's position, m after 1 m; it grows with the square root of the way."""
     yaw_drift_deg: float = 0.2
     """Drift of the odometry's yaw, deg after 1 s; it grows with the square root of the time."""
