@@ -44,9 +44,7 @@ def benchmark(command: Callable[..., None]) -> click.Command:
     @wraps(command)
     def checked(**arguments: Any) -> None:
         try:
-            # Small matrices: more threads only wait for one another.
-            with threadpool_limits(1):
-                command(**arguments)
+            command(**arguments)
         except VioframeError as error:
             click.echo(f"error: {error}", err=True)
             sys.exit(2)
@@ -74,7 +72,10 @@ def backend_rows(
     config = configuration.override(Config(backend=PartConfig(name=backend)), installed, assignments)
     for about, sequence in sequences:
         estimator = installed.create_backend(backend, sequence.calibration, config.backend.options)
-        yield {**about, **backend_row(sequence, run_backend(sequence, estimator))}
+        # Small matrices: more threads only wait for one another. Set here, when every BLAS has been loaded.
+        with threadpool_limits(1):
+            run = run_backend(sequence, estimator)
+        yield {**about, **backend_row(sequence, run)}
 
 
 def present(
