@@ -41,22 +41,27 @@ def flown_window(
 ) -> tuple[Problem, Variables]:
     """States a quarter of a second apart, landmarks seen by two frames or more, a prior on the first two states.
 
-    The truth, but for biases and time offset, satisfies all but the prior; each of the states hosts some landmarks.
+    They are the true ones, of which pixels and readings are off by noise, and the prior by as much. With ``noise_px`` 0
+    all are exact. Each state but the last hosts some landmarks.
     """
-    rng = np.random.default_rng(seed)
-    sequence = simulated_sequence("figure_eight", seed=seed, duration_s=0.25 * frames + 0.1)
+    rng, exact = np.random.default_rng(seed), noise_px == 0.0
+    duration_s = 0.25 * frames + 0.1
+    noise = None if exact else packaged_calibration("euroc").imu
+    sequence = simulated_sequence("figure_eight", noise, seed=seed, duration_s=duration_s)
     at = 1 + 5 * np.arange(frames)
     states = StateArrays.stack([sequence.true_states[k] for k in at])
     readings = []
     for k in at[:-1]:
         imu = join_segments([imu for imu, _ in sequence.packets[k + 1 : k + 6]])
-        readings.append(
-            preintegrate(imu, 0.002 * rng.normal(size=3), 0.02 * rng.normal(size=3), sequence.calibration.imu)
-        )
+        biases = np.zeros((2, 3)) if exact else rng.normal(size=(2, 3)) * [[0.002], [0.02]]
+        readings.append(preintegrate(imu, *biases, sequence.calibration.imu))
     calibrated = Calibrated(sequence.calibration.R_BC, sequence.calibration.p_BC, offset_s)
     sightings, points = _sightings(states, calibrated, camera, landmarks, noise_px, on_sphere, rng)
     x = Variables(states, calibrated, points)
-    problem = Problem(prior_on(x, 2, rng), ImuFactors.stack(readings), {}, sightings, first_estimates)
+    prior = prior_on(x, 2, rng)
+    if exact:
+        prior = replace(prior, b=np.zeros_like(prior.b))
+    problem = Problem(prior, ImuFactors.stack(readings), {}, sightings, first_estimates)
     return problem, x
 
 
