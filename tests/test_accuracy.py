@@ -32,10 +32,15 @@ def installed() -> registry.Registry:
     return registry.load()
 
 
-def fly(recording: Path, clip: Path, folder: Path, detector: str = "shi_tomasi") -> tuple[Row, TrajectoryErrors]:
+def fly(
+    recording: Path, clip: Path, folder: Path, detector: str = "shi_tomasi", backend: str = "msckf"
+) -> tuple[Row, TrajectoryErrors]:
     """The whole pipeline into ``folder``; the summary and the errors against the clip's ground truth."""
     config = Config(
-        dataset=DatasetConfig(path=recording), detector=PartConfig(name=detector), ground_truth=clip / TRUTH
+        dataset=DatasetConfig(path=recording),
+        detector=PartConfig(name=detector),
+        backend=PartConfig(name=backend),
+        ground_truth=clip / TRUTH,
     )
     record(prepare(config, installed()), folder)
     done = RunFolder.open(folder)
@@ -45,11 +50,10 @@ def fly(recording: Path, clip: Path, folder: Path, detector: str = "shi_tomasi")
     return json.loads((folder / "summary.json").read_text()), evaluate(estimate, truth)
 
 
-def fly_tracks(sequence: TrackSequence) -> Row:
+def fly_tracks(sequence: TrackSequence, backend: str = "msckf") -> Row:
+    estimator = installed().create_backend(backend, sequence.calibration, {})
     with threadpool_limits(1):
-        return backend_row(
-            sequence, run_backend(sequence, installed().create_backend("msckf", sequence.calibration, {}))
-        )
+        return backend_row(sequence, run_backend(sequence, estimator))
 
 
 @pytest.fixture(scope="module")
@@ -63,12 +67,18 @@ def machine_hall(shared_data: Path, tmp_path_factory: pytest.TempPathFactory) ->
 
 
 @pytest.mark.parametrize(
-    ("detector", "limit_m"),
-    [("shi_tomasi", 0.015), ("fast", 0.025), ("orb", 0.025), pytest.param("sift", 0.025, marks=pytest.mark.slow)],
+    ("detector", "backend", "limit_m"),
+    [
+        ("shi_tomasi", "msckf", 0.015),
+        ("fast", "msckf", 0.025),
+        ("orb", "msckf", 0.025),
+        pytest.param("sift", "msckf", 0.025, marks=pytest.mark.slow),
+        ("shi_tomasi", "sliding_window", 0.012),
+    ],
 )
-def test_machine_hall_from_a_bag(machine_hall, tmp_path, detector, limit_m):
+def test_machine_hall_from_a_bag(machine_hall, tmp_path, detector, backend, limit_m):
     clip, bag = machine_hall
-    summary, errors = fly(bag, clip, tmp_path / "run", detector)
+    summary, errors = fly(bag, clip, tmp_path / "run", detector, backend)
     assert summary["finished"]
     assert summary["frames"] == 300
     assert summary["initialised_after_s"] <= 3.0
@@ -80,19 +90,21 @@ def test_machine_hall_from_a_bag(machine_hall, tmp_path, detector, limit_m):
     assert errors.scale == pytest.approx(1.0, abs=0.02)
 
 
-def test_two_runs_on_one_bag_are_the_same_byte_for_byte(machine_hall, tmp_path):
+@pytest.mark.parametrize("backend", ["msckf", "sliding_window"])
+def test_two_runs_on_one_bag_are_the_same_byte_for_byte(machine_hall, tmp_path, backend):
     clip, bag = machine_hall
     for name in ("first", "second"):
-        fly(bag, clip, tmp_path / name)
+        fly(bag, clip, tmp_path / name, backend=backend)
     for file in ("trajectory.tum", "states.csv", "pose_cov.csv", "tracks.csv", "map.ply"):
         first, second = ((tmp_path / name / file).read_bytes() for name in ("first", "second"))
         assert len(first) > 1000
         assert first == second, file
 
 
-def test_vicon_room_at_rest(shared_data, tmp_path):
+@pytest.mark.parametrize("backend", ["msckf", "sliding_window"])
+def test_vicon_room_at_rest(shared_data, tmp_path, backend):
     clip = shared_data / "euroc/V1_01_easy_rest"
-    summary, errors = fly(clip, clip, tmp_path / "run")
+    summary, errors = fly(clip, clip, tmp_path / "run", backend=backend)
     drift_m = np.linalg.norm(errors.estimate.p_WB - errors.estimate.p_WB[0], axis=1).max()
     assert "initialised (static)" in [event["event"] for event in summary["events"]]
     assert summary["completion"] == 1.0
@@ -100,19 +112,30 @@ def test_vicon_room_at_rest(shared_data, tmp_path):
     assert drift_m <= 0.010
 
 
-def test_april_grid_under_strong_motion(shared_data):
-    row = fly_tracks(april_sequence(shared_data / "euroc_imu_april"))
+@pytest.mark.parametrize(("backend", "limit_m"), [("msckf", 0.040), ("sliding_window", 0.030)])
+def test_april_grid_under_strong_motion(shared_data, backend, limit_m):
+    row = fly_tracks(april_sequence(shared_data / "euroc_imu_april"), backend)
     assert row["completion"] == 1.0
     assert row["resets"] == 0
     assert row["initialised_s"] < 3.0
     assert row["path_m"] > 10.0
-    assert row["ate_m"] <= 0.040
+    assert row["ate_m"] <= limit_m
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", REAL_MOTION_SEQUENCES)
 def test_real_motion(shared_data, name):
     _check_real_motion(real_motion_sequence(shared_data / "euroc_imu_gt" / name), least_path_m=55.0)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", REAL_MOTION_SEQUENCES)
+def test_the_sliding_window_is_at_least_as_accurate_as_the_filter(shared_data, name):
+    sequence = real_motion_sequence(shared_data / "euroc_imu_gt" / name)
+    filtered, optimised = (fly_tracks(sequence, backend) for backend in ("msckf", "sliding_window"))
+    assert optimised["completion"] == 1.0
+    assert optimised["resets"] == 0
+    assert optimised["ate_m"] <= 1.1 * filtered["ate_m"]
 
 
 def test_half_a_minute_of_real_motion(shared_data):

@@ -116,6 +116,15 @@ class FrameTracks:
     xy: Float
     xy_normalised: Float
 
+    def only(self, keep: NDArray[np.bool_]) -> FrameTracks:
+        """The features ``keep`` (N,)."""
+        return FrameTracks(self.t_ns, self.ids[keep], self.xy[keep], self.xy_normalised[keep])
+
+    def finite(self) -> FrameTracks:
+        """Without the points that could not be undistorted."""
+        good = np.asarray(np.isfinite(self.xy_normalised).all(axis=1))
+        return self if good.all() else self.only(good)
+
 
 @dataclass(frozen=True, slots=True)
 class NavState:

@@ -7,7 +7,6 @@ first-estimate Jacobians (Li and Mourikis, IJRR 2013) and long-lived landmarks k
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from vioframe.initialization import Starter
@@ -53,6 +52,7 @@ class Msckf:
 
     def process(self, imu: ImuSegment, tracks: FrameTracks) -> Estimate:
         """Initialise, or filter one frame; where the filter fails it says so and starts again from where it was."""
+        tracks = tracks.finite()
         if self._state is None:
             return self._initialise(imu, tracks)
         try:
@@ -75,7 +75,7 @@ class Msckf:
 
         state.propagate(imu, noise_over(imu, self._calibration.imu), options.first_estimate_jacobians)
         state.augment_clone(imu.gyro_B[-1] - state.bias_gyro_B)
-        observations.add_frame(_without(tracks, state.landmark_ids))
+        observations.add_frame(tracks.only(~np.isin(tracks.ids, state.landmark_ids)))
         watch.lap("propagate")
 
         selection = select_tracks(observations, state, options)
@@ -138,8 +138,3 @@ class Msckf:
         blind_s = (state.t_ns - self._seeing_ns) * 1e-9
         if blind_s > self._options.max_blind_s:
             raise DivergedError(f"nothing usable was seen for {blind_s:.1f} s")
-
-
-def _without(tracks: FrameTracks, ids: NDArray[np.int64]) -> FrameTracks:
-    keep = ~np.isin(tracks.ids, ids)
-    return FrameTracks(tracks.t_ns, tracks.ids[keep], tracks.xy[keep], tracks.xy_normalised[keep])

@@ -23,6 +23,8 @@ from vioframe_sliding_window.window import Window
 _MIN_LANDMARKS = 5
 # A body that turns no faster than this, rad/s, does not lose sight of this many tracks from one frame to the next.
 _SLOW_TURN, _MANY_TRACKS = 1.0, 20
+# Part of the landmarks in sight that do not fit, beyond which the estimate is what does not.
+_MOST = 0.8
 
 
 class SlidingWindow:
@@ -62,6 +64,7 @@ class SlidingWindow:
 
     def process(self, imu: ImuSegment, tracks: FrameTracks) -> Estimate:
         """Initialise, or estimate one frame; where that fails it says so and starts again from where it was."""
+        tracks = tracks.finite()
         before, self._before = self._before, tracks
         velocity = _image_velocity(before, tracks)
         if self._window is None:
@@ -98,7 +101,7 @@ class SlidingWindow:
         window.triangulate()
         watch.lap("triangulate")
         window.optimise()
-        window.reject_outliers()
+        _check_agreement(*window.reject_outliers())
         watch.lap("optimise")
         ids, p_WF = window.landmarks()
         newest = window.newest
@@ -167,6 +170,15 @@ def _check_continuity(before: FrameTracks | None, tracks: FrameTracks, imu: ImuS
         return
     if np.linalg.norm(imu.gyro_B, axis=1).max() < _SLOW_TURN:
         raise DivergedError("everything in sight changed at once, though the body hardly turned")
+
+
+def _check_agreement(rejected: int, seen: int) -> None:
+    """Raise :class:`DivergedError` where ``rejected`` of the landmarks ``seen`` are most of many, all at once.
+
+    The landmarks agreed with one another and with the readings until now: not they are wrong, but where the body is.
+    """
+    if seen >= _MANY_TRACKS and rejected > _MOST * seen:
+        raise DivergedError(f"images and readings contradict each other: {rejected} of {seen} landmarks do not fit")
 
 
 def _predict(state: NavState, imu: ImuSegment, calibration: Calibration) -> NavState:

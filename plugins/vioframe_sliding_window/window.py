@@ -168,8 +168,8 @@ class Window:
         self._cov = self._newest_covariance(S)
         return solution.iterations
 
-    def reject_outliers(self) -> None:
-        """Drop tracks that do not fit."""
+    def reject_outliers(self) -> tuple[int, int]:
+        """Drop tracks that do not fit; how many the newest frame saw, and of how many."""
         tracks = self.tracks
         rows = np.flatnonzero(tracks.known)
         x = self._variables(rows)
@@ -177,9 +177,11 @@ class Window:
         camera = x.camera
         errors = self._sightings(rows).errors(poses, camera.R_BC, camera.p_BC, camera.offset_s, x.landmarks)
         bad = (errors * self._options.pixel_sigma > self._options.outlier_px) | (x.landmarks[:, 2] <= 0.0)
+        newest = tracks.seen[rows, -1]
         keep = np.ones(len(tracks.ids), dtype=bool)
         keep[rows[bad]] = False
         tracks.keep(keep)
+        return int((bad & newest).sum()), int(newest.sum())
 
     @property
     def in_sight(self) -> int:
