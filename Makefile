@@ -12,6 +12,7 @@ DEMO := build/demo
 FLIGHT ?= inspection
 FLIGHT_BAG := $(DEMO)/$(FLIGHT).bag
 DETECTORS := shi_tomasi fast orb sift
+RUNS := $(DETECTORS:%=$(DEMO)/%) $(DEMO)/sliding_window
 
 # What Open3D's wheel needs from the system.
 SYSTEM_LIBRARIES := libusb-1.0-0 libgl1 libgomp1 libx11-6 libegl1
@@ -32,15 +33,16 @@ lint: install
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-# Every detector on the same simulated flight; nothing is downloaded.
+# Every detector with the filter, and the optimiser with loop closure, on the same simulated flight; nothing is downloaded.
 demo: install
 	@mkdir -p $(DEMO)
 	$(BIN)/vioframe simulate $(FLIGHT_BAG) --flight $(FLIGHT) --duration 25 --overwrite
 	for detector in $(DETECTORS); do \
 		$(BIN)/vioframe run $(FLIGHT_BAG) --detector $$detector --backend msckf --out $(DEMO)/$$detector --overwrite || exit; \
 	done
-	$(BIN)/vioframe evaluate $(DETECTORS:%=$(DEMO)/%)
-	$(BIN)/vioframe plot $(DETECTORS:%=$(DEMO)/%) --out $(DEMO)/plots
+	$(BIN)/vioframe run $(FLIGHT_BAG) --backend sliding_window --loop-closure pose_graph --out $(DEMO)/sliding_window --overwrite
+	$(BIN)/vioframe evaluate $(RUNS)
+	$(BIN)/vioframe plot $(RUNS) --out $(DEMO)/plots
 	$(BIN)/vioframe view $(DEMO)/$(firstword $(DETECTORS)) --world $(FLIGHT_BAG).simulation/world.ply --save $(DEMO)/plots/view.png
 
 install: $(INSTALLED) system-libraries
