@@ -15,7 +15,8 @@ from vioframe.initialization import Starter
 from vioframe.recovery import DivergedError, check_plausible, noise_over
 from vioframe.standstill import STANDSTILL_GATE, Standstill, StandstillDetector
 from vioframe.stopwatch import Stopwatch
-from vioframe.types import NS_PER_S, Calibration, Estimate, Float, FrameTracks, ImuSegment, NavState, Status
+from vioframe.types import Calibration, Estimate, Float, FrameTracks, ImuSegment, NavState, Status
+from vioframe_sliding_window.image_motion import ImageMotion
 from vioframe_sliding_window.options import SlidingWindowOptions
 from vioframe_sliding_window.window import Window
 
@@ -50,6 +51,7 @@ class SlidingWindow:
         )
         self._standstill = StandstillDetector(self._options.standstill_disparity_px)
         self._window: Window | None = None
+        self._motion = ImageMotion()
         self._before: FrameTracks | None = None
         self._pending: list[ImuSegment] = []
         self._seeing_ns = 0
@@ -66,7 +68,7 @@ class SlidingWindow:
         """Initialise, or estimate one frame; where that fails it says so and starts again from where it was."""
         tracks = tracks.finite()
         before, self._before = self._before, tracks
-        velocity = _image_velocity(before, tracks)
+        velocity = self._motion.of(tracks)
         if self._window is None:
             return self._initialise(imu, tracks, velocity)
         try:
@@ -148,15 +150,6 @@ class SlidingWindow:
         jump = float(np.linalg.norm(newest.p_WB - predicted.p_WB))
         if not jump < self._options.max_jump_m:
             raise DivergedError(f"images moved the position by {jump:.1f} m from where the readings put it")
-
-
-def _image_velocity(before: FrameTracks | None, tracks: FrameTracks) -> Float:
-    """(N, 2) motion of ``tracks`` on the z = 1 plane since the frame ``before``, 1/s; zero for new ones."""
-    velocity = np.zeros((len(tracks.ids), 2))
-    if before is not None and tracks.t_ns > before.t_ns:
-        _, i, j = np.intersect1d(before.ids, tracks.ids, assume_unique=True, return_indices=True)
-        velocity[j] = (tracks.xy_normalised[j] - before.xy_normalised[i]) / (tracks.t_ns - before.t_ns) * NS_PER_S
-    return velocity
 
 
 def _check_continuity(before: FrameTracks | None, tracks: FrameTracks, imu: ImuSegment) -> None:
