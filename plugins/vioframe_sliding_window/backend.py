@@ -16,7 +16,6 @@ from vioframe.recovery import DivergedError, check_plausible, noise_over
 from vioframe.standstill import STANDSTILL_GATE, Standstill, StandstillDetector
 from vioframe.stopwatch import Stopwatch
 from vioframe.types import Calibration, Estimate, Float, FrameTracks, ImuSegment, NavState, Status
-from vioframe_sliding_window.image_motion import ImageMotion
 from vioframe_sliding_window.options import SlidingWindowOptions
 from vioframe_sliding_window.window import Window
 
@@ -51,13 +50,12 @@ class SlidingWindow:
         )
         self._standstill = StandstillDetector(self._options.standstill_disparity_px)
         self._window: Window | None = None
-        self._motion = ImageMotion()
         self._before: FrameTracks | None = None
         self._pending: list[ImuSegment] = []
         self._seeing_ns = 0
         if initial_state is not None:
             nothing = FrameTracks(initial_state.t_ns, np.empty(0, np.int64), *np.empty((2, 0, 2)))
-            self._begin(initial_state, nothing, np.empty((0, 2)))
+            self._begin(initial_state, nothing, np.zeros(3))
 
     @property
     def window(self) -> Window | None:
@@ -68,12 +66,11 @@ class SlidingWindow:
         """Initialise, or estimate one frame; where that fails it says so and starts again from where it was."""
         tracks = tracks.finite()
         before, self._before = self._before, tracks
-        velocity = self._motion.of(tracks)
         if self._window is None:
-            return self._initialise(imu, tracks, velocity)
+            return self._initialise(imu, tracks)
         try:
             _check_continuity(before, tracks, imu)
-            estimate = self._estimate(self._window, imu, tracks, velocity)
+            estimate = self._estimate(self._window, imu, tracks)
             assert estimate.state is not None
             check_plausible(estimate.state)
             self._check_sight(tracks.t_ns)
@@ -83,7 +80,7 @@ class SlidingWindow:
         self._starter.follow(estimate.state)
         return estimate
 
-    def _estimate(self, window: Window, imu: ImuSegment, tracks: FrameTracks, velocity: Float) -> Estimate:
+    def _estimate(self, window: Window, imu: ImuSegment, tracks: FrameTracks) -> Estimate:
         options, watch = self._options, Stopwatch()
         self._pending.append(imu)
         since = join_segments(self._pending)
@@ -98,7 +95,7 @@ class SlidingWindow:
         if still:
             window.hold_still(tracks.t_ns, Standstill.over(since, self._calibration.imu))
         else:
-            window.add_frame(since, tracks, velocity)
+            window.add_frame(since, tracks)
         window.repropagate()
         window.triangulate()
         watch.lap("triangulate")
@@ -127,17 +124,17 @@ class SlidingWindow:
         S = H @ predicted.cov @ H.T + np.diag(still.sigma**2)
         return bool(residual @ np.linalg.solve(S, residual) < STANDSTILL_GATE)
 
-    def _initialise(self, imu: ImuSegment, tracks: FrameTracks, velocity: Float) -> Estimate:
+    def _initialise(self, imu: ImuSegment, tracks: FrameTracks) -> Estimate:
         self._standstill.sees_standstill(tracks)
         estimate = self._starter.begin(imu, tracks)
         if estimate.state is not None:
-            self._begin(estimate.state, tracks, velocity)
+            self._begin(estimate.state, tracks, imu.gyro_B[-1])
         return estimate
 
-    def _begin(self, state: NavState, tracks: FrameTracks, velocity: Float) -> None:
+    def _begin(self, state: NavState, tracks: FrameTracks, gyro_B: Float) -> None:
         calibration, found = self._starter.calibration, self._starter.camera_rotation
         self._calibration = replace(calibration, imu=self._noise)
-        self._window = Window(state, tracks, velocity, self._calibration, self._options, found)
+        self._window = Window(state, tracks, gyro_B, self._calibration, self._options, found)
         self._pending.clear()
         self._seeing_ns = state.t_ns
 

@@ -37,6 +37,24 @@ def in_hosts(states: StateArrays, camera: Calibrated, hosts: Rows, p_WF: Float) 
     return np.column_stack([p_C[:, 0] / z, p_C[:, 1] / z, 1.0 / z]), in_front
 
 
+def image_velocities(states: StateArrays, camera: Calibrated, gyro_B: Float, hosts: Rows, landmarks: Float) -> Float:
+    """(L, K, 2) 1/s: how [x y rho] (L, 3) in the frames ``hosts`` (L,) move on the z = 1 plane of every frame.
+
+    ``gyro_B`` (K, 3) rad/s are the readings at the frames. A fixed point moves by p_C' = -w x p_C - v as seen from a
+    camera that turns by w and flies at v. The difference of two observations would have their noise in it, and as it
+    multiplies a residual with the same noise, would pass for a time offset. Zero for points that are not in front.
+    """
+    R_WC, p_WC = camera_poses(states, camera)
+    p_C = np.einsum("kji,lkj->lki", R_WC, positions(states, camera, hosts, landmarks)[:, None] - p_WC)
+    in_front = p_C[..., 2] > MIN_DEPTH_M
+    z = np.where(in_front, p_C[..., 2], 1.0)[..., None]
+    ray = p_C / z
+    rate_B = gyro_B - states.bias_gyro_B
+    velocity_B = np.einsum("kji,kj->ki", states.R_WB, states.v_WB) + np.cross(rate_B, camera.p_BC)
+    moved = -np.cross(rate_B @ camera.R_BC, ray) - velocity_B @ camera.R_BC / z
+    return np.where(in_front[..., None], moved[..., :2] - ray[..., :2] * moved[..., 2:], 0.0)
+
+
 def camera_poses(states: StateArrays, camera: Calibrated) -> tuple[Float, Float]:
     """R_WC (K, 3, 3) and p_WC (K, 3)."""
     return states.R_WB @ camera.R_BC, states.R_WB @ camera.p_BC + states.p_WB

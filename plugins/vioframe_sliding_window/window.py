@@ -15,7 +15,7 @@ from vioframe.recovery import noise_over
 from vioframe.standstill import Standstill
 from vioframe.types import NS_PER_S, Calibration, Float, FrameTracks, ImuSegment, Int, NavState
 from vioframe_sliding_window.keyframes import parallax
-from vioframe_sliding_window.landmarks import in_hosts, positions, triangulate_tracks
+from vioframe_sliding_window.landmarks import image_velocities, in_hosts, positions, triangulate_tracks
 from vioframe_sliding_window.marginalisation import marginalise_oldest
 from vioframe_sliding_window.options import SlidingWindowOptions
 from vioframe_sliding_window.problem import STATE_SIZE, Calibrated, Prior, Problem, Variables
@@ -33,16 +33,15 @@ _REPROPAGATE_GYRO, _REPROPAGATE_ACCEL = 0.01, 0.1
 class Window:
     """K states, the newest last, and all factors between them.
 
-    It begins with one state, whose covariance is the first prior, and the tracks of its frame. ``velocity`` (N, 2) 1/s
-    is the motion of tracks on the z = 1 plane, here and in :meth:`add_frame`. ``camera_rotation`` is what the hand-eye
-    calibration found, where there was one.
+    It begins with one state, whose covariance is the first prior, the tracks of its frame and the gyroscope's reading
+    there, ``gyro_B`` (3,) rad/s. ``camera_rotation`` is what the hand-eye calibration found, where there was one.
     """
 
     def __init__(
         self,
         state: NavState,
         tracks: FrameTracks,
-        velocity: Float,
+        gyro_B: Float,
         calibration: Calibration,
         options: SlidingWindowOptions,
         camera_rotation: CameraRotation | None = None,
@@ -53,6 +52,7 @@ class Window:
         self._sigma = options.pixel_sigma / self._focal_px
         self._t_ns = [state.t_ns]
         self._states = StateArrays.stack([state])
+        self._gyro_B = gyro_B[None]
         self._camera = Calibrated(calibration.R_BC, calibration.p_BC, 0.0)
         camera_cov = np.diag(_SIGMA_CALIBRATION**2)
         if camera_rotation is not None:
@@ -64,7 +64,7 @@ class Window:
         self._cov = state.cov
         self._camera_model, self._intrinsics = intrinsics_of(calibration.camera)
         self.tracks = TrackTable()
-        self._add_tracks(tracks, velocity)
+        self._add_tracks(tracks)
 
     def __len__(self) -> int:
         return len(self._t_ns)
@@ -82,7 +82,7 @@ class Window:
     def prior(self) -> Prior:
         return self._prior
 
-    def add_frame(self, imu: ImuSegment, tracks: FrameTracks, velocity: Float) -> None:
+    def add_frame(self, imu: ImuSegment, tracks: FrameTracks) -> None:
         """Append the frame that ``imu`` leads to from the newest one, which gives way if it is no keyframe."""
         noise = noise_over(imu, self._noise)
         newest = self.newest
@@ -95,14 +95,15 @@ class Window:
         self._readings.append(preintegrate(imu, base.bias_gyro_B[0], base.bias_accel_B[0], noise))
         self._t_ns.append(predicted.t_ns)
         self._states = self._states.append(StateArrays.stack([predicted]))
+        self._gyro_B = np.concatenate([self._gyro_B, imu.gyro_B[-1:]])
         self._prior = self._prior.with_state(self._states)
-        self._add_tracks(tracks, velocity)
+        self._add_tracks(tracks)
         self._newest_is_keyframe = False
 
-    def _add_tracks(self, tracks: FrameTracks, velocity: Float) -> None:
+    def _add_tracks(self, tracks: FrameTracks) -> None:
         on_sphere = self._options.residual == "sphere"
         to_px = pixels_by_residual(self._camera_model, self._intrinsics, tracks.xy_normalised, on_sphere)
-        self.tracks.add_frame(tracks, velocity, to_px)
+        self.tracks.add_frame(tracks, to_px)
 
     @property
     def is_full(self) -> bool:
@@ -133,7 +134,7 @@ class Window:
         self.tracks.drop_frame(len(self) - 1)
         self._t_ns.pop()
         self._readings.pop()
-        self._states = self._states[:-1]
+        self._states, self._gyro_B = self._states[:-1], self._gyro_B[:-1]
         self._prior = self._prior.without_newest()
 
     def triangulate(self) -> None:
@@ -210,7 +211,7 @@ class Window:
         tracks.drop_frame(0)
         self._t_ns.pop(0)
         self._readings.pop(0)
-        self._states = self._states[1:]
+        self._states, self._gyro_B = self._states[1:], self._gyro_B[1:]
         self._still = {k - 1: still for k, still in self._still.items() if k > 0}
         self._host_again(ids, p_WF)
 
@@ -242,10 +243,13 @@ class Window:
 
     def _sightings(self, rows: Rows) -> Sightings:
         options, tracks = self._options, self.tracks
+        velocity = image_velocities(
+            self._states, self._camera, self._gyro_B, tracks.hosts[rows], tracks.landmarks[rows]
+        )
         return Sightings(
             tracks.seen[rows],
             tracks.xy[rows],
-            tracks.velocity[rows],
+            velocity,
             tracks.to_px[rows],
             options.pixel_sigma,
             options.cauchy_sigmas,
