@@ -157,8 +157,12 @@ def test_holding_still_is_the_kalman_update_with_numeric_jacobians():
     P[DBG, DBG] += np.eye(3) * NOISE.gyro_walk**2 * imu.duration_s
     P[DBA, DBA] += np.eye(3) * NOISE.accel_walk**2 * imu.duration_s
     assert hold_still(state, imu, NOISE, first_estimates=False)
-    # The noise of the sensors ten times over, for a body that stands but shakes, and a velocity of 1 cm/s.
-    sigma = np.repeat([10 * NOISE.gyro_density / np.sqrt(0.05), 10 * NOISE.accel_density / np.sqrt(0.05), 0.01], 3)
+    # The noise of the sensors ten times over, for a body that stands but shakes; that of the mean of a bias that walks
+    # meanwhile; and a velocity of 1 cm/s.
+    T = imu.duration_s
+    gyro = np.hypot(10 * NOISE.gyro_density / np.sqrt(T), NOISE.gyro_walk * np.sqrt(T / 3))
+    accel = np.hypot(10 * NOISE.accel_density / np.sqrt(T), NOISE.accel_walk * np.sqrt(T / 3))
+    sigma = np.repeat([gyro, accel, 0.01], 3)
     K = P @ H.T @ np.linalg.inv(H @ P @ H.T + np.diag(sigma**2))
     dx = K @ residual
     np.testing.assert_allclose(state.cov, P - K @ H @ P, atol=1e-9 * np.abs(P).max())
