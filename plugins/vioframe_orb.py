@@ -1,12 +1,11 @@
 """Detector ``orb``: FAST over a scale pyramid, ranked by Harris' measure (Rublee et al., ICCV 2011)."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Annotated
-
-import numpy as np
 
 from vioframe.hookspecs import hookimpl
 from vioframe.interfaces import DetectorFactory
+from vioframe.opencv_keypoints import detect
 from vioframe.types import Image, Keypoints
 
 
@@ -28,15 +27,8 @@ class Orb:
 
     def detect(self, image: Image, max_points: int) -> Keypoints:
         """At most ``max_points`` corners of ``image``, strongest first."""
-        import cv2
-
         self._orb.setMaxFeatures(max_points)
-        found: Sequence[cv2.KeyPoint] = sorted(self._orb.detect(image), key=lambda k: -k.response)[:max_points]
-        descriptors = None
-        if self._descriptors:
-            found, descriptors = self._orb.compute(image, found)  # drops what it cannot describe
-        xy = np.reshape(cv2.KeyPoint.convert(found), (-1, 2)).astype(np.float32)
-        return Keypoints(xy, np.array([k.response for k in found], np.float32), descriptors)
+        return detect(self._orb, image, max_points, descriptors=self._descriptors)
 
 
 @hookimpl

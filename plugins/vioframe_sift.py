@@ -1,12 +1,11 @@
 """Detector ``sift``: extrema of the difference of Gaussians (Lowe, IJCV 2004)."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Annotated
-
-import numpy as np
 
 from vioframe.hookspecs import hookimpl
 from vioframe.interfaces import DetectorFactory
+from vioframe.opencv_keypoints import detect
 from vioframe.types import Image, Keypoints
 
 
@@ -30,19 +29,7 @@ class Sift:
 
     def detect(self, image: Image, max_points: int) -> Keypoints:
         """At most ``max_points`` blobs of ``image``, strongest first."""
-        import cv2
-
-        ordered = sorted(self._sift.detect(image), key=lambda k: -k.response)
-        # A blob with several orientations comes once for each; the strongest stays.
-        distinct: dict[tuple[float, float], cv2.KeyPoint] = {}
-        for keypoint in ordered:
-            distinct.setdefault((keypoint.pt[0], keypoint.pt[1]), keypoint)
-        found: Sequence[cv2.KeyPoint] = list(distinct.values())[:max_points]
-        descriptors = None
-        if self._descriptors:
-            found, descriptors = self._sift.compute(image, found)  # drops what it cannot describe
-        xy = np.reshape(cv2.KeyPoint.convert(found), (-1, 2)).astype(np.float32)
-        return Keypoints(xy, np.array([k.response for k in found], np.float32), descriptors)
+        return detect(self._sift, image, max_points, descriptors=self._descriptors)
 
 
 @hookimpl

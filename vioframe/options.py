@@ -78,7 +78,8 @@ def validate_options(
     for name, option in table.items():
         if name not in values:
             if option.default is REQUIRED:
-                raise ConfigError(f"{owner} needs the option {name!r}: pass -o {name}=...; {shown}")
+                meaning = f" ({option.doc})" if option.doc else ""
+                raise ConfigError(f"{owner} needs the option {name!r}{meaning}: pass -o {name}=...; {shown}")
             complete[name] = option.default
             continue
         try:

@@ -1,0 +1,36 @@
+"""Detector ``akaze``: blobs in a scale space that keeps edges sharp (Alcantarilla, Nuevo and Bartoli, BMVC 2013)."""
+
+from collections.abc import Mapping
+from typing import Annotated
+
+from pydantic import NonNegativeFloat, PositiveInt
+
+from vioframe.hookspecs import hookimpl
+from vioframe.interfaces import DetectorFactory
+from vioframe.opencv_keypoints import detect
+from vioframe.types import Image, Keypoints
+
+
+class Akaze:
+    """Sub-pixel maxima of the determinant of the Hessian over a non-linear scale space."""
+
+    def __init__(
+        self,
+        *,
+        threshold: Annotated[NonNegativeFloat, "weakest determinant kept; lower finds more"] = 0.001,
+        octaves: Annotated[PositiveInt, "how often the resolution is halved, plus one"] = 4,
+        descriptors: Annotated[bool, "also compute the 61-byte descriptors, which tracking does not use"] = False,
+    ) -> None:
+        import cv2
+
+        self._akaze = cv2.AKAZE.create(threshold=threshold, nOctaves=octaves)
+        self._descriptors = descriptors
+
+    def detect(self, image: Image, max_points: int) -> Keypoints:
+        """At most ``max_points`` blobs of ``image``, strongest first."""
+        return detect(self._akaze, image, max_points, descriptors=self._descriptors)
+
+
+@hookimpl
+def vioframe_detectors() -> Mapping[str, DetectorFactory]:
+    return {"akaze": Akaze}

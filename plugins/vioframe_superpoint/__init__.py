@@ -1,0 +1,46 @@
+"""Detector ``superpoint``: a network trained on its own detections (DeTone, Malisiewicz and Rabinovich, CVPRW 2018)."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import NonNegativeInt
+
+from vioframe.errors import PluginError
+from vioframe.hookspecs import hookimpl
+from vioframe.interfaces import Detector, DetectorFactory
+
+
+def superpoint(
+    *,
+    weights: Annotated[
+        Path, "superpoint_v1.pth; github.com/magicleap/SuperPointPretrainedNetwork has it, under its own licence"
+    ],
+    threshold: Annotated[float, "smallest probability of a keypoint kept; lower finds more"] = 0.015,
+    nms_radius_px: Annotated[NonNegativeInt, "no two keypoints are this near or nearer, in both x and y"] = 4,
+    border_px: Annotated[NonNegativeInt, "width of the border without keypoints"] = 4,
+    device: Annotated[Literal["auto", "cpu", "cuda"], "auto: a GPU where there is one"] = "auto",
+    descriptors: Annotated[bool, "also compute the 256-vectors, which tracking does not use"] = False,
+) -> Detector:
+    """Whole-pixel keypoints by the SuperPoint network, whose weights its authors' licence forbids to pass on."""
+    try:
+        from vioframe_superpoint.detector import SuperPoint
+    except ModuleNotFoundError as error:
+        if error.name != "torch":
+            raise
+        raise PluginError(
+            "detector 'superpoint' needs PyTorch, which is not installed: pip install 'vioframe[superpoint]'"
+        ) from error
+    return SuperPoint(
+        weights,
+        threshold=threshold,
+        nms_radius_px=nms_radius_px,
+        border_px=border_px,
+        device=device,
+        descriptors=descriptors,
+    )
+
+
+@hookimpl
+def vioframe_detectors() -> Mapping[str, DetectorFactory]:
+    return {"superpoint": superpoint}
