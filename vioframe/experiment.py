@@ -82,13 +82,21 @@ class Experiment:
         except VioframeError:
             raise
         except (Exception, SystemExit) as error:
-            if isinstance(error.__cause__, KeyboardInterrupt):
-                # Ctrl-C within compiled code comes out as a SystemError.
+            if _is_interrupt(error):
                 raise KeyboardInterrupt from error
             source = self.registry.blame(error.__traceback__)
             if source is None:
                 raise
             raise PluginError(f"plug-in {source.entry_point!r} ({source}) failed: {describe(error)}") from error
+
+
+def _is_interrupt(error: BaseException | None) -> bool:
+    """Whether Ctrl-C is what began it: within compiled code it comes out as a SystemError, or as one behind another."""
+    while error is not None:
+        if isinstance(error, KeyboardInterrupt):
+            return True
+        error = error.__cause__ or error.__context__
+    return False
 
 
 def _closing_loops(steps: Iterable[Step], loop_closer: LoopCloser) -> Iterator[Step]:

@@ -14,6 +14,7 @@ from vioframe.interfaces import (
     DetectorFactory,
     FlightFactory,
     LoopCloserFactory,
+    TrainerFactory,
     WorldFactory,
 )
 
@@ -56,4 +57,12 @@ def vioframe_worlds() -> Mapping[str, WorldFactory]:  # type: ignore[empty-body]
     """Map names to factories: ``factory(p_WB, rng, **options) -> World``.
 
     ``p_WB`` (N, 3) m is the path that the world must leave free, ``rng`` a numpy Generator.
+    """
+
+
+@hookspec
+def vioframe_trainers() -> Mapping[str, TrainerFactory]:  # type: ignore[empty-body]
+    """Map names to factories: ``factory(job, **options) -> Trainer``, behind ``vioframe train NAME``.
+
+    ``job`` is a :class:`vioframe.types.TrainingJob`.
     """

@@ -17,6 +17,7 @@ from vioframe.types import (
     LoopClosure,
     Measurement,
     Step,
+    TrainingStep,
 )
 
 if TYPE_CHECKING:
@@ -129,8 +130,18 @@ class World(Protocol):
         ...
 
 
+@runtime_checkable
+class Trainer(Protocol):
+    """Trains what a learned part needs."""
+
+    def train(self) -> Iterator[TrainingStep]:
+        """Train to the end, step by step; what is done when it is stopped can be gone on with."""
+        ...
+
+
 DetectorFactory = Callable[..., Detector]
 BackendFactory = Callable[..., Backend]
 LoopCloserFactory = Callable[..., LoopCloser]
 FlightFactory = Callable[..., Flight]
 WorldFactory = Callable[..., World]
+TrainerFactory = Callable[..., Trainer]

@@ -21,7 +21,7 @@ import pluggy
 
 from vioframe import hookspecs
 from vioframe.errors import DatasetError, PluginError, VioframeError
-from vioframe.interfaces import Backend, Dataset, Detector, Flight, LoopCloser, World
+from vioframe.interfaces import Backend, Dataset, Detector, Flight, LoopCloser, Trainer, World
 from vioframe.options import Option, did_you_mean, options_of, plugin_factory, validate_options
 from vioframe.types import Calibration, Float
 
@@ -48,7 +48,8 @@ LOOP_CLOSER = Kind("loop closer", "vioframe_loop_closers", LoopCloser, 1)
 DATASET = Kind("dataset", "vioframe_datasets", Dataset, 1)
 FLIGHT = Kind("flight", "vioframe_flights", Flight, 2)
 WORLD = Kind("world", "vioframe_worlds", World, 2)
-KINDS = (DETECTOR, BACKEND, LOOP_CLOSER, DATASET, FLIGHT, WORLD)
+TRAINER = Kind("trainer", "vioframe_trainers", Trainer, 1)
+KINDS = (DETECTOR, BACKEND, LOOP_CLOSER, DATASET, FLIGHT, WORLD, TRAINER)
 
 
 @dataclass(frozen=True, slots=True)

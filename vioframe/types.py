@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -244,3 +245,30 @@ class Calibration:
     p_BC: Float
     imu: ImuNoise
     time_offset_ns: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class TrainingJob:
+    """What to train on and where the result goes."""
+
+    images: tuple[Path, ...]
+    """Folders of photographs, and recordings."""
+    out: Path
+    """Folder for checkpoint, log and weights."""
+    hold_out: tuple[str, ...] = ()
+    """Images whose name contains one of these, or matches it as a pattern, serve validation only."""
+    start_from: Path | None = None
+    """Weights to fine-tune."""
+    resume: bool = False
+    """Go on with the training in ``out``."""
+
+
+@dataclass(frozen=True, slots=True)
+class TrainingStep:
+    """One step of a training: ``done`` of ``total``."""
+
+    done: int
+    total: int
+    losses: Mapping[str, float]
+    epoch: Mapping[str, float] | None = None
+    """With the last step of an epoch: its means, and the validation on what is held out."""

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import errno
 import logging
-from importlib import import_module
 
 import click
 
 import vioframe
+from vioframe.cli.lazy import LazyGroup
 from vioframe.errors import VioframeError
 
 _COMMANDS = {
@@ -20,6 +20,8 @@ _COMMANDS = {
     "config": "Print a complete configuration, or check a file.",
     "simulate": "Render a flight and write it as a recording with exact truth.",
     "montecarlo": "Fly many simulated flights: accuracy and consistency of back-ends.",
+    "bench": "Compare parts with one another: detectors by speed, quality, tracks.",
+    "train": "Train what a learned part needs, such as keypointnet.",
     "convert": "Convert a recording: ASL folder, ROS 1 bag, ROS 2 bag, MCAP.",
 }
 """Sub-commands and their short help, kept here so that ``vioframe --help`` needs none of their modules."""
@@ -28,21 +30,8 @@ EXIT_BAD_INPUT = 2
 EXIT_INTERRUPTED = 130
 
 
-class _LazyGroup(click.Group):
-    """Finds a sub-command's module by its name, and turns errors into one line and an exit code."""
-
-    def list_commands(self, ctx: click.Context) -> list[str]:
-        return list(_COMMANDS)
-
-    def get_command(self, ctx: click.Context, name: str) -> click.Command | None:
-        if name not in _COMMANDS:
-            return None
-        command: click.Command = import_module(f"vioframe.cli.{name}").command
-        return command
-
-    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        with formatter.section("Commands"):
-            formatter.write_dl(list(_COMMANDS.items()))
+class _Main(LazyGroup):
+    """Turns errors into one line and an exit code."""
 
     def invoke(self, ctx: click.Context) -> object:
         try:
@@ -77,7 +66,9 @@ class _EchoHandler(logging.Handler):
         click.echo(f"vioframe: {record.levelname.lower()}: {self.format(record)}", err=True)
 
 
-@click.group(cls=_LazyGroup, context_settings={"help_option_names": ["-h", "--help"]})
+@click.group(
+    cls=_Main, modules="vioframe.cli.{}", summaries=_COMMANDS, context_settings={"help_option_names": ["-h", "--help"]}
+)
 @click.version_option(vioframe.__version__, prog_name="vioframe")
 @click.option("--debug", is_flag=True, envvar="VIOFRAME_DEBUG", help="Show the traceback of an error.")
 def main(debug: bool) -> None:

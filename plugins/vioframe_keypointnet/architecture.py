@@ -1,0 +1,80 @@
+"""What a KeypointNet is made of; numpy and torch are needed by neither reader nor writer of this."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass
+
+from vioframe.errors import ConfigError
+
+CELL_PX = 8
+"""Side of the cells of which each gives one candidate keypoint."""
+
+
+@dataclass(frozen=True, slots=True)
+class Architecture:
+    """Channels of every layer; the published network by default (Tang et al., ICLR 2020).
+
+    ``blocks`` are the encoder's four, at 1, 1/2, 1/4 and 1/8 of the resolution, each a tuple of the channels that its
+    3 x 3 convolutions give. An empty first block folds 2 x 2 pixels into channels instead, which loses nothing and
+    saves the costliest layers. ``image_channels`` is 3 (RGB) or 1 (grey).
+    """
+
+    name: str = "full"
+    image_channels: int = 3
+    blocks: tuple[tuple[int, ...], ...] = ((32, 32), (64, 64), (128, 128), (256, 256))
+    head: int = 256
+    descriptor: int = 256
+
+    def __post_init__(self) -> None:
+        channels = (*(c for block in self.blocks for c in block), self.head, self.descriptor)
+        if len(self.blocks) != 4 or not all(self.blocks[1:]) or min(channels) < 1 or self.image_channels not in (1, 3):
+            raise ConfigError(f"no KeypointNet can be built of {self}: four blocks of channels, the first may be empty")
+
+    def widened(self, factor: float) -> Architecture:
+        """With ``factor`` times the channels in every layer."""
+        if not factor > 0.0:
+            raise ConfigError(f"the width of a network must be more than zero, got {factor}")
+
+        def times(channels: int) -> int:
+            return max(1, round(factor * channels))
+
+        blocks = tuple(tuple(map(times, block)) for block in self.blocks)
+        return Architecture(
+            f"{self.name}-x{factor:g}", self.image_channels, blocks, times(self.head), times(self.descriptor)
+        )
+
+    @property
+    def folds_pixels(self) -> bool:
+        """Whether 2 x 2 pixels become channels of one."""
+        return not self.blocks[0]
+
+    @property
+    def encoder(self) -> tuple[tuple[str, int, int], ...]:
+        """Name, channels in and channels out of the encoder's convolutions, in order: ``("1a", 3, 32)`` ..."""
+        layers, before = [], self.image_channels * (4 if self.folds_pixels else 1)
+        for number, block in enumerate(self.blocks, start=1):
+            for letter, after in zip("abcdefgh", block, strict=False):
+                layers.append((f"{number}{letter}", before, after))
+                before = after
+        return tuple(layers)
+
+    @property
+    def pooled(self) -> frozenset[str]:
+        """Names of the convolutions after which the resolution is halved."""
+        return frozenset(f"{n}{'abcdefgh'[len(block) - 1]}" for n, block in enumerate(self.blocks[:3], 1) if block)
+
+    def to_json(self) -> str:
+        return json.dumps(asdict(self))
+
+    @staticmethod
+    def from_json(text: str) -> Architecture:
+        """Raises ValueError, TypeError or KeyError where ``text`` is not what :meth:`to_json` wrote."""
+        values = json.loads(text)
+        blocks = tuple(tuple(map(int, block)) for block in values.pop("blocks"))
+        return Architecture(blocks=blocks, **values)
+
+
+FULL = Architecture()
+COMPACT = Architecture("compact", 1, ((), (16,), (32, 32), (64, 64)), 64, 64)
+ARCHITECTURES = {architecture.name: architecture for architecture in (FULL, COMPACT)}

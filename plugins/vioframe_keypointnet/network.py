@@ -1,0 +1,133 @@
+"""The network in torch, as it is trained: detector, descriptor and, for training only, the outlier classifier IO-Net.
+
+Layer names are those of the published checkpoints, so that these load as they are.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+from torch.nn.functional import grid_sample, normalize
+
+from vioframe_keypointnet.architecture import CELL_PX, FULL, Architecture
+
+_CROSS_RATIO = 2.0
+"""How far a keypoint may lie from its cell's centre, in half cells: neighbouring cells reach into each other."""
+
+
+@dataclass(frozen=True, slots=True)
+class Detection:
+    """What the network sees in (B, C, H, W) images: one candidate a cell of a grid of h x w = H/8 x W/8."""
+
+    score: Tensor
+    """(B, h, w) in [0, 1]; 0 in the outermost ring of cells, which sees less than it should."""
+    xy: Tensor
+    """(B, 2, h, w) px."""
+    descriptors: Tensor
+    """(B, D, H/4, W/4), not yet normalised; :func:`describe` samples them."""
+
+
+class KeypointNet(nn.Module):
+    """Score, place and descriptor of one keypoint a cell of 8 x 8 pixels (Tang et al., ICLR 2020, section 3).
+
+    ``dropout`` is that of whole channels after the second convolution of each block and in each head.
+    """
+
+    def __init__(self, architecture: Architecture = FULL, dropout: float = 0.2) -> None:
+        super().__init__()
+        self.architecture = architecture
+        for name, before, after in architecture.encoder:
+            self.add_module(f"conv{name}", _conv_bn(before, after))
+        deepest, skip = architecture.blocks[3][-1], architecture.blocks[2][-1]
+        head, quarter = architecture.head, architecture.blocks[2][-1]
+        self.convDa, self.convDb = _conv_bn(deepest, head), nn.Conv2d(head, 1, 3, padding=1)
+        self.convPa, self.convPb = _conv_bn(deepest, head), nn.Conv2d(head, 2, 3, padding=1)
+        self.convFa, self.convFb = _conv_bn(deepest, head), _conv_bn(head, 4 * quarter)
+        self.convFaa = _conv_bn(quarter + skip, head)
+        self.convFbb = nn.Conv2d(head, architecture.descriptor, 3, padding=1)
+        self.fold, self.unfold = nn.PixelUnshuffle(2), nn.PixelShuffle(2)
+        self.act, self.pool = nn.LeakyReLU(inplace=True), nn.MaxPool2d(2)
+        self.dropout = nn.Dropout2d(dropout)
+
+    def forward(self, images: Tensor) -> Detection:
+        """``images`` (B, C, H, W) in [0, 1], H and W multiples of 8."""
+        x = (images - 0.5) * 0.225
+        if self.architecture.folds_pixels:
+            x = self.fold(x)
+        for name, *_ in self.architecture.encoder:
+            x = self.act(self.get_submodule(f"conv{name}")(x))
+            if name.endswith("b"):
+                x = self.dropout(x)
+            if name[0] == "3":
+                skip = x
+            if name in self.architecture.pooled:
+                x = self.pool(x)
+        # Pixels of a large image do not fit into half precision.
+        score = torch.sigmoid(self.convDb(self.dropout(self.act(self.convDa(x)))).float())[:, 0]
+        place = torch.tanh(self.convPb(self.dropout(self.act(self.convPa(x)))).float())
+        x = self.convFb(self.dropout(self.act(self.convFa(x))))
+        x = self.act(self.convFaa(torch.cat([self.unfold(x), skip], dim=1)))
+        return Detection(_without_ring(score), keypoint_places(place), self.convFbb(x))
+
+
+def keypoint_places(place: Tensor) -> Tensor:
+    """(B, 2, h, w) px from the location head's (B, 2, h, w) in [-1, 1], within the image."""
+    h, w = place.shape[-2:]
+    rows, columns = torch.meshgrid(torch.arange(h), torch.arange(w), indexing="ij")
+    centre = torch.stack([columns, rows]).to(place) * CELL_PX + (CELL_PX - 1) / 2
+    limit = place.new_tensor([w * CELL_PX - 1.0, h * CELL_PX - 1.0])[:, None, None]
+    return torch.minimum((centre + _CROSS_RATIO * (CELL_PX - 1) / 2 * place).clamp(min=0.0), limit)
+
+
+def describe(descriptors: Tensor, xy: Tensor) -> Tensor:
+    """(B, N, D) unit descriptors at ``xy`` (B, N, 2) px of the image that ``descriptors`` (B, D, H/4, W/4) are of."""
+    h, w = descriptors.shape[-2:]
+    size = xy.new_tensor([4.0 * w - 1.0, 4.0 * h - 1.0])
+    sampled = grid_sample(descriptors, (2.0 * xy / size - 1.0)[:, :, None], align_corners=True)[..., 0]
+    return normalize(sampled, dim=1).transpose(1, 2)
+
+
+class InlierOutlierNet(nn.Module):
+    """Tells from matched points alone which matches are right: (B, 5, N) to (B, N), positive for an inlier.
+
+    The five are the place in either image, scaled to [-1, 1], and the distance of the descriptors (section 3.3; after
+    Brachmann and Rother, ICCV 2019).
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.first = nn.Sequential(nn.Conv1d(5, 128, 1, bias=False), nn.BatchNorm1d(128), nn.ReLU(inplace=True))
+        self.blocks = nn.ModuleList(_residual(128) for _ in range(4))
+        self.last = nn.Conv1d(128, 1, 1)
+
+    def forward(self, matches: Tensor) -> Tensor:
+        x = self.first(matches)
+        for block in self.blocks:
+            x = x + block(x)
+        out: Tensor = self.last(x)[:, 0]
+        return out
+
+
+def _conv_bn(before: int, after: int) -> nn.Sequential:
+    return nn.Sequential(nn.Conv2d(before, after, 3, padding=1, bias=False), nn.BatchNorm2d(after))
+
+
+def _residual(channels: int) -> nn.Sequential:
+    layers: list[nn.Module] = []
+    for _ in range(2):
+        layers += [
+            nn.Conv1d(channels, channels, 1),
+            nn.InstanceNorm1d(channels),
+            nn.BatchNorm1d(channels),
+            nn.ReLU(inplace=True),
+        ]
+    return nn.Sequential(*layers)
+
+
+def _without_ring(score: Tensor) -> Tensor:
+    """``score`` (B, h, w) with 0 in its outermost ring."""
+    inner = torch.zeros_like(score)
+    inner[:, 1:-1, 1:-1] = 1.0
+    return score * inner

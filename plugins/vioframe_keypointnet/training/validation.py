@@ -1,0 +1,80 @@
+"""How repeatable the points of a network are on images it has not seen."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from vioframe.types import Float
+from vioframe_keypointnet.network import KeypointNet
+from vioframe_keypointnet.training.homography import HomographyRange, random_homography, transfer
+from vioframe_keypointnet.training.images import Picture
+
+_SIZE = (320, 240)
+_TOP = 300
+_NEAR_PX = 3.0
+_NMS_PX = 4.0
+
+
+@dataclass(frozen=True, slots=True)
+class Validation:
+    """Means over the held-out images."""
+
+    repeatability: float
+    """Share of the 300 strongest points of one view that have one of the other's within 3 px, either way."""
+    localisation_px: float
+    """Mean distance of those."""
+
+
+def validate(network: KeypointNet, pictures: Sequence[Picture], seed: int) -> Validation:
+    """Under one synthetic homography an image, at 320 x 240; the network is left in its training mode."""
+    import cv2
+
+    was_training = network.training
+    network.eval()
+    found = []
+    for k, picture in enumerate(pictures):
+        image = cv2.resize(picture.pixels, _SIZE, interpolation=cv2.INTER_AREA)
+        H = random_homography(np.random.default_rng([seed, 2, k]), _SIZE, HomographyRange(rotation_deg=30.0))
+        target = cv2.warpPerspective(image, H, _SIZE, flags=cv2.INTER_LINEAR)
+        found.append(_repeatability(_strongest(network, image), _strongest(network, target), H))
+    network.train(was_training)
+    return Validation(*(float(np.nanmean(column)) for column in zip(*found, strict=True)))
+
+
+def _strongest(network: KeypointNet, image: NDArray[np.uint8]) -> Float:
+    """(N, 2) px after suppression of near neighbours, strongest first."""
+    device = next(network.parameters()).device
+    pixels = torch.from_numpy(np.atleast_3d(image)).to(device).permute(2, 0, 1)[None].float() / 255.0
+    with torch.no_grad():
+        seen = network(pixels)
+    order = seen.score.flatten().argsort(descending=True)[: 4 * _TOP]
+    xy: Float = seen.xy[0].flatten(1).T[order].cpu().double().numpy()
+    taken = np.ones(len(xy), bool)
+    near = np.linalg.norm(xy[:, None] - xy, axis=-1) < _NMS_PX
+    for k in range(len(xy)):
+        taken[k] = not (near[k, :k] & taken[:k]).any()
+    return xy[taken]
+
+
+def _repeatability(a: Float, b: Float, H: Float) -> tuple[float, float]:
+    """Of the strongest points that both views could see: the share found in both, and their mean distance, px."""
+    a = _seen(a, H)[:_TOP]
+    b = _seen(b, np.linalg.inv(H))[:_TOP]
+    if not len(a) or not len(b):
+        return 0.0, float("nan")
+    distance = np.linalg.norm(transfer(H, a)[:, None] - b, axis=-1)
+    nearest = np.concatenate([distance.min(axis=0), distance.min(axis=1)])
+    matched = nearest[nearest <= _NEAR_PX]
+    return len(matched) / len(nearest), float(matched.mean()) if len(matched) else float("nan")
+
+
+def _seen(xy: Float, H: Float) -> Float:
+    moved = transfer(H, xy)
+    with np.errstate(invalid="ignore"):
+        inside = ((moved >= 0.0) & (moved <= np.array(_SIZE) - 1.0)).all(axis=1)
+    return xy[inside]
