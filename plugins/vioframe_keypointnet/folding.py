@@ -1,0 +1,145 @@
+"""The network as it is run: batch norm folded into the convolutions, grey images in, nothing that is not needed.
+
+One description, three libraries: :meth:`FoldedNetwork.build` walks the layers and lets an :class:`Operations` make of
+each what its library calls it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vioframe_keypointnet.architecture import Architecture
+from vioframe_keypointnet.tensors import HEADS, OUT, Tensors
+from vioframe_keypointnet.weights import Weights
+
+LEAK = 0.01
+"""Slope of LeakyReLU below zero."""
+
+NEUTRAL_GREY = 127.5
+"""The grey that the network sees as 0; also what lies around the image."""
+
+_SCALE = 0.225 / 255.0
+_BATCH_NORM_EPSILON = 1e-5
+
+NodeT = TypeVar("NodeT")
+
+
+@dataclass(frozen=True, slots=True)
+class Convolution:
+    """A convolution padded with zeros so that the size is kept (halved by stride 2), then LeakyReLU if activated."""
+
+    name: str
+    weight: NDArray[np.float32]
+    """(out, in, k, k)."""
+    bias: NDArray[np.float32]
+    """(out,)."""
+    activated: bool = True
+    stride: int = 1
+
+    @property
+    def pad(self) -> int:
+        return (int(self.weight.shape[2]) - self.stride) // 2
+
+
+class Operations(Protocol[NodeT]):
+    """What a library must offer; a node is a tensor, or its name in a graph."""
+
+    def convolve(self, layer: Convolution, x: NodeT) -> NodeT: ...
+
+    def pool(self, x: NodeT) -> NodeT:
+        """The maximum of each 2 x 2."""
+
+    def shuffle(self, x: NodeT) -> NodeT:
+        """Four channels become 2 x 2 pixels, as torch.nn.PixelShuffle(2) does."""
+
+    def join(self, a: NodeT, b: NodeT) -> NodeT:
+        """The channels of ``a``, then those of ``b``."""
+
+
+@dataclass(frozen=True, slots=True)
+class FoldedNetwork:
+    """Layers of the detector, from grey images less :data:`NEUTRAL_GREY`, and those of the descriptors if wanted."""
+
+    architecture: Architecture
+    encoder: tuple[Convolution, ...]
+    heads: tuple[Convolution, Convolution]
+    description: tuple[Convolution, ...] = ()
+    """Fa, Fb, Faa, Fbb, or nothing."""
+
+    def build(self, operations: Operations[NodeT], image: NodeT) -> tuple[NodeT, ...]:
+        """(B, 1, H, W) -> (B, 3, H/8, W/8), before sigmoid and tanh: score, x, y; then (B, D, H/4, W/4) if described.
+
+        The descriptors are not normalised yet.
+        """
+        x = skip = image
+        for layer in self.encoder:
+            x = operations.convolve(layer, x)
+            if layer.name.startswith("3"):
+                skip = x
+            if layer.name in self.architecture.pooled:
+                x = operations.pool(x)
+        hidden, out = self.heads
+        found = operations.convolve(out, operations.convolve(hidden, x))
+        if not self.description:
+            return (found,)
+        first, second, third, fourth = self.description
+        x = operations.shuffle(operations.convolve(second, operations.convolve(first, x)))
+        return found, operations.convolve(fourth, operations.convolve(third, operations.join(x, skip)))
+
+
+def fold(weights: Weights, descriptors: bool = False) -> FoldedNetwork:
+    """The network of ``weights`` for grey images, which equals the trained one on R = G = B exactly."""
+    architecture, tensors = weights.architecture, weights.tensors
+    encoder = [_normalised(tensors, name) for name, *_ in architecture.encoder]
+    encoder[0] = _on_grey_levels(encoder[0], architecture)
+    hidden = _stacked(HEADS, [_normalised(tensors, "Da"), _normalised(tensors, "Pa")])
+    description: tuple[Convolution, ...] = ()
+    if descriptors:
+        first, second, third = (_normalised(tensors, name, name != "Fb") for name in ("Fa", "Fb", "Faa"))
+        last = Convolution("Fbb", tensors["convFbb.weight"], tensors["convFbb.bias"], activated=False)
+        description = (first, second, third, last)
+    return FoldedNetwork(architecture, tuple(encoder), (hidden, _joint_output(tensors)), description)
+
+
+def _normalised(tensors: Tensors, name: str, activated: bool = True) -> Convolution:
+    """Convolution ``name`` and the batch norm behind it, in one."""
+    gamma, beta, mean, variance = (
+        tensors[f"conv{name}.1.{s}"].astype(np.float64) for s in ("weight", "bias", "running_mean", "running_var")
+    )
+    gain = gamma / np.sqrt(variance + _BATCH_NORM_EPSILON)
+    weight = tensors[f"conv{name}.0.weight"] * gain[:, None, None, None]
+    return Convolution(name, weight.astype(np.float32), (beta - mean * gain).astype(np.float32), activated)
+
+
+def _on_grey_levels(first: Convolution, architecture: Architecture) -> Convolution:
+    """The first layer on (grey level - 127.5) of one channel, in place of (x / 255 - 0.5) * 0.225 of all.
+
+    Only the factor may go into the weights: the shift has to stay before the padding, whose zeros mean neutral grey.
+    A 3 x 3 convolution on folded pixels is one of 6 x 6 and stride 2 on the image: the folded pixel of row r holds the
+    rows 2 r + dy in its channels 2 dy + dx, so that kernel row k reaches the rows 2 (r + k - 1) + dy.
+    """
+    out = len(first.weight)
+    weight = first.weight.reshape(out, architecture.image_channels, -1, 3, 3).sum(axis=1) * np.float32(_SCALE)
+    if not architecture.folds_pixels:
+        return Convolution(first.name, weight, first.bias)
+    # (out, dy, dx, row, column) -> (out, row, dy, column, dx)
+    unfolded = weight.reshape(out, 2, 2, 3, 3).transpose(0, 3, 1, 4, 2).reshape(out, 1, 6, 6)
+    return Convolution(first.name, np.ascontiguousarray(unfolded), first.bias, stride=2)
+
+
+def _stacked(name: str, layers: Sequence[Convolution]) -> Convolution:
+    """Layers that see the same, as one."""
+    return Convolution(name, np.concatenate([la.weight for la in layers]), np.concatenate([la.bias for la in layers]))
+
+
+def _joint_output(tensors: Tensors) -> Convolution:
+    """Score and place as one convolution of the stacked hidden layers, each blind to the other's half."""
+    score, place = tensors["convDb.weight"], tensors["convPb.weight"]
+    weight = np.zeros((3, 2 * score.shape[1], 3, 3), np.float32)
+    weight[:1, : score.shape[1]], weight[1:, score.shape[1] :] = score, place
+    return Convolution(OUT, weight, np.concatenate([tensors["convDb.bias"], tensors["convPb.bias"]]), activated=False)

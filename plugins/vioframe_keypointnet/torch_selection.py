@@ -1,0 +1,74 @@
+"""What :mod:`selection` does, in torch on the device of the network and without a step whose result has to be awaited.
+
+Everything has a size known beforehand, so that it can be recorded into a CUDA graph.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from vioframe_keypointnet.architecture import CELL_PX
+from vioframe_keypointnet.network import describe
+from vioframe_keypointnet.selection import CONTRAST_REACH_PX, OFFSET_PX, Rules
+
+_NEVER = float("-inf")
+
+
+class TorchSelection:
+    """Selects among the candidates of images of one size; the grid and the masks are made once."""
+
+    def __init__(self, padded: tuple[int, int], shape: tuple[int, int], rules: Rules, device: str) -> None:
+        h, w = padded[0] // CELL_PX, padded[1] // CELL_PX
+        rows, columns = torch.meshgrid(torch.arange(h), torch.arange(w), indexing="ij")
+        self._centres = (torch.stack([columns, rows]) * CELL_PX + (CELL_PX - 1) / 2).to(device, torch.float32)
+        self._limits = torch.tensor([w * CELL_PX - 1.0, h * CELL_PX - 1.0], device=device)[:, None, None]
+        self._last = torch.tensor([shape[1] - 1.0, shape[0] - 1.0], device=device)[:, None, None]
+        self._inner = torch.zeros(h, w, dtype=torch.bool)
+        self._inner[1:-1, 1:-1] = True
+        self._inner = self._inner.to(device)
+        self._rules = rules
+        neighbours = (2 * rules.reach_cells + 1) ** 2
+        self._first = (torch.arange(neighbours) < neighbours // 2)[:, None].to(device)
+        """Of a cell's neighbours, row by row, those before it: they win where scores are equal."""
+
+    def __call__(self, heads: Tensor, image: Tensor, descriptors: Tensor | None, max_points: int) -> Tensor:
+        """(K, 3 + D): x, y px, score before the sigmoid, descriptor; strongest first, and -inf where there are no more.
+
+        ``heads`` (3, h, w), ``image`` (8 h, 8 w) and ``descriptors`` (D, 2 h, 2 w) are floats.
+        """
+        score = heads[0].masked_fill(~self._inner, _NEVER)
+        xy = torch.minimum((self._centres + OFFSET_PX * torch.tanh(heads[1:])).clamp(min=0.0), self._limits)
+        barred = self._suppressed(score, xy) | (xy > self._last).any(dim=0) | self._flat(image, xy)
+        score = score.masked_fill(barred, _NEVER).flatten()
+        best, cells = score.topk(min(max_points, len(score)))
+        places = xy.flatten(1)[:, cells].T
+        found = torch.cat([places, best[:, None]], dim=1)
+        if descriptors is None:
+            return found
+        return torch.cat([found, describe(descriptors[None], places[None])[0]], dim=1)
+
+    def _suppressed(self, score: Tensor, xy: Tensor) -> Tensor:
+        """(h, w) whether a stronger candidate is too near."""
+        reach = self._rules.reach_cells
+        # Beyond the grid there is nothing that could be stronger, wherever it is said to be.
+        around = torch.cat([functional.pad(score[None], [reach] * 4, value=_NEVER), functional.pad(xy, [reach] * 4)])
+        others = functional.unfold(around[None], 2 * reach + 1).view(3, -1, score.numel())
+        own = torch.cat([score[None], xy]).flatten(1)[:, None]
+        stronger = (others[0] > own[0]) | (self._first & (others[0] == own[0]))
+        near = (others[1:] - own[1:]).square().sum(dim=0) < self._rules.nms_px**2
+        return (stronger & near).any(dim=0).view_as(score)
+
+    def _flat(self, image: Tensor, xy: Tensor) -> Tensor:
+        """(h, w) whether grey levels around the candidates hardly differ."""
+        column, row = xy.round().long()
+        range_ = _spread(image[None])[0] + _spread(-image[None])[0]
+        return range_[row, column] < self._rules.min_contrast
+
+
+def _spread(image: Tensor) -> Tensor:
+    """The maximum of ``image`` (1, H, W) around each pixel."""
+    side, reach = 2 * CONTRAST_REACH_PX + 1, CONTRAST_REACH_PX
+    rows = functional.max_pool2d(image, (side, 1), stride=1, padding=(reach, 0))
+    return functional.max_pool2d(rows, (1, side), stride=1, padding=(0, reach))

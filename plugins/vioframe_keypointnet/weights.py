@@ -1,0 +1,157 @@
+"""Trained weights: one ``.safetensors`` file that also says which network it is of, and how it was trained.
+
+The metadata holds ``architecture``, a ``card`` (free JSON: data, schedule, figures) and, for int8 inference,
+``activation_ranges``, so that nobody who only runs the network needs images to calibrate it.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vioframe.errors import ConfigError
+from vioframe.options import did_you_mean
+from vioframe_keypointnet.architecture import ARCHITECTURES, Architecture
+from vioframe_keypointnet.optional import needs
+from vioframe_keypointnet.tensors import Tensors, ranged_layers, shapes, untrained
+
+_LOG = logging.getLogger(__name__)
+
+_SHIPPED = Path(__file__).parent / "data"
+_PREFIX, _SUFFIX = "keypointnet-", ".safetensors"
+_UNTRAINED = "untrained:"
+_REMEDY = (
+    "train some with `vioframe train keypointnet --images DIR`, or name an official checkpoint: -o weights=v4.ckpt"
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Weights:
+    """A network's tensors (float32, read-only by convention) and what is known of them.
+
+    ``activation_ranges`` maps the name of a folded layer to the largest output that int8 inference represents; None
+    where they have not been measured, see :mod:`vioframe_keypointnet.quantisation`.
+    """
+
+    architecture: Architecture
+    tensors: Tensors
+    card: Mapping[str, Any] = field(default_factory=dict)
+    activation_ranges: Mapping[str, float] | None = None
+    source: str = "memory"
+
+
+def save(
+    path: str | Path,
+    tensors: Mapping[str, Any],
+    architecture: Architecture,
+    card: Mapping[str, Any],
+    activation_ranges: Mapping[str, float] | None = None,
+) -> None:
+    """Write ``tensors`` (arrays by name; counters of batches are left out) as a file that :func:`load` reads.
+
+    Raises :class:`ConfigError` where they are not those of ``architecture``.
+    """
+    with needs("safetensors", "keypointnet"):
+        from safetensors.numpy import save_file
+
+    checked = _checked(tensors, architecture, "the tensors to save")
+    metadata = {"architecture": architecture.to_json(), "card": json.dumps(dict(card))}
+    if activation_ranges is not None:
+        metadata["activation_ranges"] = json.dumps(dict(activation_ranges))
+    save_file(dict(checked), path, metadata)
+
+
+def load(source: str | Path) -> Weights:
+    """Weights by the name of those that ship, or from a ``.safetensors`` file or an official ``.ckpt``.
+
+    ``untrained:full`` and ``untrained:compact`` are random, for measuring speed: only ever by this explicit wish.
+    Raises :class:`ConfigError` saying how to get weights.
+    """
+    name = str(source)
+    if name.startswith(_UNTRAINED):
+        return _random(name)
+    path = Path(source).expanduser()
+    if not path.is_file():
+        path = _SHIPPED / f"{_PREFIX}{name}{_SUFFIX}"
+    if not path.is_file():
+        known = shipped()
+        raise ConfigError(
+            f"there are no KeypointNet weights {name!r}{did_you_mean(name, known)}: neither a file nor among those "
+            f"that ship ({', '.join(known) or 'none'}); {_REMEDY}"
+        )
+    if path.suffix == _SUFFIX:
+        return _read(path)
+    from vioframe_keypointnet import checkpoint  # imports torch
+
+    return checkpoint.read(path)
+
+
+def shipped() -> list[str]:
+    """Names of the weights that came with the package."""
+    return sorted(path.name[len(_PREFIX) : -len(_SUFFIX)] for path in _SHIPPED.glob(f"{_PREFIX}*{_SUFFIX}"))
+
+
+def of_tensors(tensors: Mapping[str, Any], architecture: Architecture, source: Path) -> Weights:
+    """Weights of tensors read from ``source``; raises :class:`ConfigError` where they do not fit ``architecture``."""
+    return Weights(architecture, _checked(tensors, architecture, str(source)), source=str(source))
+
+
+def _read(path: Path) -> Weights:
+    with needs("safetensors", "keypointnet"):
+        from safetensors import SafetensorError, safe_open
+    try:
+        with safe_open(path, framework="np") as file:
+            metadata = file.metadata() or {}
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118, it is no mapping
+    except (SafetensorError, OSError, ValueError) as error:
+        raise ConfigError(f"{path} is damaged or no safetensors file ({error}); {_REMEDY}") from error
+    try:
+        architecture = Architecture.from_json(metadata["architecture"])
+        card = dict(json.loads(metadata.get("card", "{}")))
+        ranges = json.loads(metadata.get("activation_ranges", "null"))
+        ranges = None if ranges is None else {str(layer): float(most) for layer, most in ranges.items()}
+    except (ValueError, TypeError, KeyError, AttributeError) as error:
+        raise ConfigError(
+            f"{path} does not say which KeypointNet it is of; convert official checkpoints with "
+            f"`python -m vioframe_keypointnet.checkpoint IN.ckpt OUT.safetensors`, or {_REMEDY}"
+        ) from error
+    return Weights(architecture, _checked(tensors, architecture, str(path)), card, ranges, str(path))
+
+
+def _random(name: str) -> Weights:
+    kind = name.removeprefix(_UNTRAINED)
+    if kind not in ARCHITECTURES:
+        raise ConfigError(f"there is no network {kind!r} to leave untrained; known: {', '.join(sorted(ARCHITECTURES))}")
+    _LOG.warning("KeypointNet runs with random weights, as asked: it is good for measuring speed and nothing else")
+    architecture = ARCHITECTURES[kind]
+    ranges = dict.fromkeys(ranged_layers(architecture), 1.0)  # signals stay about as small as the normalised image
+    return Weights(architecture, untrained(architecture), {"trained": False}, ranges, name)
+
+
+def _checked(tensors: Mapping[str, Any], architecture: Architecture, what: str) -> Tensors:
+    """``tensors`` as float32, exactly those that ``architecture`` has."""
+    found = {name: tensor for name, tensor in tensors.items() if not name.endswith("num_batches_tracked")}
+    expected = shapes(architecture)
+    wrong = [f"{name} is missing" for name in expected.keys() - found.keys()]
+    wrong += [f"{name} is not of it" for name in found.keys() - expected.keys()]
+    wrong += [
+        f"{name} has the shape {tuple(found[name].shape)} and not {shape}"
+        for name, shape in expected.items()
+        if name in found and tuple(found[name].shape) != shape
+    ]
+    if wrong:
+        raise ConfigError(
+            f"{what}: not the weights of a {architecture.name} KeypointNet: {min(wrong)}"
+            f"{f' and {len(wrong) - 1} more such' if len(wrong) > 1 else ''}; {_REMEDY}"
+        )
+    arrays = {name: np.ascontiguousarray(found[name], np.float32) for name in expected}
+    broken = [name for name, array in arrays.items() if not np.isfinite(array).all()]
+    if broken:
+        raise ConfigError(f"{what}: {broken[0]} holds numbers that are not finite; {_REMEDY}")
+    return arrays
