@@ -56,7 +56,7 @@ def table(title: str, rows: Sequence[Row], columns: Mapping[str, str]) -> Table:
     for key in columns:
         out.add_column(key, justify="left" if columns[key] == "" else "right", no_wrap=True)
     for row in rows:
-        out.add_row(*(_format(_reach(row, key), spec) for key, spec in columns.items()))
+        out.add_row(*(_format(reach(row, key), spec) for key, spec in columns.items()))
     return out
 
 
@@ -72,7 +72,8 @@ def record(path: Path, rows: Sequence[Row], settings: Mapping[str, Any]) -> None
     path.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
 
 
-def _reach(row: Row, key: str) -> Any:
+def reach(row: Row, key: str) -> Any:
+    """The value at ``key``, as ``ms.total``; None where there is none."""
     value: Any = row
     for part in key.split("."):
         value = value.get(part) if isinstance(value, Mapping) else None

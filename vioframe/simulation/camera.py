@@ -17,14 +17,11 @@ from vioframe.geometry.cameras import Camera
 from vioframe.interfaces import World
 from vioframe.simulation.movers import Movers
 from vioframe.simulation.renderer import Renderer
+from vioframe.simulation.sensor import digitise
 from vioframe.simulation.shading import Float32
 from vioframe.types import Float, Image
 
 _MIDDLE_GREY = 0.4
-_FULL_WELL = 10_000.0
-"""Electrons of a white pixel at a gain of one: their shot noise is what low light is noisy by."""
-_READ_NOISE = 0.002
-_WHITE = 255.0
 
 
 @dataclass(frozen=True)
@@ -79,16 +76,13 @@ class SimulatedCamera:
         studio = self._studio
         if studio.dynamic_range != 1.0:
             light = _MIDDLE_GREY * (light / _MIDDLE_GREY) ** studio.dynamic_range
-        value = light * shot.gain
-        if studio.light < 1.0 or studio.noise_deviation > 0.0:
-            # Shot noise is that of the electrons gathered; the gain amplifies it and the read-out noise alike.
-            amplification = shot.gain / studio.light
-            shot_variance = np.maximum(light, 0.0) * studio.light / _FULL_WELL
-            deviation = np.sqrt(amplification**2 * (shot_variance + _READ_NOISE**2) + studio.noise_deviation**2)
-            rng = np.random.default_rng(shot.seed)
-            value = value + deviation * rng.standard_normal(light.shape, dtype=np.float32)
-        image: Image = np.clip(np.round(_WHITE * value), 0.0, _WHITE).astype(np.uint8)
-        return image
+        return digitise(
+            light,
+            np.random.default_rng(shot.seed),
+            gain=shot.gain,
+            exposed=studio.light,
+            noise_deviation=studio.noise_deviation,
+        )
 
 
 def take_pictures(studio: Studio, shots: Iterable[Shot], workers: int) -> Iterator[Image]:

@@ -1,0 +1,97 @@
+"""Detectors to compare, from what is written on the command line."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from vioframe.config import parse_assignments
+from vioframe.errors import ConfigError, PluginError, VioframeError
+from vioframe.interfaces import Detector
+from vioframe.options import Option
+from vioframe.registry import DETECTOR, Registry, describe
+from vioframe.types import Image, Keypoints
+
+_DESCRIPTORS = "descriptors"
+
+
+@dataclass(frozen=True, slots=True)
+class Entrant:
+    """A detector by name with its options; ``label`` is what tables call it."""
+
+    label: str
+    name: str
+    options: Mapping[str, Any] = field(default_factory=dict)
+
+    def describing(self, installed: Registry) -> Entrant:
+        """The same, asked for descriptors if it can compute any."""
+        can = any(option.name == _DESCRIPTORS for option in installed.find(DETECTOR, self.name).options)
+        return replace(self, options={_DESCRIPTORS: True, **self.options}) if can else self
+
+
+@dataclass(frozen=True, slots=True)
+class LineUp:
+    """Those that can take part, and why the others, by label, cannot."""
+
+    ready: tuple[tuple[Entrant, Detector], ...]
+    absent: Mapping[str, str]
+
+
+def parse_entrants(specs: Sequence[str], assignments: Sequence[str], installed: Registry) -> list[Entrant]:
+    """An entrant for each of ``specs``, or for every installed detector where there are none.
+
+    A spec is a name, or a name with options of its own: ``sift:contrast_threshold=0.01,edge_threshold=12``.
+    ``assignments``, texts such as ``sift.contrast_threshold=0.01``, go to every entrant of that name; the name may be
+    left out where only one has such an option. Raises :class:`ConfigError` or :class:`PluginError`.
+    """
+    specs = list(dict.fromkeys(specs)) or installed.names(DETECTOR)
+    named = [(name, own) for name, _, own in (spec.partition(":") for spec in specs)]
+    options = {name: installed.find(DETECTOR, name).options for name, _ in named}
+    shared: dict[str, dict[str, Any]] = {name: {} for name in options}
+    for name, key, value in parse_assignments(assignments, options):
+        shared[name][key] = value
+    entrants = [
+        Entrant(spec, name, {**shared[name], **_own(name, own, options)})
+        for spec, (name, own) in zip(specs, named, strict=True)
+    ]
+    for entrant in entrants:
+        # What is asked for must be right; what only lacks something, as weights, is absent and no error.
+        if entrant.options:
+            installed.find(DETECTOR, entrant.name).validate(entrant.options)
+    return entrants
+
+
+def line_up(entrants: Sequence[Entrant], installed: Registry) -> LineUp:
+    """Create each and have it look at one image; raises :class:`ConfigError` where none of them can."""
+    ready: list[tuple[Entrant, Detector]] = []
+    absent: dict[str, str] = {}
+    probe = np.kron(np.random.default_rng(0).integers(0, 256, (30, 40), dtype=np.uint8), np.ones((8, 8), np.uint8))
+    for entrant in entrants:
+        try:
+            detector = installed.create_detector(entrant.name, entrant.options)
+            detector.detect(probe, 10)
+        except (Exception, SystemExit) as error:  # a plug-in may raise anything
+            reason = str(error) if isinstance(error, VioframeError) else describe(error)
+            absent[entrant.label] = " ".join(reason.split()).partition("; its options")[0]
+        else:
+            ready.append((entrant, detector))
+    if not ready:
+        reasons = "; ".join(f"{label}: {reason}" for label, reason in absent.items())
+        raise ConfigError(f"no detector can take part: {reasons}")
+    return LineUp(tuple(ready), absent)
+
+
+def detect(entrant: Entrant, detector: Detector, image: Image, max_points: int) -> Keypoints:
+    """What ``detector`` finds; raises :class:`PluginError` in the entrant's name where it fails."""
+    try:
+        return detector.detect(image, max_points)
+    except Exception as error:
+        raise PluginError(f"detector {entrant.label} failed: {describe(error)}; leave it out or repair it") from error
+
+
+def _own(name: str, own: str, options: Mapping[str, list[Option]]) -> dict[str, Any]:
+    texts = [f"{name}.{text.strip()}" for text in own.split(",")] if own else []
+    return {key: value for _, key, value in parse_assignments(texts, {name: options[name]})}

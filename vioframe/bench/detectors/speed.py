@@ -1,0 +1,87 @@
+"""Frames a second of detectors, side by side."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Sequence
+from time import perf_counter
+
+import numpy as np
+
+from vioframe import machine
+from vioframe.bench.detectors.entrants import Entrant, detect
+from vioframe.bench.detectors.quoted import TABLE_3_2
+from vioframe.bench.processes import usable_cores
+from vioframe.bench.results import Row
+from vioframe.interfaces import Detector
+from vioframe.registry import DETECTOR, Registry
+from vioframe.types import Float, Image, Int
+
+RESOLUTION = (640, 480)
+MAX_POINTS = 300
+# Speed does not depend on what the weights are: the published size is timed where no weights for it are at hand.
+_VARIANTS = {"keypointnet": ("keypointnet:weights=untrained:full",)}
+
+
+def time_detectors(
+    ready: Sequence[tuple[Entrant, Detector]],
+    images: Sequence[Image],
+    rounds: int,
+    max_points: int = MAX_POINTS,
+    on_round: Callable[[int], None] = lambda count: None,
+) -> list[Row]:
+    """A row a detector: every image in every round, one at a time.
+
+    The detectors take turns within a round, so that whatever else the machine does slows all of them alike. A round
+    of a detector begins with a call that is not counted: caches, and threads that others left spinning, are then its
+    own. A whole round before the first warms up. Raises :class:`PluginError` where a detector fails.
+    """
+    seconds: list[list[float]] = [[] for _ in ready]
+    points: list[list[int]] = [[] for _ in ready]
+    for number in range(rounds + 1):
+        for k, (entrant, detector) in enumerate(ready):
+            detect(entrant, detector, images[-1], max_points)
+            for image in images:
+                begin = perf_counter()
+                found = detect(entrant, detector, image, max_points)
+                taken = perf_counter() - begin
+                if number > 0:
+                    seconds[k].append(taken)
+                    points[k].append(len(found.xy))
+        on_round(1)
+    return [_row(e, np.array(s), np.array(p)) for (e, _), s, p in zip(ready, seconds, points, strict=True)]
+
+
+def variants(installed: Registry) -> list[str]:
+    """Every installed detector, and the sizes of those that come in several."""
+    return [spec for name in installed.names(DETECTOR) for spec in (name, *_VARIANTS.get(name, ()))]
+
+
+def devices() -> list[str]:
+    """The processor with its threads, and the graphics cards that torch, where a detector has loaded it, can use."""
+    import cv2
+
+    found = [f"{machine.cpu_model()}, {usable_cores()} cores, OpenCV on {cv2.getNumThreads()} threads"]
+    torch = sys.modules.get("torch")
+    if torch is not None:
+        found[0] += f", torch on {torch.get_num_threads()}"
+        found += [torch.cuda.get_device_name(k) for k in range(torch.cuda.device_count())]
+    return found
+
+
+def _row(entrant: Entrant, seconds: Float, points: Int) -> Row:
+    low, median, high = np.quantile(seconds, [0.25, 0.5, 0.75])
+    quoted = TABLE_3_2.get(entrant.name)
+    return {
+        "detector": entrant.label,
+        "options": dict(entrant.options),
+        "calls": len(seconds),
+        "measured": {
+            "fps": float(1.0 / median),
+            "fps_quartiles": [float(1.0 / high), float(1.0 / low)],
+            "ms": 1e3 * float(median),
+            "ms_quartiles": [1e3 * float(low), 1e3 * float(high)],
+            "points": float(np.median(points)),
+        },
+        "quoted": None if quoted is None else {"fps": quoted.fps, "source": quoted.source},
+    }

@@ -1,0 +1,16 @@
+"""``vioframe bench``: parts compared with one another, a sub-command a question."""
+
+from __future__ import annotations
+
+import click
+
+from vioframe.cli.lazy import LazyGroup
+
+_COMMANDS = {
+    "detectors": "Speed, repeatability, and tracks in the front-end, of every detector.",
+}
+
+
+@click.group("bench", cls=LazyGroup, modules="vioframe.cli.bench_{}", summaries=_COMMANDS)
+def command() -> None:
+    """Compare parts with one another."""
