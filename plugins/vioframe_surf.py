@@ -38,7 +38,7 @@ class Surf:
         self,
         *,
         threshold: Annotated[NonNegativeFloat, "weakest determinant kept, grey levels squared; lower finds more"] = 1.0,
-        octaves: Annotated[PositiveInt, "how often the resolution is halved, plus one; 3 finds blobs of up to 50 px"] = 2,
+        octaves: Annotated[PositiveInt, "how often the resolution is halved, plus one; more finds larger blobs"] = 2,
         descriptors: Annotated[bool, "also compute the 64-vectors, which tracking does not use"] = False,
     ) -> None:
         try:

@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from vioframe import registry
+from vioframe.options import REQUIRED
 from vioframe.testing import check_backend, check_dataset, check_detector
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -45,7 +46,11 @@ def test_the_example_plugin_passes_its_own_tests(example):
 
 @pytest.mark.parametrize("name", INSTALLED.names(registry.DETECTOR))
 def test_every_detector_conforms(name):
-    check_detector(INSTALLED.find(registry.DETECTOR, name).factory)
+    part = INSTALLED.find(registry.DETECTOR, name)
+    needed = [option.name for option in part.options if option.default is REQUIRED]
+    if needed:
+        pytest.skip(f"it needs what does not ship ({', '.join(needed)}); its own tests check it")
+    check_detector(part.factory)
 
 
 @pytest.mark.parametrize("name", INSTALLED.names(registry.BACKEND))

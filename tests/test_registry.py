@@ -51,7 +51,8 @@ def failure(loaded: registry.Registry, entry_point: str) -> str:
 def test_every_built_in_comes_in_through_the_entry_points():
     loaded = registry.load()
     assert not loaded.failures
-    assert {"shi_tomasi", "fast", "orb", "sift"} <= set(loaded.names(registry.DETECTOR))
+    classic = {"shi_tomasi", "fast", "orb", "sift", "akaze", "brisk", "surf"}
+    assert classic | {"superpoint"} <= set(loaded.names(registry.DETECTOR))
     assert "msckf" in loaded.names(registry.BACKEND)
     assert {"euroc", "rosbag"} <= set(loaded.names(registry.DATASET))
     assert {"hover", "figure_eight", "standstill"} <= set(loaded.names(registry.FLIGHT))
@@ -128,7 +129,9 @@ def test_the_same_name_may_serve_two_kinds(add):
 
 def test_an_unknown_name_lists_what_is_there_and_what_failed(add):
     add("gone_part", "import a_library_nobody_has")
-    message = r"no detector is called 'shi_tomas' \(did you mean 'shi_tomasi'\?\); installed: fast, orb, .*gone_part"
+    message = (
+        r"no detector is called 'shi_tomas' \(did you mean 'shi_tomasi'\?\); installed: akaze, .*fast, .*gone_part"
+    )
     with pytest.raises(PluginError, match=message):
         registry.load().create_detector("shi_tomas")
 
@@ -294,7 +297,9 @@ def test_a_bad_option_shows_the_options_there_are(values, why):
 
 
 def test_an_option_without_default_is_asked_for():
-    def factory(weights: Path) -> None: ...
+    def factory(weights: Annotated[Path, "a trained network"]) -> None: ...
 
-    with pytest.raises(ConfigError, match=r"it needs the option 'weights': pass -o weights=\.\.\."):
+    with pytest.raises(
+        ConfigError, match=r"it needs the option 'weights' \(a trained network\): pass -o weights=\.\.\."
+    ):
         validate_options("it", factory, {})

@@ -26,10 +26,8 @@ class SuperPoint:
         elif device == "cuda" and not torch.cuda.is_available():
             raise ConfigError("superpoint: device=cuda, but PyTorch finds no GPU here; use device=cpu")
         self._device = torch.device(device)
-        self._network = load(weights).to(self._device)
-        for parameter in self._network.parameters():  # as convolutions run fastest
-            if parameter.dim() == 4:
-                parameter.data = parameter.data.contiguous(memory_format=torch.channels_last)
+        network = load(weights).to(self._device)
+        self._network = network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         self._threshold = threshold
         self._nms_radius_px = nms_radius_px
         self._border_px = border_px

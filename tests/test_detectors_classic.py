@@ -1,0 +1,106 @@
+"""Where AKAZE, BRISK and SURF put their keypoints: the right axes, no shift, and sub-pixel where they say so."""
+
+import sys
+from functools import partial
+
+import cv2
+import numpy as np
+import pytest
+
+from vioframe import registry
+from vioframe.errors import ConfigError, PluginError
+from vioframe_akaze import Akaze
+from vioframe_brisk import Brisk
+from vioframe_surf import Surf
+
+FINEST = {"akaze": Akaze, "brisk": partial(Brisk, octaves=0), "surf": Surf}
+each_detector = pytest.mark.parametrize("make", FINEST.values(), ids=FINEST)
+
+
+def blobs(sigma_px, seed=5):
+    """Bright blobs around random sub-pixel places: (image (480, 640), (35, 2) px their centres)."""
+    grid = np.array([(x, y) for y in range(80, 401, 80) for x in range(80, 561, 80)], float)
+    centres = grid + np.random.default_rng(seed).uniform(-5.0, 5.0, grid.shape)
+    return np.round(40.0 + 180.0 * sum(blob(x, y, sigma_px) for x, y in centres)).astype(np.uint8), centres
+
+
+def blob(x, y, sigma_px, shape=(480, 640)):
+    rows, columns = np.mgrid[: shape[0], : shape[1]]
+    return np.exp(-((columns - x) ** 2 + (rows - y) ** 2) / (2 * sigma_px**2))
+
+
+def errors(found, centres, within_px=3.0):
+    """(M, 2) px from each centre to the nearest point, where there is one."""
+    distance = np.linalg.norm(centres[:, None] - found[None], axis=2)
+    near = distance.min(axis=1) < within_px
+    return (found[distance.argmin(axis=1)] - centres)[near]
+
+
+def texture(seed=3):
+    noise = np.random.default_rng(seed).normal(size=(240, 320))
+    smooth = cv2.GaussianBlur(noise, (0, 0), 2.0)
+    return np.clip(128 + 40 * smooth / smooth.std(), 0, 255).astype(np.uint8)
+
+
+@pytest.mark.parametrize(
+    ("make", "sigma_px", "mean_px", "largest_px"),
+    [
+        pytest.param(Akaze, 2.0, 0.01, 0.05, id="akaze-fine"),
+        pytest.param(Akaze, 4.0, 0.01, 0.05, id="akaze-coarse"),
+        pytest.param(partial(Brisk, octaves=0), 1.5, 0.02, 0.15, id="brisk-fine"),
+        pytest.param(Brisk, 1.5, 0.3, 1.0, id="brisk"),
+        pytest.param(Surf, 2.5, 0.01, 0.06, id="surf-finest-octave"),
+        pytest.param(Surf, 6.0, 0.02, 0.08, id="surf-second-octave"),
+        pytest.param(partial(Surf, octaves=3), 9.0, 0.02, 0.08, id="surf-third-octave"),
+    ],
+)
+def test_blobs_are_found_where_they_are(make, sigma_px, mean_px, largest_px):
+    image, centres = blobs(sigma_px)
+    error = errors(make().detect(image, 1000).xy, centres)
+    assert len(error) >= len(centres) - 1
+    assert np.abs(error.mean(axis=0)).max() <= mean_px
+    assert np.abs(error).max() <= largest_px
+
+
+@each_detector
+def test_an_image_upside_down_has_the_same_keypoints_upside_down(make):
+    """What shifts every point shows twice; a shift of half a pixel would be one pixel."""
+    image = texture()
+    here = make().detect(image, 300).xy
+    back = np.array([319, 239]) - make().detect(np.ascontiguousarray(image[::-1, ::-1]), 300).xy
+    difference = errors(back, here, within_px=1.5)
+    assert len(difference) >= 0.8 * len(here)
+    assert np.abs(difference.mean(axis=0)).max() <= 0.03
+
+
+@each_detector
+def test_fewer_points_are_the_strongest_of_more(make):
+    image = texture()
+    many, few = make().detect(image, 60), make().detect(image, 7)
+    assert len(few.xy) == 7
+    assert few.score.tolist() == many.score[:7].tolist()
+    assert {tuple(xy) for xy in few.xy[few.score > many.score[7]]} <= {tuple(xy) for xy in many.xy[:7]}
+
+
+@pytest.mark.parametrize(("sigma_px", "x", "y"), [(2.5, 21.3, 25.8), (6.0, 39.2, 41.7)])
+def test_surf_finds_what_is_near_the_border(sigma_px, x, y):
+    """mahotas by itself keeps 18, then 64 px away from it."""
+    image = np.round(40.0 + 180.0 * blob(x, y, sigma_px, shape=(200, 300))).astype(np.uint8)
+    assert Surf().detect(image, 1).xy[0] == pytest.approx([x, y], abs=0.15)
+
+
+def test_surf_says_what_to_install(monkeypatch):
+    for name in ("mahotas", "mahotas.features"):
+        monkeypatch.setitem(sys.modules, name, None)
+    with pytest.raises(PluginError, match=r"^detector 'surf' needs mahotas, .*: pip install 'vioframe\[surf\]'$"):
+        registry.load().create_detector("surf")
+
+
+@pytest.mark.parametrize(
+    ("name", "option"),
+    [("akaze", "octaves=0"), ("brisk", "octaves=-1"), ("surf", "threshold=-1"), ("surf", "octaves=0")],
+)
+def test_an_option_out_of_range_is_refused(name, option):
+    key, value = option.split("=")
+    with pytest.raises(ConfigError, match=rf"detector '{name}': {key}='{value}': Input should be greater than"):
+        registry.load().create_detector(name, {key: value})
