@@ -97,10 +97,9 @@ def test_surf_says_what_to_install(monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("name", "option"),
-    [("akaze", "octaves=0"), ("brisk", "octaves=-1"), ("surf", "threshold=-1"), ("surf", "octaves=0")],
+    ("name", "key", "value"),
+    [("akaze", "octaves", "0"), ("brisk", "octaves", "-1"), ("surf", "threshold", "-1"), ("surf", "octaves", "0")],
 )
-def test_an_option_out_of_range_is_refused(name, option):
-    key, value = option.split("=")
+def test_an_option_out_of_range_is_refused(name, key, value):
     with pytest.raises(ConfigError, match=rf"detector '{name}': {key}='{value}': Input should be greater than"):
         registry.load().create_detector(name, {key: value})

@@ -129,9 +129,7 @@ def test_the_same_name_may_serve_two_kinds(add):
 
 def test_an_unknown_name_lists_what_is_there_and_what_failed(add):
     add("gone_part", "import a_library_nobody_has")
-    message = (
-        r"no detector is called 'shi_tomas' \(did you mean 'shi_tomasi'\?\); installed: akaze, .*fast, .*gone_part"
-    )
+    message = r"no detector is called 'shi_tomas' \(did you mean 'shi_tomasi'\?\); installed: akaze, .*gone_part"
     with pytest.raises(PluginError, match=message):
         registry.load().create_detector("shi_tomas")
 
@@ -299,7 +297,6 @@ def test_a_bad_option_shows_the_options_there_are(values, why):
 def test_an_option_without_default_is_asked_for():
     def factory(weights: Annotated[Path, "a trained network"]) -> None: ...
 
-    with pytest.raises(
-        ConfigError, match=r"it needs the option 'weights' \(a trained network\): pass -o weights=\.\.\."
-    ):
+    message = r"it needs the option 'weights' \(a trained network\): pass -o weights=\.\.\."
+    with pytest.raises(ConfigError, match=message):
         validate_options("it", factory, {})
