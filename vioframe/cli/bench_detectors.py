@@ -160,6 +160,7 @@ def _quality(
     from vioframe.bench.detectors.degradations import choose
     from vioframe.bench.detectors.entrants import line_up
     from vioframe.bench.detectors.images import evenly
+    from vioframe.bench.detectors.leads import BASELINE
     from vioframe.bench.detectors.pairs import hpatches_pairs, synthetic_pairs
     from vioframe.bench.processes import usable_cores
 
@@ -185,12 +186,12 @@ def _quality(
         "pair_count": len(pairs),
         "resolution": quality.RESOLUTION,
         "top_k": quality.TOP_K,
-        "baseline": quality.BASELINE,
+        "baseline": BASELINE,
     }
     shown = [tables.quality_table(rows, settings)]
     if len(chosen) > 1:
         for figure, title in (("repeatability", "Repeatability"), ("distinct", "Repeatability of distinct points")):
-            shown.append(tables.sweep_table(rows, chosen, figure, title, quality.BASELINE))
+            shown.append(tables.sweep_table(rows, chosen, figure, title, BASELINE))
     return _Answer(rows, settings, shown, lined_up)
 
 
@@ -205,7 +206,7 @@ def _frontend(
     from vioframe.bench.detectors import flight, tables
     from vioframe.bench.detectors.degradations import choose
     from vioframe.bench.detectors.entrants import line_up
-    from vioframe.bench.detectors.quality import BASELINE
+    from vioframe.bench.detectors.leads import BASELINE
     from vioframe.bench.processes import usable_cores
 
     if dataset is None:

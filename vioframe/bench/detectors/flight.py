@@ -12,9 +12,10 @@ import numpy as np
 from vioframe import registry
 from vioframe.bench.detectors.degradations import Circumstances, Degradation
 from vioframe.bench.detectors.entrants import Entrant
-from vioframe.bench.detectors.tracks import coverage, median_life, survival
+from vioframe.bench.detectors.leads import BASELINE, lead_of_shares
+from vioframe.bench.detectors.tracks import coverage, lives
 from vioframe.bench.epipolar import epipolar_errors_px
-from vioframe.bench.processes import map_in_processes
+from vioframe.bench.processes import map_in_processes, single_threaded
 from vioframe.bench.results import Row
 from vioframe.errors import ConfigError, DatasetError
 from vioframe.frontend import Frontend, FrontendOptions
@@ -76,9 +77,6 @@ def check(stretch: Stretch, installed: Registry) -> str:
 
 
 def _fly(job: _Job) -> list[Row]:
-    import cv2
-    from threadpoolctl import threadpool_limits
-
     installed = registry.load()
     dataset = installed.open_dataset(job.stretch.path)
     options = FrontendOptions()
@@ -93,16 +91,11 @@ def _fly(job: _Job) -> list[Row]:
         for entrant in job.entrants
     }
     steps: dict[str, list[FrameTracks]] = {label: [] for label in frontends}
-    threads = cv2.getNumThreads()
-    cv2.setNumThreads(1)  # there is a process a core already
-    try:
-        with threadpool_limits(1):
-            for imu, frame in degraded(dataset, job.stretch, job.degradation, job.seed):
-                for label, frontend in frontends.items():
-                    steps[label].append(frontend.track(imu, frame, dataset.calibration.R_BC))
-    finally:
-        cv2.setNumThreads(threads)
-    return [
+    with single_threaded():
+        for imu, frame in degraded(dataset, job.stretch, job.degradation, job.seed):
+            for label, frontend in frontends.items():
+                steps[label].append(frontend.track(imu, frame, dataset.calibration.R_BC))
+    rows: list[Row] = [
         {
             "detector": label,
             "degradation": job.degradation.name,
@@ -112,6 +105,20 @@ def _fly(job: _Job) -> list[Row]:
         }
         for label, tracks in steps.items()
     ]
+    baseline = next((row for row in rows if row["detector"] == BASELINE), None)
+    return rows if baseline is None else [_with_leads(row, baseline) for row in rows]
+
+
+def _with_leads(row: Row, baseline: Row) -> Row:
+    """``row`` with its leads in survival over ``baseline``, of as many frames as both can tell."""
+    if row is baseline:
+        return row
+    leads = {
+        n: lead_of_shares(row["survival"][n], row["tracks"][n], baseline["survival"][n], baseline["tracks"][n])
+        for n in row["survival"]
+        if row["tracks"][n] and baseline["tracks"][n]
+    }
+    return {**row, "lead": {"survival": leads}}
 
 
 def degraded(
@@ -119,7 +126,8 @@ def degraded(
 ) -> Iterator[tuple[ImuSegment, Frame]]:
     """The packets of ``stretch``, each image degraded on its own.
 
-    The direction of motion blur turns once every eight seconds, brightness swings once every two. Raises :class:`DatasetError` where there is no image.
+    The direction of motion blur turns once every eight seconds, brightness swings once every two. Raises
+    :class:`DatasetError` where there is no image.
     """
     packets = synchronise(
         dataset.measurements(),
@@ -148,12 +156,14 @@ def track_figures(
     steps: Sequence[FrameTracks], dataset: Dataset, truth: Trajectory, grid: tuple[int, int]
 ) -> Mapping[str, Any]:
     """What the tracks of a front-end amount to; what cannot be said of so few frames is None."""
+    life = lives(steps)
     errors_px: Float = epipolar_errors_px(steps, truth, dataset.calibration, BASELINE_FRAMES)
     return {
         "frames": len(steps),
         "alive": float(np.mean([len(step.ids) for step in steps])),
-        "survival": {str(n): survival(steps, n) for n in SURVIVAL_FRAMES},
-        "median_life": median_life(steps),
+        "survival": {str(n): life.share(n) for n in SURVIVAL_FRAMES},
+        "tracks": {str(n): int(life.known[n]) if n < len(steps) else 0 for n in SURVIVAL_FRAMES},
+        "median_life": life.median,
         "epipolar_inliers": float(np.mean(errors_px <= INLIER_PX)) if len(errors_px) else None,
         "epipolar_median_px": float(np.median(errors_px)) if len(errors_px) else None,
         "coverage": coverage(steps, dataset.calibration.camera.resolution, grid),

@@ -11,23 +11,21 @@ import numpy as np
 from vioframe import registry
 from vioframe.bench.detectors.degradations import Circumstances, Degradation
 from vioframe.bench.detectors.entrants import Entrant, detect
+from vioframe.bench.detectors.leads import BASELINE, lead_of_pairs
 from vioframe.bench.detectors.metrics import CORNERS_WITHIN_PX, PairScore, score_pair
-from vioframe.bench.detectors.pairs import Pair
-from vioframe.bench.processes import map_in_processes
+from vioframe.bench.detectors.pairs import Pair, Views
+from vioframe.bench.processes import map_in_processes, single_threaded
 from vioframe.bench.results import Row
-from vioframe.types import Float
+from vioframe.types import Image
 
 RESOLUTION = (320, 240)
 TOP_K = 300
-BASELINE = "shi_tomasi"
-"""The detector that the others are held against."""
 LEADS = ("repeatability", "distinct")
 """The figures that leads are stated for."""
 
 # Asked of a detector before those that only one view shows are left out.
 _CANDIDATES = 4 * TOP_K
 _LARGEST_JOB = 8
-_CONFIDENCE = 1.96
 
 Scores = Mapping[tuple[str, Degradation], Sequence[PairScore]]
 """By detector's label and degradation, in the order of the pairs."""
@@ -68,33 +66,31 @@ def score_detectors(
 
 
 def _score(job: _Job) -> dict[tuple[str, Degradation], list[PairScore]]:
-    import cv2
-    from threadpoolctl import threadpool_limits
-
     installed = registry.load()
     ready = [(entrant, installed.create_detector(entrant.name, entrant.options)) for entrant in job.entrants]
     scores: dict[tuple[str, Degradation], list[PairScore]] = {
         (entrant.label, degradation): [] for degradation in job.degradations for entrant in job.entrants
     }
-    threads = cv2.getNumThreads()
-    cv2.setNumThreads(1)  # there is a process a core already
-    try:
-        with threadpool_limits(1):
-            for number, pair in job.pairs:
-                views = pair.load(RESOLUTION)
-                for degradation in job.degradations:
-                    rng = np.random.default_rng((job.seed, number, *map(ord, degradation.name)))
-                    first, second = (
-                        degradation(image, Circumstances(rng, float(rng.uniform(0.0, np.pi)), phase))
-                        for phase, image in ((0.0, views.first), (1.0, views.second))
-                    )
-                    for entrant, detector in ready:
-                        found = [detect(entrant, detector, image, _CANDIDATES) for image in (first, second)]
-                        score = score_pair(found[0], found[1], views.H_21, RESOLUTION, TOP_K)
-                        scores[entrant.label, degradation].append(score)
-    finally:
-        cv2.setNumThreads(threads)
+    with single_threaded():
+        for number, pair in job.pairs:
+            views = pair.load(RESOLUTION)
+            for degradation in job.degradations:
+                first, second = _degraded(views, degradation, (job.seed, number))
+                for entrant, detector in ready:
+                    found = [detect(entrant, detector, image, _CANDIDATES) for image in (first, second)]
+                    score = score_pair(found[0], found[1], views.H_21, RESOLUTION, TOP_K)
+                    scores[entrant.label, degradation].append(score)
     return scores
+
+
+def _degraded(views: Views, degradation: Degradation, seed: tuple[int, ...]) -> tuple[Image, Image]:
+    """Both views: noise and direction of each its own, brightness that of the first unchanged."""
+    rng = np.random.default_rng((*seed, *degradation.name.encode()))
+    first, second = (
+        degradation(image, Circumstances(rng, direction_rad=float(rng.uniform(0.0, np.pi)), phase=phase))
+        for image, phase in ((views.first, 0.0), (views.second, 1.0))
+    )
+    return first, second
 
 
 def quality_rows(scores: Scores) -> list[Row]:
@@ -129,18 +125,10 @@ def quality_row(
         row["homography"] = {f"{px:g}px": float(np.mean(np.array(errors) <= px)) for px in CORNERS_WITHIN_PX}
     if baseline is not None and label != BASELINE:
         row["lead"] = {
-            figure: lead(*(np.array([getattr(s, figure) for s in of]) for of in (scores, baseline))) for figure in LEADS
+            figure: lead_of_pairs(*(np.array([getattr(s, figure) for s in of]) for of in (scores, baseline)))
+            for figure in LEADS
         }
     return row
-
-
-def lead(values: Float, baseline: Float) -> dict[str, Any]:
-    """Mean of the differences (N,), their 95 % interval by the normal law, and whether it is won, lost or even."""
-    difference = values - baseline
-    mean = float(difference.mean())
-    half = float(_CONFIDENCE * difference.std(ddof=1) / np.sqrt(len(difference))) if len(difference) > 1 else np.inf
-    verdict = "even" if abs(mean) <= half else "won" if mean > 0.0 else "lost"
-    return {"mean": mean, "half_width": half if np.isfinite(half) else None, "verdict": verdict}
 
 
 def _spread(values: Sequence[float | None]) -> dict[str, Any] | None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Sequence
 from time import perf_counter
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 
@@ -20,7 +21,18 @@ from vioframe.types import Float, Image, Int
 RESOLUTION = (640, 480)
 MAX_POINTS = 300
 # Speed does not depend on what the weights are: the published size is timed where no weights for it are at hand.
-_VARIANTS = {"keypointnet": ("keypointnet:weights=untrained:full",)}
+_VARIANTS = {"keypointnet": tuple(f"keypointnet:weights=untrained:full{how}" for how in ("", ",precision=int8"))}
+
+
+@runtime_checkable
+class Placed(Protocol):
+    """A detector that can run in several places and says in which: ``cpu`` or ``cuda``, and at what precision."""
+
+    @property
+    def device(self) -> str: ...
+
+    @property
+    def precision(self) -> str: ...
 
 
 def time_detectors(
@@ -49,7 +61,7 @@ def time_detectors(
                     seconds[k].append(taken)
                     points[k].append(len(found.xy))
         on_round(1)
-    return [_row(e, np.array(s), np.array(p)) for (e, _), s, p in zip(ready, seconds, points, strict=True)]
+    return [_row(*one, np.array(s), np.array(p)) for one, s, p in zip(ready, seconds, points, strict=True)]
 
 
 def variants(installed: Registry) -> list[str]:
@@ -69,7 +81,7 @@ def devices() -> list[str]:
     return found
 
 
-def _row(entrant: Entrant, seconds: Float, points: Int) -> Row:
+def _row(entrant: Entrant, detector: Detector, seconds: Float, points: Int) -> Row:
     low, median, high = np.quantile(seconds, [0.25, 0.5, 0.75])
     quoted = TABLE_3_2.get(entrant.name)
     return {
@@ -82,6 +94,7 @@ def _row(entrant: Entrant, seconds: Float, points: Int) -> Row:
             "ms": 1e3 * float(median),
             "ms_quartiles": [1e3 * float(low), 1e3 * float(high)],
             "points": float(np.median(points)),
+            "on": f"{detector.device}, {detector.precision}" if isinstance(detector, Placed) else "cpu",
         },
         "quoted": None if quoted is None else {"fps": quoted.fps, "source": quoted.source},
     }

@@ -24,7 +24,7 @@ def speed_table(rows: Sequence[Row], absent: Mapping[str, str], settings: Mappin
         f"Measured here: {'; '.join(settings['devices'])}; {settings['image_count']} images ({settings['images']}) in "
         f"{settings['rounds']} rounds; median, and quartiles in brackets"
     )
-    for column in ("detector", "thesis", "measured here", "ms", "points"):
+    for column in ("detector", "thesis", "measured here", "ms", "points", "on"):
         table.add_column(column, justify="left" if column == "detector" else "right", no_wrap=True)
     table.caption = f"thesis, Table 3.2: * {FROM_PAPER}; the others: {FROM_THESIS}"
     for row in rows:
@@ -36,14 +36,15 @@ def speed_table(rows: Sequence[Row], absent: Mapping[str, str], settings: Mappin
             f"{measured['fps']:.1f} ({low:.1f}-{high:.1f})",
             f"{measured['ms']:.2f}",
             f"{measured['points']:.0f}",
+            measured["on"],
         )
     table.add_section()
     for label in absent:
-        table.add_row(Text(label), _quoted(label.partition(":")[0]), "does not take part", _NOTHING, _NOTHING)
+        table.add_row(Text(label), _quoted(label.partition(":")[0]), "does not take part", *(3 * [_NOTHING]))
     known = {label.partition(":")[0] for label in (*absent, *(row["detector"] for row in rows))}
     for name, quoted in TABLE_3_2.items():
         if name not in known:
-            table.add_row(quoted.title, _quoted(name), _NOTHING, _NOTHING, _NOTHING)
+            table.add_row(quoted.title, _quoted(name), *(4 * [_NOTHING]))
     return table
 
 
@@ -124,11 +125,8 @@ def _led(row: Row, key: str, reference: float | None) -> str:
     value = _mean(row, key)
     if value is None or reference is None:
         return _number(value, ".3f")
-    # Only where many pairs were measured is there a spread to tell a lead from chance by.
-    verdict = reach(row, f"lead.{key}.verdict") or (
-        "won" if value > reference else "lost" if value < reference else "even"
-    )
-    return f"{value:.3f} ({value - reference:+.3f} {verdict})"
+    verdict = reach(row, f"lead.{key}.verdict")
+    return f"{value:.3f} ({value - reference:+.3f}{'' if verdict is None else f' {verdict}'})"
 
 
 def _mean(row: Row, key: str) -> float | None:
