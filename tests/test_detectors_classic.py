@@ -12,6 +12,7 @@ from vioframe.errors import ConfigError, PluginError
 from vioframe_akaze import Akaze
 from vioframe_brisk import Brisk
 from vioframe_surf import Surf
+from vioframe_surf.descriptors import describe
 
 FINEST = {"akaze": Akaze, "brisk": partial(Brisk, octaves=0), "surf": Surf}
 each_detector = pytest.mark.parametrize("make", FINEST.values(), ids=FINEST)
@@ -87,6 +88,34 @@ def test_surf_finds_what_is_near_the_border(sigma_px, x, y):
     """mahotas by itself keeps 18, then 64 px away from it."""
     image = np.round(40.0 + 180.0 * blob(x, y, sigma_px, shape=(200, 300))).astype(np.uint8)
     assert Surf().detect(image, 1).xy[0] == pytest.approx([x, y], abs=0.15)
+
+
+@pytest.mark.parametrize("direction_deg", [0, 90, 180, -90, 37])
+def test_surf_describes_a_slope_alike_in_every_direction(direction_deg):
+    """In its own direction a slope rises along u everywhere and along v nowhere; a part's share is its Gaussian's."""
+    rows, columns = np.mgrid[:200, :200] - 100.0
+    angle = np.radians(direction_deg)
+    image = np.round(128 + 2.5 * (np.cos(angle) * columns + np.sin(angle) * rows)).clip(0, 255).astype(np.uint8)
+    (found,) = describe(image, np.array([[100.0, 100.0]]), np.array([2.0])).reshape(1, 16, 4)
+    steps = np.exp(-((np.arange(20) - 9.5) ** 2) / (2 * 3.3**2)).reshape(4, 5).sum(axis=1)
+    share = np.outer(steps, steps).ravel()
+    expected = share[:, None] * np.array([1, 0, 1, 0]) / np.linalg.norm(share) / np.sqrt(2)
+    np.testing.assert_allclose(found, expected, atol=0.02)
+
+
+@pytest.mark.parametrize("turn_deg", [25, 140, 180, -80])
+def test_surf_descriptors_turn_with_the_image(turn_deg):
+    """Box filters do not quite; with orientations that do not turn, as mahotas has them, about a tenth are right."""
+    image = cv2.resize(texture(), (640, 480))
+    turn = cv2.getRotationMatrix2D((319.5, 239.5), turn_deg, 1.0)
+    turned = cv2.warpAffine(image, turn, (640, 480), flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
+    here, there = (Surf(descriptors=True).detect(view, 150) for view in (image, turned))
+    match = np.linalg.norm(here.descriptors[:, None] - there.descriptors[None], axis=2).argmin(axis=1)
+    moved = here.xy @ turn[:, :2].T + turn[:, 2]
+    distance = np.linalg.norm(moved[:, None] - there.xy[None], axis=2)
+    seen_twice = distance.min(axis=1) < 1.5
+    assert seen_twice.sum() >= 40
+    assert (distance[np.arange(len(match)), match] < 3.0)[seen_twice].mean() >= 0.7
 
 
 def test_surf_says_what_to_install(monkeypatch):

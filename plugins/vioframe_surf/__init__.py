@@ -18,6 +18,7 @@ from vioframe.errors import PluginError
 from vioframe.hookspecs import hookimpl
 from vioframe.interfaces import DetectorFactory
 from vioframe.types import Float, Image, Keypoints
+from vioframe_surf.descriptors import describe
 
 _FILTERS = 4
 """Filter sizes an octave, 9, 15, 21 and 27 px: maxima are those of the middle two, which meet the next octave's."""
@@ -27,8 +28,8 @@ _SMALLEST_PX = 37
 
 # Columns of what mahotas returns.
 _PLACE = slice(1, None, -1)
+_SCALE = 2
 _SCORE = 3
-_DESCRIPTOR = slice(6, None)
 
 
 class Surf:
@@ -54,18 +55,17 @@ class Surf:
 
     def detect(self, image: Image, max_points: int) -> Keypoints:
         """At most ``max_points`` blobs of ``image``, strongest first."""
-        found = [np.empty((0, 70 if self._descriptors else 5))]
+        found = [np.empty((0, 5))]
         for size_px, octave in self._pyramid(image):
             points = self._finest(octave, max_points)
             points[:, :2] = (points[:, :2] + 0.5) * size_px - 0.5
+            points[:, _SCALE] *= size_px
             found.append(points)
         every = np.concatenate(found)
         best = every[np.argsort(-every[:, _SCORE], kind="stable")[:max_points]]
-        return Keypoints(
-            best[:, _PLACE].astype(np.float32),
-            best[:, _SCORE].astype(np.float32),
-            best[:, _DESCRIPTOR].astype(np.float32) if self._descriptors else None,
-        )
+        xy = best[:, _PLACE]
+        descriptors = describe(image, xy, best[:, _SCALE]) if self._descriptors else None
+        return Keypoints(xy.astype(np.float32), best[:, _SCORE].astype(np.float32), descriptors)
 
     def _pyramid(self, image: Image) -> Iterator[tuple[int, Float]]:
         """Each octave's image with the size of its pixels."""
@@ -78,14 +78,13 @@ class Surf:
             octave = octave[: 2 * height, : 2 * width].reshape(height, 2, width, 2).mean(axis=(1, 3))
 
     def _finest(self, octave: Float, max_points: int) -> Float:
-        """(N, 5) or, with descriptors, (N, 70) of one octave, in its own pixels: y, x, scale, score, ..."""
+        """(N, 5) of one octave, in its own pixels: y, x, scale, score, sign of the Laplacian."""
         integral = self._surf.integral(octave)
         points: Float = self._surf.interest_points(
             integral, 1, _FILTERS, 1, self._threshold, max_points, is_integral=True
         )
         points[:, :2] = 2.0 * np.round(points[:, :2]) - points[:, :2]
-        # Leaves out the points too near to the border.
-        return self._surf.descriptors(integral, points, is_integral=True) if self._descriptors else points
+        return points
 
 
 @hookimpl
