@@ -1,7 +1,7 @@
 """Official KP2D checkpoints, ``{"state_dict": ..., "config": ...}``, without running any code they hold.
 
 torch's own restricted loader admits tensors and plain containers and nothing else; the one class it is told of in
-addition is the yacs ``CfgNode`` of ``config``, a dictionary, which is neither imported nor kept.
+addition is the yacs ``CfgNode`` of ``config``, a dictionary, in whose place it puts one of Python's own.
 
     python -m vioframe_keypointnet.checkpoint v4.ckpt v4.safetensors --calibrate FOLDER_OF_IMAGES
 """
@@ -9,11 +9,11 @@ addition is the yacs ``CfgNode`` of ``config``, a dictionary, which is neither i
 from __future__ import annotations
 
 import re
+from collections import OrderedDict
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 from pickle import UnpicklingError
-from typing import Any
 
 import click
 
@@ -27,10 +27,6 @@ from vioframe_keypointnet.weights import Weights
 _MOST_IMAGES = 64
 
 
-class _ConfigNode(dict[str, Any]):
-    """Stands in for ``yacs.config.CfgNode``."""
-
-
 def read(path: Path) -> Weights:
     """The full network of an official checkpoint, in either of torch's formats.
 
@@ -39,7 +35,7 @@ def read(path: Path) -> Weights:
     with needs("torch", "keypointnet"):
         import torch
     try:
-        with torch.serialization.safe_globals([(_ConfigNode, "yacs.config.CfgNode")]):
+        with torch.serialization.safe_globals([(OrderedDict, "yacs.config.CfgNode")]):
             content = torch.load(path, map_location="cpu", weights_only=True)
     except UnpicklingError as error:
         forbidden = re.search(r"GLOBAL (\S+)", str(error))

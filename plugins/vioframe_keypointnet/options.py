@@ -15,21 +15,21 @@ class KeypointNetOptions:
     """How KeypointNet is run."""
 
     weights: str = "compact"
-    """name of weights that ship, or a .safetensors or official .ckpt file"""
+    """Name of weights that ship, or a .safetensors or official .ckpt file."""
     runtime: Runtime = "auto"
-    """library that runs the network; auto: the fastest that is installed"""
+    """Library that runs the network; auto takes the fastest that is installed."""
     precision: Precision = "auto"
-    """auto: float16 on CUDA, int8 with OpenVINO where the weights allow it, else float32"""
+    """Auto: float16 on CUDA, int8 with OpenVINO where the weights allow it, else float32."""
     device: Device = "auto"
-    """auto: a GPU where there is one"""
+    """Auto takes CUDA where there is any."""
     threads: int = 0
-    """threads of a CPU; 0: as many as the library likes"""
+    """Threads on a CPU; 0 leaves the library's choice."""
     nms_px: float = 4.0
-    """a keypoint goes where a stronger one is nearer than this"""
+    """A keypoint goes where a stronger one is nearer than this."""
     min_contrast: int = 4
-    """grey levels by which the image must vary within 8 px of a keypoint; 0 admits those on blank surfaces"""
+    """Grey levels by which the image must vary within 8 px of a keypoint; 0 admits those on blank surfaces."""
     descriptors: bool = False
-    """also compute descriptors, which tracking does not use and which take longer than detection"""
+    """Also compute descriptors, which tracking does not use and which take longer than detection."""
 
     def __post_init__(self) -> None:
         if self.threads < 0 or self.nms_px < 0.0:

@@ -21,7 +21,7 @@ from vioframe_keypointnet.options import Device, Precision, Runtime
 
 Run = Callable[[Image], tuple[NDArray[np.float32], ...]]
 
-_ON_CPU = {"openvino": ("float32", "bfloat16", "int8"), "onnxruntime": ("float32", "int8"), "torch": ("float32",)}
+ON_CPU = {"openvino": ("float32", "bfloat16", "int8"), "onnxruntime": ("float32", "int8"), "torch": ("float32",)}
 """Runtimes, the fastest first, and the precisions each has on a CPU."""
 
 _NEED = {"openvino": ("openvino", "onnx"), "onnxruntime": ("onnxruntime", "onnx"), "torch": ("torch",)}
@@ -47,14 +47,14 @@ def choose(runtime: Runtime, precision: Precision, device: Device, calibrated: b
             "these weights do not say the range of their activations, which int8 needs; have them measured: "
             "python -m vioframe_keypointnet.checkpoint IN OUT.safetensors --calibrate FOLDER_OF_IMAGES"
         )
-    able = [name for name, has in _ON_CPU.items() if precision in ("auto", *has)]
+    able = [name for name, has in ON_CPU.items() if precision in ("auto", *has)]
     chosen: str = runtime
     if runtime == "auto":
         if not able:
             raise ConfigError(f"no runtime has the precision {precision} on a CPU; leave the option precision out")
         chosen = next((name for name in able if all(map(find_spec, _NEED[name]))), able[0])
     if chosen not in able:
-        raise ConfigError(f"on a CPU {chosen} has the precision {' or '.join(_ON_CPU[chosen])}, not {precision}")
+        raise ConfigError(f"on a CPU {chosen} has the precision {' or '.join(ON_CPU[chosen])}, not {precision}")
     if precision == "auto":
         return chosen, "int8" if calibrated and chosen == "openvino" else "float32", "cpu"
     return chosen, precision, "cpu"

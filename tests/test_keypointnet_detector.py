@@ -1,0 +1,213 @@
+"""The detector keypointnet: which candidates become keypoints, on images of any kind, and that it keeps the contract."""
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch")
+
+from keypointnet_helpers import ARCHITECTURES, TINY, network, texture, weights  # noqa: E402
+
+from vioframe.errors import ConfigError  # noqa: E402
+from vioframe.testing import check_detector  # noqa: E402
+from vioframe.types import Keypoints  # noqa: E402
+from vioframe_keypointnet import vioframe_detectors  # noqa: E402
+from vioframe_keypointnet import weights as weights_file
+from vioframe_keypointnet.folding import fold  # noqa: E402
+from vioframe_keypointnet.runtimes import cuda  # noqa: E402
+from vioframe_keypointnet.selection import Rules, candidate_places, padded_to_cells, select  # noqa: E402
+from vioframe_keypointnet.torch_selection import TorchSelection  # noqa: E402
+
+FACTORY = vioframe_detectors()["keypointnet"]
+NO_RULES = Rules(nms_px=0.0, min_contrast=0)
+
+
+@pytest.fixture(scope="module")
+def tiny(tmp_path_factory):
+    """A weights file of a small network that was never trained."""
+    path = tmp_path_factory.mktemp("weights") / "tiny.safetensors"
+    weights_file.save(path, weights(network(TINY)).tensors, TINY, {})
+    return str(path)
+
+
+def random_heads(h=30, w=40, seed=0):
+    return np.random.default_rng(seed).normal(size=(3, h, w)).astype(np.float32)
+
+
+def by_definition(heads, image, shape, rules):
+    """The keypoints in the plainest words: (N, 2) px, strongest first."""
+    xs, ys = candidate_places(heads)
+    h, w = xs.shape
+    inner = [(r, c) for r in range(1, h - 1) for c in range(1, w - 1)]
+    kept = []
+    for r, c in sorted(inner, key=lambda rc: -heads[0][rc]):
+        x, y = xs[r, c], ys[r, c]
+        others = [o for o in inner if heads[0][o] > heads[0][r, c]]
+        near = any((xs[o] - x) ** 2 + (ys[o] - y) ** 2 < rules.nms_px**2 for o in others)
+        row, column = round(float(y)), round(float(x))
+        if near or x > shape[1] - 1 or y > shape[0] - 1:
+            continue
+        window = image[max(row - 8, 0) : row + 9, max(column - 8, 0) : column + 9]
+        if int(window.max()) - int(window.min()) >= rules.min_contrast:
+            kept.append((x, y))
+    return np.array(kept, np.float32).reshape(-1, 2)
+
+
+def half_blank(shape):
+    image = texture(shape)
+    image[:, : shape[1] // 2] = 100
+    return image
+
+
+@pytest.mark.parametrize("nms_px", [0.0, 2.5, 4.0, 9.0, 15.0])
+def test_selection_is_as_defined(nms_px):
+    heads, image, rules = random_heads(15, 20), half_blank((120, 160)), Rules(nms_px, min_contrast=4)
+    xy, score = select(heads, image, (117, 155), 1000, rules)
+    expected = by_definition(heads, image, (117, 155), rules)
+    assert len(expected) > (20 if nms_px < 10.0 else 5)
+    assert np.array_equal(xy, expected)
+    assert (np.diff(score) <= 0.0).all()
+    first, _ = select(heads, image, (117, 155), 7, rules)
+    assert np.array_equal(first, expected[:7])
+
+
+@pytest.mark.parametrize("nms_px", [0.0, 4.0, 15.0])
+@pytest.mark.parametrize("shape", [(240, 320), (235, 317)])
+def test_selection_on_the_device_is_the_same(nms_px, shape):
+    heads, rules = random_heads(), Rules(nms_px, min_contrast=4)
+    image = padded_to_cells(half_blank(shape))
+    xy, score = select(heads, image, shape, 300, rules)
+    selection = TorchSelection(image.shape, shape, rules, "cpu")
+    rows = selection(torch.from_numpy(heads), torch.from_numpy(image).float(), None, 300)
+    found = cuda.keypoints(rows.numpy())
+    assert len(found.xy) == len(xy) > 20
+    assert np.abs(found.xy - xy).max() < 1e-4
+    assert np.abs(found.score - score).max() < 1e-6
+
+
+def test_equal_scores_leave_one_of_two_neighbours():
+    heads = random_heads()
+    heads[0] = 1.0
+    image = texture((240, 320))
+    rules = Rules(nms_px=4.0, min_contrast=0)
+    xy, _ = select(heads, image, (240, 320), 10_000, rules)
+    gap = np.linalg.norm(xy[:, None] - xy[None], axis=2)
+    assert gap[np.triu_indices(len(xy), 1)].min() >= 4.0
+    selection = TorchSelection((240, 320), (240, 320), rules, "cpu")
+    rows = selection(torch.from_numpy(heads), torch.from_numpy(image).float(), None, 10_000)
+    same = cuda.keypoints(rows.numpy()).xy
+    assert {tuple(p) for p in np.round(same, 3)} == {tuple(p) for p in np.round(xy, 3)}
+
+
+def test_the_outermost_cells_are_left_out():
+    heads = np.zeros((3, 15, 20), np.float32)
+    xy, score = select(heads, texture(), (120, 160), 1000, NO_RULES)
+    assert len(xy) == 13 * 18
+    assert (xy.min(axis=0) == [11.5, 11.5]).all()
+    assert (xy.max(axis=0) == [147.5, 107.5]).all()
+    assert (score == 0.5).all()
+
+
+@pytest.mark.parametrize("max_points", [0, 1, 50])
+def test_no_more_points_than_asked_for(tiny, max_points):
+    assert len(FACTORY(weights=tiny, threads=1).detect(texture(), max_points).xy) <= max_points
+
+
+@pytest.mark.parametrize("shape", [(117, 155), (121, 161), (24, 24), (23, 9), (1, 1)])
+def test_images_of_any_size(tiny, shape):
+    image = texture(shape)
+    found = FACTORY(weights=tiny, threads=1, descriptors=True).detect(image, 500)
+    assert len(found.xy) == len(found.score) == len(found.descriptors)
+    assert len(found.xy) > 0 or min(shape) <= 24
+    assert (found.xy >= 0).all()
+    assert (found.xy <= np.array(shape[::-1]) - 1).all()
+
+
+def test_padding_repeats_the_border():
+    image = texture((21, 16))
+    padded = padded_to_cells(image)
+    assert padded.shape == (24, 16)
+    assert np.array_equal(padded[:21], image)
+    assert (padded[21:] == image[-1]).all()
+    assert padded_to_cells(padded) is padded
+
+
+def test_blank_images_have_no_keypoints_unless_asked_for(tiny):
+    blank = np.full((120, 160), 80, np.uint8)
+    assert len(FACTORY(weights=tiny, threads=1).detect(blank, 50).xy) == 0
+    assert len(FACTORY(weights=tiny, threads=1, min_contrast=0).detect(blank, 50).xy) > 0
+
+
+def test_colour_and_other_depths_are_refused(tiny):
+    detector = FACTORY(weights=tiny, threads=1)
+    for image in (np.zeros((24, 24, 3), np.uint8), np.zeros((24, 24), np.uint16)):
+        with pytest.raises(ConfigError, match=r"\(H, W\) of uint8"):
+            detector.detect(image, 10)
+
+
+@pytest.mark.parametrize("runtime", ["torch", "onnxruntime", "openvino"])
+def test_all_runtimes_find_the_same_keypoints(tiny, runtime):
+    pytest.importorskip(runtime)
+    image = texture((117, 155))
+    expected = FACTORY(weights=tiny, runtime="torch", device="cpu", threads=1, descriptors=True).detect(image, 60)
+    found = FACTORY(weights=tiny, runtime=runtime, device="cpu", threads=1, descriptors=True).detect(image, 60)
+    assert len(found.xy) == 60
+    assert np.abs(found.xy - expected.xy).max() < 1e-3
+    assert np.abs(found.score - expected.score).max() < 1e-5
+    assert np.abs(found.descriptors - expected.descriptors).max() < 1e-4
+    assert np.allclose(np.linalg.norm(found.descriptors, axis=1), 1.0, atol=1e-5)
+
+
+@pytest.mark.parametrize("architecture", ARCHITECTURES.values(), ids=ARCHITECTURES)
+def test_what_the_gpu_records_finds_the_same_keypoints(architecture):
+    """The very operations that are recorded there, run here on the CPU."""
+    made, image, rules = weights(network(architecture)), texture((117, 155)), Rules(4.0, 4)
+    network_ = fold(made, descriptors=True)
+    padded = padded_to_cells(image)
+    detect = cuda.detection(network_, rules, padded.shape, image.shape, 60, torch.float32, "cpu")
+    with torch.inference_mode():
+        found = cuda.keypoints(detect(torch.from_numpy(padded)[None, None]).numpy())
+    expected = on_cpu(network_, rules, image)
+    assert np.abs(found.xy - expected.xy).max() < 1e-3
+    assert np.abs(found.score - expected.score).max() < 1e-5
+    assert np.abs(found.descriptors - expected.descriptors).max() < 1e-4
+
+
+def on_cpu(folded, rules, image) -> Keypoints:
+    from vioframe_keypointnet.detector import OnCpu
+    from vioframe_keypointnet.runtimes.torch import TorchOnCpu
+
+    return OnCpu(TorchOnCpu(folded, 1), rules)(padded_to_cells(image), image.shape, 60)
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+@pytest.mark.parametrize(("precision", "tolerance_px"), [("float32", 0.01), ("float16", 0.5)])
+def test_a_gpu_finds_the_same_keypoints(tiny, precision, tolerance_px):
+    image = texture((117, 155))
+    expected = FACTORY(weights=tiny, device="cpu", runtime="torch").detect(image, 60)
+    found = FACTORY(weights=tiny, device="cuda", precision=precision).detect(image, 60)
+    distance = np.linalg.norm(found.xy[:, None] - expected.xy[None], axis=2).min(axis=1)
+    assert np.mean(distance < tolerance_px) > 0.9
+
+
+def test_without_a_gpu_cuda_is_refused(tiny, monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    with pytest.raises(ConfigError, match="torch finds no CUDA device"):
+        FACTORY(weights=tiny, device="cuda")
+
+
+@pytest.mark.parametrize("runtime", ["torch", "onnxruntime", "openvino"])
+def test_the_conformance_kit_agrees_whatever_the_weights(tiny, runtime):
+    pytest.importorskip(runtime)
+    check_detector(FACTORY, weights=tiny, runtime=runtime, device="cpu", threads=1)
+
+
+def test_naming_the_detector_loads_nothing_heavy():
+    program = "import sys, vioframe_keypointnet as k; k.vioframe_detectors(); k.vioframe_trainers(); "
+    program += (
+        "sys.exit(' '.join({'torch', 'onnx', 'onnxruntime', 'openvino', 'cv2', 'numba'} & set(sys.modules)) or 0)"
+    )
+    done = subprocess.run([sys.executable, "-c", program], check=False, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
