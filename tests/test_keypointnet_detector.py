@@ -1,4 +1,4 @@
-"""The detector keypointnet: which candidates become keypoints, on images of any kind, and that it keeps the contract."""
+"""The detector keypointnet: which candidates become keypoints, on images of any kind, and the contract."""
 
 import subprocess
 import sys
@@ -14,7 +14,7 @@ from vioframe.errors import ConfigError  # noqa: E402
 from vioframe.testing import check_detector  # noqa: E402
 from vioframe.types import Keypoints  # noqa: E402
 from vioframe_keypointnet import vioframe_detectors  # noqa: E402
-from vioframe_keypointnet import weights as weights_file
+from vioframe_keypointnet import weights as weights_file  # noqa: E402
 from vioframe_keypointnet.folding import fold  # noqa: E402
 from vioframe_keypointnet.runtimes import cuda  # noqa: E402
 from vioframe_keypointnet.selection import Rules, candidate_places, padded_to_cells, select  # noqa: E402
