@@ -73,6 +73,9 @@ def machine_hall(shared_data: Path, tmp_path_factory: pytest.TempPathFactory) ->
         ("fast", "msckf", 0.025),
         ("orb", "msckf", 0.025),
         pytest.param("sift", "msckf", 0.025, marks=pytest.mark.slow),
+        pytest.param("akaze", "msckf", 0.015, marks=pytest.mark.slow),
+        pytest.param("brisk", "msckf", 0.015, marks=pytest.mark.slow),
+        pytest.param("surf", "msckf", 0.015, marks=pytest.mark.slow),
         ("shi_tomasi", "sliding_window", 0.012),
     ],
 )
