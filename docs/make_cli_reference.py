@@ -4,6 +4,7 @@ import inspect
 import re
 from pathlib import Path
 
+import click
 from click.testing import CliRunner
 
 from vioframe import registry
@@ -36,7 +37,14 @@ def page() -> str:
 
 
 def _commands() -> list[str]:
-    return [_help(), *(_help(name) for name in main.list_commands(None))]
+    context = click.Context(main)
+    names = main.list_commands(context)
+    return [_help(), *(section for name in names for section in _sections(name, main.get_command(context, name)))]
+
+
+def _sections(name: str, command: click.Command | None) -> list[str]:
+    within = command.list_commands(click.Context(command)) if isinstance(command, click.Group) else []
+    return [_help(name), *(_help(name, sub) for sub in within)]
 
 
 def _help(*command: str) -> str:

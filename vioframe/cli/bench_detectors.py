@@ -13,7 +13,7 @@ import click
 from vioframe.errors import ConfigError, DatasetError
 
 if TYPE_CHECKING:
-    from rich.table import Table
+    from rich.console import Group
 
     from vioframe.bench.detectors.entrants import Entrant, LineUp
     from vioframe.bench.results import Row
@@ -26,7 +26,7 @@ _SPEED_IMAGES, _SPEED_ROUNDS, _FLIGHT_S = 8, 10, 10.0
 _USES = {
     "speed": ("images", "limit", "rounds"),
     "quality": ("images", "hpatches", "limit", "degradations", "workers"),
-    "frontend": ("dataset", "degradations", "start", "duration", "workers"),
+    "frontend": ("dataset", "degradations", "start", "duration", "ground_truth", "workers"),
 }
 """Of the arguments that not every question has a use for, those that each has."""
 _ARGUMENTS = {"dataset": "DATASET", "degradations": "--degradation"}
@@ -44,7 +44,7 @@ class _Request:
 class _Answer:
     rows: Sequence[Row]
     settings: dict[str, Any]
-    tables: Sequence[Table]
+    tables: Sequence[Group]
     line_up: LineUp
 
 
@@ -65,6 +65,7 @@ class _Answer:
 @click.option("--rounds", type=click.IntRange(1), metavar="N", help=f"Rounds to time.  [default: {_SPEED_ROUNDS}]")
 @click.option("--start", type=click.FloatRange(0.0), metavar="S", help="Skip the first S seconds of DATASET.")
 @click.option("--duration", type=float, metavar="S", help=f"Seconds of DATASET.  [default: {_FLIGHT_S:g}]")
+@click.option("--ground-truth", type=_FILE, help="True motion, where DATASET brings none: TUM or EuRoC csv.")
 @click.option("--workers", type=click.IntRange(1), metavar="N", help="Processes.  [default: one a core]")
 @click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="Seed of all that is random.")
 @click.option("--record", "keep", type=_FILE, metavar="FILE", help="Also write the results, as JSON.")
@@ -119,7 +120,8 @@ def _given(question: str, specific: dict[str, Any]) -> dict[str, Any]:
         if value not in (None, ()) and name not in _USES[question]:
             use = " or ".join(f"--{other}" for other, uses in _USES.items() if name in uses and other != "speed")
             remedy = f"it goes with {use}" if use else "it is about speed alone"
-            raise ConfigError(f"{_ARGUMENTS.get(name, f'--{name}')} would do nothing here: {remedy}")
+            argument = _ARGUMENTS.get(name, "--" + name.replace("_", "-"))
+            raise ConfigError(f"{argument} would do nothing here: {remedy}")
     return {name: specific[name] for name in _USES[question]}
 
 
@@ -201,6 +203,7 @@ def _frontend(
     degradations: tuple[str, ...],
     start: float | None,
     duration: float | None,
+    ground_truth: Path | None,
     workers: int | None,
 ) -> _Answer:
     from vioframe.bench.detectors import flight, tables
@@ -214,7 +217,7 @@ def _frontend(
             "no recording given: `vioframe bench detectors --frontend DATASET`; `vioframe simulate` makes some"
         )
     chosen = choose(degradations)
-    stretch = flight.Stretch(dataset, start or 0.0, _FLIGHT_S if duration is None else duration)
+    stretch = flight.Stretch(dataset, start or 0.0, _FLIGHT_S if duration is None else duration, ground_truth)
     name = flight.check(stretch, request.installed)
     lined_up = line_up(request.entrants, request.installed)
     entrants = [entrant for entrant, _ in lined_up.ready]
@@ -252,7 +255,7 @@ def _watch(what: str, total: int, quiet: bool) -> Iterator[Callable[[int], None]
         yield lambda count: progress.advance(task, count)
 
 
-def _print(table: Table) -> None:
+def _print(table: Group) -> None:
     from rich.console import Console
 
     console = Console()

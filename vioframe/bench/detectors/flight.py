@@ -23,7 +23,7 @@ from vioframe.incidents import Incidents
 from vioframe.interfaces import Dataset
 from vioframe.registry import Registry
 from vioframe.synchronise import synchronise
-from vioframe.trajectory import Trajectory
+from vioframe.trajectory import Trajectory, load_trajectory
 from vioframe.types import NS_PER_S, Float, Frame, FrameTracks, ImuSegment
 
 SURVIVAL_FRAMES = (5, 10, 20)
@@ -36,11 +36,12 @@ _SWING_S, _TURN_S = 2.0, 8.0
 
 @dataclass(frozen=True, slots=True)
 class Stretch:
-    """The part of a recording to fly along."""
+    """The part of a recording to fly along, and the file of its true motion unless it brings that itself."""
 
     path: Path
     start_s: float = 0.0
     duration_s: float | None = None
+    ground_truth: Path | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,7 +73,7 @@ def check(stretch: Stretch, installed: Registry) -> str:
     if stretch.duration_s is not None and not 0.0 < stretch.duration_s < np.inf:
         raise ConfigError(f"--duration must be above 0, not {stretch.duration_s:g}")
     dataset = installed.open_dataset(stretch.path)
-    truth_of(dataset)
+    truth_of(dataset, stretch)
     return dataset.name
 
 
@@ -100,7 +101,7 @@ def _fly(job: _Job) -> list[Row]:
             "detector": label,
             "degradation": job.degradation.name,
             "level": job.degradation.level,
-            **track_figures(tracks, dataset, truth_of(dataset), options.grid),
+            **track_figures(tracks, dataset, truth_of(dataset, job.stretch), options.grid),
             "incidents": dict(incidents[label].counts),
         }
         for label, tracks in steps.items()
@@ -170,11 +171,11 @@ def track_figures(
     }
 
 
-def truth_of(dataset: Dataset) -> Trajectory:
-    """The true motion; raises :class:`DatasetError` where the recording brings none."""
-    truth = dataset.ground_truth
+def truth_of(dataset: Dataset, stretch: Stretch) -> Trajectory:
+    """The true motion; raises :class:`DatasetError` where there is none."""
+    truth = dataset.ground_truth if stretch.ground_truth is None else load_trajectory(stretch.ground_truth)
     if truth is None:
         raise DatasetError(
-            f"{dataset.name} brings no ground truth to judge tracks by; `vioframe simulate` makes recordings that do"
+            f"{dataset.name} brings no ground truth to judge tracks by; name a file of it with --ground-truth"
         )
     return truth

@@ -9,6 +9,7 @@ from typing import TypeVar
 import numpy as np
 
 from vioframe.errors import DatasetError
+from vioframe.images import decode_image, to_gray8
 from vioframe.types import Float, Image
 
 ItemT = TypeVar("ItemT")
@@ -28,12 +29,10 @@ def find_images(folder: Path) -> list[Path]:
 
 def read_grey(path: Path) -> Image:
     """(H, W) uint8; raises :class:`DatasetError` where the file cannot be decoded."""
-    import cv2
-
-    image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+    image = decode_image(path.read_bytes())
     if image is None:
-        raise DatasetError(f"{path} is missing or cannot be decoded; replace it or take it away")
-    return np.asarray(image, np.uint8)
+        raise DatasetError(f"{path} cannot be decoded; replace it or take it away")
+    return to_gray8(image, 16, str(path))
 
 
 def evenly(items: Sequence[ItemT], count: int | None) -> list[ItemT]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from rich.console import Group
 from rich.table import Table
 from rich.text import Text
 
@@ -16,17 +17,18 @@ from vioframe.bench.results import Row, reach
 _NOTHING = "-"
 
 
-def speed_table(rows: Sequence[Row], absent: Mapping[str, str], settings: Mapping[str, Any]) -> Table:
+def speed_table(rows: Sequence[Row], absent: Mapping[str, str], settings: Mapping[str, Any]) -> Group:
     """What was measured, beside what the thesis quotes; detectors known by quotation alone come last."""
     width, height = settings["resolution"]
-    table = _table(
+    heading = (
         f"Frames a second at {width} x {height}, {settings['max_points']} keypoints, batch 1, decoding excluded. "
         f"Measured here: {'; '.join(settings['devices'])}; {settings['image_count']} images ({settings['images']}) in "
         f"{settings['rounds']} rounds; median, and quartiles in brackets"
     )
+    table = _table()
     for column in ("detector", "thesis", "measured here", "ms", "points", "on"):
         table.add_column(column, justify="left" if column == "detector" else "right", no_wrap=True)
-    table.caption = f"thesis, Table 3.2: * {FROM_PAPER}; the others: {FROM_THESIS}"
+    caption = f"thesis, Table 3.2: * {FROM_PAPER}; the others: {FROM_THESIS}"
     for row in rows:
         measured = row["measured"]
         low, high = measured["fps_quartiles"]
@@ -45,16 +47,17 @@ def speed_table(rows: Sequence[Row], absent: Mapping[str, str], settings: Mappin
     for name, quoted in TABLE_3_2.items():
         if name not in known:
             table.add_row(quoted.title, _quoted(name), *(4 * [_NOTHING]))
-    return table
+    return _group(heading, table, caption)
 
 
-def quality_table(rows: Sequence[Row], settings: Mapping[str, Any]) -> Table:
+def quality_table(rows: Sequence[Row], settings: Mapping[str, Any]) -> Group:
     """All figures on images as they are."""
     width, height = settings["resolution"]
-    table = _table(
+    heading = (
         f"Found again: {settings['pair_count']} pairs ({settings['pairs']}), {width} x {height}, the "
         f"{settings['top_k']} strongest in both views, within 3 px; mean and standard deviation over pairs"
     )
+    table = _table()
     homography = [f"{px:g}px" for px in CORNERS_WITHIN_PX]
     titles = [
         "detector",
@@ -76,16 +79,17 @@ def quality_table(rows: Sequence[Row], settings: Mapping[str, Any]) -> Table:
             *(_number(reach(row, f"homography.{px}"), ".3f") for px in homography),
             _spread(row["matching_score"]),
         )
-    return table
+    return _group(heading, table)
 
 
-def frontend_table(rows: Sequence[Row], settings: Mapping[str, Any]) -> Table:
+def frontend_table(rows: Sequence[Row], settings: Mapping[str, Any]) -> Group:
     """All figures on images as they are."""
-    table = _table(
+    heading = (
         f"Followed by the front-end: {settings['dataset']}, {settings['duration_s']:g} s after the first "
         f"{settings['start_s']:g} s; inliers within {settings['epipolar_inlier_px']:g} px of the true epipolar line "
         f"over {settings['epipolar_baseline_frames']} frames"
     )
+    table = _table()
     columns = {
         "alive": ("points", ".0f"),
         "survival.5": ("alive after 5", ".1%"),
@@ -102,14 +106,15 @@ def frontend_table(rows: Sequence[Row], settings: Mapping[str, Any]) -> Table:
     for row in _of(rows, Degradation()):
         figures = (_number(reach(row, key), spec) for key, (_, spec) in columns.items())
         table.add_row(Text(row["detector"]), *figures)
-    return table
+    return _group(heading, table)
 
 
-def sweep_table(rows: Sequence[Row], degradations: Sequence[Degradation], key: str, title: str, baseline: str) -> Table:
+def sweep_table(rows: Sequence[Row], degradations: Sequence[Degradation], key: str, title: str, baseline: str) -> Group:
     """``key`` of every detector at every level, with the lead over ``baseline`` where that takes part."""
     labels = list(dict.fromkeys(row["detector"] for row in rows))
     led = baseline in labels
-    table = _table(f"{title} by degradation" + (f"; in brackets the lead over {baseline}" if led else ""))
+    heading = f"{title} by degradation" + (f"; in brackets the lead over {baseline}" if led else "")
+    table = _table()
     table.add_column("degradation", no_wrap=True)
     for label in labels:
         table.add_column(Text(label), justify="right", no_wrap=True)
@@ -118,7 +123,7 @@ def sweep_table(rows: Sequence[Row], degradations: Sequence[Degradation], key: s
         reference = _mean(of_it[baseline], key) if led else None
         cells = [_led(of_it[label], key, None if label == baseline else reference) for label in labels]
         table.add_row(Text(degradation.label), *cells)
-    return table
+    return _group(heading, table)
 
 
 def _led(row: Row, key: str, reference: float | None) -> str:
@@ -139,8 +144,13 @@ def _of(rows: Sequence[Row], degradation: Degradation) -> list[Row]:
     return [r for r in rows if (r["degradation"], r["level"]) == (degradation.name, degradation.level)]
 
 
-def _table(title: str) -> Table:
-    return Table(title=Text(title), title_justify="left", caption_justify="left", box=None, pad_edge=False)
+def _table() -> Table:
+    return Table(box=None, pad_edge=False)
+
+
+def _group(heading: str, table: Table, caption: str = "") -> Group:
+    """Not as the table's own title, which would be folded at the width of the table."""
+    return Group(Text(heading, style="bold"), table, Text(caption))
 
 
 def _quoted(name: str) -> str:
