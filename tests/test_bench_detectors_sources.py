@@ -13,7 +13,7 @@ from test_bench_detectors import textured
 
 from vioframe import registry
 from vioframe.bench.detectors.degradations import Degradation
-from vioframe.bench.detectors.entrants import line_up, parse_entrants
+from vioframe.bench.detectors.entrants import everyone, line_up, parse_entrants
 from vioframe.bench.detectors.flight import Stretch, fly_detectors
 from vioframe.bench.detectors.images import evenly, find_images, fit, fitting, procedural_images, read_grey
 from vioframe.bench.detectors.metrics import lands_inside, warp
@@ -164,7 +164,12 @@ def _empty(folder: Path) -> Path:
 
 
 def test_every_installed_detector_takes_part_unless_some_are_named(installed):
-    assert [e.name for e in parse_entrants((), (), installed)] == installed.names(registry.DETECTOR)
+    names = installed.names(registry.DETECTOR)
+    assert everyone(installed, "frontend") == names
+    for question in ("speed", "quality"):
+        specs = everyone(installed, question)
+        assert sorted({spec.partition(":")[0] for spec in specs}) == names
+        assert len(specs) == len(set(specs)) > len(names)
     assert [e.label for e in parse_entrants(["orb", "sift", "orb"], (), installed)] == ["orb", "sift"]
 
 

@@ -61,7 +61,9 @@ class _Answer:
 @click.option(
     "--limit", type=click.IntRange(1), metavar="N", help=f"Images.  [default: {_SPEED_IMAGES} for speed, or all]"
 )
-@click.option("--degradation", "degradations", metavar="NAME", multiple=True, help="Degrade by this; none: not at all.")
+@click.option(
+    "--degradation", "degradations", metavar="NAME", multiple=True, help="Degrade by this alone.  [default: each]"
+)
 @click.option("--rounds", type=click.IntRange(1), metavar="N", help=f"Rounds to time.  [default: {_SPEED_ROUNDS}]")
 @click.option("--start", type=click.FloatRange(0.0), metavar="S", help="Skip the first S seconds of DATASET.")
 @click.option("--duration", type=float, metavar="S", help=f"Seconds of DATASET.  [default: {_FLIGHT_S:g}]")
@@ -83,15 +85,16 @@ def command(
     """Compare detectors: by default their speed at 640 x 480 with 300 keypoints, as in the thesis' Table 3.2.
 
     \b
-    --quality   the HPatches protocol at 320 x 240 with 300 keypoints: on photographs seen through known
-                homographies (--images DIR) or on HPatches itself (--hpatches DIR), as they are and degraded
-    --frontend  how long and how truly the front-end follows what was detected along DATASET, as it is and degraded
+    --quality   the HPatches protocol at 320 x 240 with 300 keypoints, on
+                photographs through homographies (--images DIR) or on HPatches
+                itself (--hpatches DIR), as they are and degraded
+    --frontend  how long and how truly the front-end follows what was detected
+                along DATASET, as it is and degraded
 
     docs/bench_detectors.md says what the figures mean.
     """
     from vioframe import registry
-    from vioframe.bench.detectors.entrants import parse_entrants
-    from vioframe.bench.detectors.speed import variants
+    from vioframe.bench.detectors.entrants import everyone, parse_entrants
     from vioframe.bench.results import record
 
     if quality and frontend:
@@ -99,8 +102,8 @@ def command(
     question = "quality" if quality else "frontend" if frontend else "speed"
     given = _given(question, specific)
     installed = registry.load()
-    named = detectors or (variants(installed) if question == "speed" else ())
-    request = _Request(parse_entrants(named, options, installed), installed, seed, quiet)
+    specs = detectors or everyone(installed, question)
+    request = _Request(parse_entrants(specs, options, installed), installed, seed, quiet)
     questions: dict[str, Callable[..., _Answer]] = {"speed": _speed, "quality": _quality, "frontend": _frontend}
     answer = questions[question](request, **given)
     for table in answer.tables:

@@ -16,6 +16,12 @@ from vioframe.registry import DETECTOR, Registry, describe
 from vioframe.types import Image, Keypoints
 
 _DESCRIPTORS = "descriptors"
+_VARIANTS: Mapping[str, Mapping[str, Sequence[str]]] = {
+    # Speed does not depend on what the weights are: the published size is timed also where there are none for it.
+    "speed": {"keypointnet": tuple(f"keypointnet:weights=untrained:full{how}" for how in ("", ",precision=int8"))},
+    # 10 px between corners, the default, suits tracking; it leaves out many that could be found again.
+    "quality": {"shi_tomasi": ("shi_tomasi:min_distance_px=4",)},
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,14 +46,20 @@ class LineUp:
     absent: Mapping[str, str]
 
 
+def everyone(installed: Registry, question: str) -> list[str]:
+    """Specs of every installed detector, and of its variants that matter to ``question``: speed, quality, frontend."""
+    variants = _VARIANTS.get(question, {})
+    return [spec for name in installed.names(DETECTOR) for spec in (name, *variants.get(name, ()))]
+
+
 def parse_entrants(specs: Sequence[str], assignments: Sequence[str], installed: Registry) -> list[Entrant]:
-    """An entrant for each of ``specs``, or for every installed detector where there are none.
+    """An entrant for each of ``specs``.
 
     A spec is a name, or a name with options of its own: ``sift:contrast_threshold=0.01,edge_threshold=12``.
     ``assignments``, texts such as ``sift.contrast_threshold=0.01``, go to every entrant of that name; the name may be
     left out where only one has such an option. Raises :class:`ConfigError` or :class:`PluginError`.
     """
-    specs = list(dict.fromkeys(specs)) or installed.names(DETECTOR)
+    specs = list(dict.fromkeys(specs))
     named = [(name, own) for name, _, own in (spec.partition(":") for spec in specs)]
     options = {name: installed.find(DETECTOR, name).options for name, _ in named}
     shared: dict[str, dict[str, Any]] = {name: {} for name in options}

@@ -15,13 +15,10 @@ from vioframe.bench.detectors.quoted import TABLE_3_2
 from vioframe.bench.processes import usable_cores
 from vioframe.bench.results import Row
 from vioframe.interfaces import Detector
-from vioframe.registry import DETECTOR, Registry
 from vioframe.types import Float, Image, Int
 
 RESOLUTION = (640, 480)
 MAX_POINTS = 300
-# Speed does not depend on what the weights are: the published size is timed where no weights for it are at hand.
-_VARIANTS = {"keypointnet": tuple(f"keypointnet:weights=untrained:full{how}" for how in ("", ",precision=int8"))}
 
 
 @runtime_checkable
@@ -62,11 +59,6 @@ def time_detectors(
                     points[k].append(len(found.xy))
         on_round(1)
     return [_row(*one, np.array(s), np.array(p)) for one, s, p in zip(ready, seconds, points, strict=True)]
-
-
-def variants(installed: Registry) -> list[str]:
-    """Every installed detector, and the sizes of those that come in several."""
-    return [spec for name in installed.names(DETECTOR) for spec in (name, *_VARIANTS.get(name, ()))]
 
 
 def devices() -> list[str]:
