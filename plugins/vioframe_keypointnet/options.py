@@ -19,7 +19,7 @@ class KeypointNetOptions:
     runtime: Runtime = "auto"
     """Library that runs the network; auto takes the fastest that is installed."""
     precision: Precision = "auto"
-    """Auto: float16 on CUDA, int8 with OpenVINO where the weights allow it, else float32."""
+    """Auto: float16 on CUDA; on a CPU int8 where runtime and weights have it, else float32."""
     device: Device = "auto"
     """Auto takes CUDA where there is any."""
     threads: int = 0

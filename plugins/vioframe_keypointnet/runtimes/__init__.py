@@ -56,7 +56,7 @@ def choose(runtime: Runtime, precision: Precision, device: Device, calibrated: b
     if chosen not in able:
         raise ConfigError(f"on a CPU {chosen} has the precision {' or '.join(ON_CPU[chosen])}, not {precision}")
     if precision == "auto":
-        return chosen, "int8" if calibrated and chosen == "openvino" else "float32", "cpu"
+        return chosen, "int8" if calibrated and "int8" in ON_CPU[chosen] else "float32", "cpu"
     return chosen, precision, "cpu"
 
 
