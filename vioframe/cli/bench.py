@@ -7,7 +7,7 @@ import click
 from vioframe.cli.lazy import LazyGroup
 
 _COMMANDS = {
-    "detectors": "Speed, repeatability, and tracks in the front-end, of every detector.",
+    "detectors": "Detectors by speed, by quality, or by the tracks made of them.",
 }
 
 
