@@ -8,6 +8,7 @@ by one each channel, signed. LeakyReLU becomes ReLU there: most of what it lets 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -18,6 +19,9 @@ from vioframe_keypointnet.optional import needs
 from vioframe_keypointnet.tensors import OUT
 
 _OPSET, _IR = 17, 9
+
+_MIDDLE_GREY = 128
+"""The whole number nearest to :data:`NEUTRAL_GREY`, so that an image's own 8 bits can be multiplied."""
 
 
 def onnx_model(
@@ -31,14 +35,24 @@ def onnx_model(
         from onnx import TensorProto, helper
 
     graph = _Graph(activation_ranges or {})
-    floats = graph.add("Cast", ["image"], to=TensorProto.FLOAT)
-    outputs = network.build(graph, graph.add("Sub", [floats, graph.constant(np.float32(NEUTRAL_GREY))]))
+    if activation_ranges:
+        outputs = _seeing_integers(network).build(graph, graph.dequantised("image", np.float32(1.0), _MIDDLE_GREY))
+    else:
+        floats = graph.add("Cast", ["image"], to=TensorProto.FLOAT)
+        outputs = network.build(graph, graph.add("Sub", [floats, graph.constant(np.float32(NEUTRAL_GREY))]))
     height, width = shape
     image = helper.make_tensor_value_info("image", TensorProto.UINT8, [1, 1, height, width])
     found = [helper.make_tensor_value_info(name, TensorProto.FLOAT, None) for name in outputs]
     made = helper.make_graph(graph.nodes, "keypointnet", [image], found, graph.constants)
     model = helper.make_model(made, opset_imports=[helper.make_opsetid("", _OPSET)], ir_version=_IR)
     return bytes(model.SerializeToString())
+
+
+def _seeing_integers(network: FoldedNetwork) -> FoldedNetwork:
+    """``network`` for grey levels less a whole number; only what it sees beyond the border differs, by half a level."""
+    first, *rest = network.encoder
+    shift = first.weight.sum(axis=(1, 2, 3)) * np.float32(_MIDDLE_GREY - NEUTRAL_GREY)
+    return replace(network, encoder=(replace(first, bias=first.bias + shift), *rest))
 
 
 class _Graph:
@@ -58,7 +72,9 @@ class _Graph:
         weight, bias = self._integers(layer, self._steps[x]) if integer else self._floats(layer)
         y = self.add("Conv", [x, weight, bias], pads=[layer.pad] * 4, strides=[layer.stride] * 2)
         if layer.name in self._ranges:
-            return self._quantised(self.add("Relu", [y]), np.float32(self._ranges[layer.name] / 255.0))
+            step = np.float32(self._ranges[layer.name] / 255.0)
+            of = [self.constant(step), self.constant(np.uint8(0))]
+            return self.dequantised(self.add("QuantizeLinear", [self.add("Relu", [y]), *of]), step, 0)
         return self.add("LeakyRelu", [y], alpha=LEAK) if layer.activated else y
 
     def pool(self, x: str) -> str:
@@ -72,6 +88,12 @@ class _Graph:
 
     def join(self, a: str, b: str) -> str:
         return self.add("Concat", [a, b], axis=1)
+
+    def dequantised(self, x: str, step: np.float32, zero: int) -> str:
+        """The values of ``x`` uint8, of which convolutions may make use as they are."""
+        y = self.add("DequantizeLinear", [x, self.constant(step), self.constant(np.uint8(zero))])
+        self._steps[y] = step
+        return y
 
     def add(self, kind: str, inputs: list[str], **attributes: Any) -> str:
         from onnx import helper
@@ -96,14 +118,8 @@ class _Graph:
         weight = np.round(layer.weight / steps[:, None, None, None]).astype(np.int8)
         products = steps * input_step
         bias = np.clip(np.round(layer.bias / products.astype(np.float64)), -(2**31), 2**31 - 1).astype(np.int32)
-        return self._dequantised(weight, steps), self._dequantised(bias, products)
+        return self._of_channels(weight, steps), self._of_channels(bias, products)
 
-    def _dequantised(self, integers: NDArray[np.generic], steps: NDArray[np.float32]) -> str:
+    def _of_channels(self, integers: NDArray[np.generic], steps: NDArray[np.float32]) -> str:
         zeros = self.constant(np.zeros(len(steps), integers.dtype))
         return self.add("DequantizeLinear", [self.constant(integers), self.constant(steps), zeros], axis=0)
-
-    def _quantised(self, x: str, step: np.float32) -> str:
-        of = [self.constant(step), self.constant(np.uint8(0))]
-        y = self.add("DequantizeLinear", [self.add("QuantizeLinear", [x, *of]), *of])
-        self._steps[y] = step
-        return y
