@@ -298,7 +298,9 @@ def test_the_quality_of_two_detectors(photographs, tmp_path):
     out = bench(*arguments, "--degradation", "noise", "--quiet", "--record", keep)
     assert "3 pairs (photographs, synthetic homographies)" in out.stdout
     assert "lead over shi_tomasi" in out.stdout
-    rows = json.loads(keep.read_text())["results"]
+    content = json.loads(keep.read_text())
+    assert content["settings"]["detectors"] == {"shi_tomasi": {}, "orb": {"descriptors": True}}
+    rows = content["results"]
     assert len(rows) == 2 * 4
     shi_tomasi, orb = rows[:2]
     assert shi_tomasi["matching_score"] is None

@@ -113,7 +113,8 @@ def command(
         click.echo(f"note: {label} does not take part: {reason}", err=True)
     if keep is not None:
         rows = [*answer.rows, *({"detector": label, "absent": reason} for label, reason in absent.items())]
-        record(keep, rows, {"question": question, "seed": seed, **answer.settings})
+        taking_part = {entrant.label: dict(entrant.options) for entrant, _ in answer.line_up.ready}
+        record(keep, rows, {"question": question, "seed": seed, **answer.settings, "detectors": taking_part})
         click.echo(f"written to {keep}")
 
 

@@ -78,7 +78,6 @@ def _row(entrant: Entrant, detector: Detector, seconds: Float, points: Int) -> R
     quoted = TABLE_3_2.get(entrant.name)
     return {
         "detector": entrant.label,
-        "options": dict(entrant.options),
         "calls": len(seconds),
         "measured": {
             "fps": float(1.0 / median),
