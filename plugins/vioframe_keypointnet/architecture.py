@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 
 from vioframe.errors import ConfigError
 
@@ -25,9 +25,15 @@ class Architecture:
     blocks: tuple[tuple[int, ...], ...] = ((32, 32), (64, 64), (128, 128), (256, 256))
     head: int = 256
     descriptor: int = 256
+    peaks: bool = False
+    """Whether a keypoint is the peak of a response as fine as the image, which the second block gives, and images are
+    freed of local brightness and contrast first. The published network regresses places from its deepest block, which
+    takes it days to learn."""
 
     def __post_init__(self) -> None:
         channels = (*(c for block in self.blocks for c in block), self.head, self.descriptor)
+        if self.peaks and not self.folds_pixels:
+            raise ConfigError(f"no KeypointNet can be built of {self}: peaks need an empty first block")
         if len(self.blocks) != 4 or not all(self.blocks[1:]) or min(channels) < 1 or self.image_channels not in (1, 3):
             raise ConfigError(f"no KeypointNet can be built of {self}: four blocks of channels, the first may be empty")
 
@@ -40,9 +46,8 @@ class Architecture:
             return max(1, round(factor * channels))
 
         blocks = tuple(tuple(map(times, block)) for block in self.blocks)
-        return Architecture(
-            f"{self.name}-x{factor:g}", self.image_channels, blocks, times(self.head), times(self.descriptor)
-        )
+        name, head, descriptor = f"{self.name}-x{factor:g}", times(self.head), times(self.descriptor)
+        return replace(self, name=name, blocks=blocks, head=head, descriptor=descriptor)
 
     @property
     def folds_pixels(self) -> bool:
@@ -76,5 +81,5 @@ class Architecture:
 
 
 FULL = Architecture()
-COMPACT = Architecture("compact", 1, ((), (16,), (32, 32), (64, 64)), 64, 64)
+COMPACT = Architecture("compact", 1, ((), (16, 16, 16), (32,), (64,)), 64, 64, peaks=True)
 ARCHITECTURES = {architecture.name: architecture for architecture in (FULL, COMPACT)}

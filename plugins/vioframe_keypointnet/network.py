@@ -9,12 +9,14 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
-from torch.nn.functional import grid_sample, normalize
+from torch.nn.functional import avg_pool2d, grid_sample, interpolate, normalize, pad, pixel_shuffle, pixel_unshuffle
 
 from vioframe_keypointnet.architecture import CELL_PX, FULL, Architecture
 
 _CROSS_RATIO = 2.0
-"""How far a keypoint may lie from its cell's centre, in half cells: neighbouring cells reach into each other."""
+"""How far a regressed keypoint may lie from its cell's centre, in half cells: neighbours reach into each other."""
+_FAINT = 0.02
+"""Deviation, of a range of one, that local normalisation takes for noise rather than contrast."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,6 +29,8 @@ class Detection:
     """(B, 2, h, w) px."""
     descriptors: Tensor
     """(B, D, H/4, W/4), not yet normalised; :func:`describe` samples them."""
+    response: Tensor | None = None
+    """(B, 64, h, w) for a network of peaks: but for a constant, the logarithm of how likely each pixel is."""
 
 
 class KeypointNet(nn.Module):
@@ -43,7 +47,11 @@ class KeypointNet(nn.Module):
         deepest, skip = architecture.blocks[3][-1], architecture.blocks[2][-1]
         head, quarter = architecture.head, architecture.blocks[2][-1]
         self.convDa, self.convDb = _conv_bn(deepest, head), nn.Conv2d(head, 1, 3, padding=1)
-        self.convPa, self.convPb = _conv_bn(deepest, head), nn.Conv2d(head, 2, 3, padding=1)
+        if architecture.peaks:
+            # Four pixels of the response at each place of the second block.
+            self.convR = nn.Conv2d(architecture.blocks[1][-1], 4, 3, padding=1)
+        else:
+            self.convPa, self.convPb = _conv_bn(deepest, head), nn.Conv2d(head, 2, 3, padding=1)
         self.convFa, self.convFb = _conv_bn(deepest, head), _conv_bn(head, 4 * quarter)
         self.convFaa = _conv_bn(quarter + skip, head)
         self.convFbb = nn.Conv2d(head, architecture.descriptor, 3, padding=1)
@@ -53,32 +61,68 @@ class KeypointNet(nn.Module):
 
     def forward(self, images: Tensor) -> Detection:
         """``images`` (B, C, H, W) in [0, 1], H and W multiples of 8."""
-        x = (images - 0.5) * 0.225
+        x = locally_normalised(images) if self.architecture.peaks else (images - 0.5) * 0.225
         if self.architecture.folds_pixels:
             x = self.fold(x)
+        after: dict[str, Tensor] = {}
         for name, *_ in self.architecture.encoder:
             x = self.act(self.get_submodule(f"conv{name}")(x))
             if name.endswith("b"):
                 x = self.dropout(x)
-            if name[0] == "3":
-                skip = x
+            after[name[0]] = x
             if name in self.architecture.pooled:
                 x = self.pool(x)
         # Pixels of a large image do not fit into half precision.
-        score = torch.sigmoid(self.convDb(self.dropout(self.act(self.convDa(x)))).float())[:, 0]
-        place = torch.tanh(self.convPb(self.dropout(self.act(self.convPa(x)))).float())
+        response = None
+        score = self.convDb(self.dropout(self.act(self.convDa(x)))).float()[:, 0]
+        if self.architecture.peaks:
+            response = cells_of(self.convR(after["2"]).float())
+            score = score + torch.logsumexp(response, dim=1)
+            place = peak_places(response)
+        else:
+            place = torch.tanh(self.convPb(self.dropout(self.act(self.convPa(x)))).float())
+            place = _CROSS_RATIO * (CELL_PX - 1) / 2 * place
         x = self.convFb(self.dropout(self.act(self.convFa(x))))
-        x = self.act(self.convFaa(torch.cat([self.unfold(x), skip], dim=1)))
-        return Detection(_without_ring(score), keypoint_places(place), self.convFbb(x))
+        x = self.act(self.convFaa(torch.cat([self.unfold(x), after["3"]], dim=1)))
+        return Detection(_without_ring(torch.sigmoid(score)), keypoint_places(place), self.convFbb(x), response)
+
+
+def locally_normalised(images: Tensor) -> Tensor:
+    """``images`` (B, C, H, W) less their mean, over their deviation, of about 20 px around; flat parts stay small."""
+
+    def smooth(x: Tensor) -> Tensor:
+        coarse = pad(avg_pool2d(x, 4), (2, 2, 2, 2), mode="replicate")
+        return interpolate(avg_pool2d(coarse, 5, stride=1), scale_factor=4.0, mode="bilinear")
+
+    flat = images - smooth(images)
+    return flat / (smooth(flat.square()) + _FAINT**2).sqrt()
+
+
+def cells_of(response: Tensor) -> Tensor:
+    """(B, 64, h, w), the pixels of each cell row by row, of what ``convR`` gives: (B, 4, H/2, W/2), 2 x 2 px each."""
+    return pixel_unshuffle(pixel_shuffle(response, 2), CELL_PX)
+
+
+def peak_places(response: Tensor) -> Tensor:
+    """(B, 2, h, w) px from the cell's centre: the largest of ``response`` (B, 64, h, w) and what is about it, weighted.
+
+    The weights, exp(response), are of pixels at most 2 px away along either axis and in the same cell.
+    """
+    along = torch.arange(CELL_PX, device=response.device)
+    rows, columns = (x.reshape(1, -1, 1, 1) for x in torch.meshgrid(along, along, indexing="ij"))
+    peak = response.argmax(dim=1, keepdim=True)
+    far = ((rows - peak // CELL_PX).abs() > 2) | ((columns - peak % CELL_PX).abs() > 2)
+    weights = torch.softmax(response.masked_fill(far, -torch.inf), dim=1)
+    return torch.stack([(weights * axis).sum(dim=1) for axis in (columns, rows)], dim=1) - (CELL_PX - 1) / 2
 
 
 def keypoint_places(place: Tensor) -> Tensor:
-    """(B, 2, h, w) px from the location head's (B, 2, h, w) in [-1, 1], within the image."""
+    """(B, 2, h, w) px in the image, and within it, of (B, 2, h, w) px from the centres of the cells."""
     h, w = place.shape[-2:]
     rows, columns = torch.meshgrid(torch.arange(h), torch.arange(w), indexing="ij")
     centre = torch.stack([columns, rows]).to(place) * CELL_PX + (CELL_PX - 1) / 2
     limit = place.new_tensor([w * CELL_PX - 1.0, h * CELL_PX - 1.0])[:, None, None]
-    return torch.minimum((centre + _CROSS_RATIO * (CELL_PX - 1) / 2 * place).clamp(min=0.0), limit)
+    return torch.minimum((centre + place).clamp(min=0.0), limit)
 
 
 def describe(descriptors: Tensor, xy: Tensor) -> Tensor:

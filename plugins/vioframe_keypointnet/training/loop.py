@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,7 @@ from torch import Tensor
 from torch.optim import Adam
 
 from vioframe.errors import ConfigError
-from vioframe_keypointnet.network import Detection, InlierOutlierNet, KeypointNet
+from vioframe_keypointnet.network import InlierOutlierNet, KeypointNet
 from vioframe_keypointnet.training.images import Picture
 from vioframe_keypointnet.training.lessons import teach
 from vioframe_keypointnet.training.losses import losses
@@ -134,7 +134,7 @@ def step_losses(
     """The losses of a batch of pairs, of the lessons where it is ``taught``; ``total`` is what is minimised."""
     with torch.autocast(pairs.source.device.type, torch.bfloat16, enabled=options.precision == "bfloat16"):
         seen = [network(x.contiguous(memory_format=torch.channels_last)) for x in (pairs.source, pairs.target)]
-    a, b = (Detection(d.score.float(), d.xy.float(), d.descriptors.float()) for d in seen)
+    a, b = (replace(d, descriptors=d.descriptors.float()) for d in seen)
     if taught:
         return teach(a, b, pairs.source_lesson, pairs.target_lesson)
     values = dict(losses(a, b, pairs.homography, judge, options.top))
