@@ -10,8 +10,9 @@ from vioframe_keypointnet.weights import Weights
 
 TINY = Architecture("tiny", 1, ((), (8,), (8,), (12, 8)), 16, 8)
 COLOUR = Architecture("colour", 3, ((), (8,), (8,), (8,)), 8, 8)
+PEAKS = Architecture("peaks", 3, ((), (8, 12), (16,), (8,)), 16, 8, peaks=True)
 NARROW = FULL.widened(0.125)
-ARCHITECTURES = {architecture.name: architecture for architecture in (TINY, COLOUR, NARROW, COMPACT)}
+ARCHITECTURES = {architecture.name: architecture for architecture in (TINY, COLOUR, PEAKS, NARROW, COMPACT)}
 
 
 def network(architecture: Architecture, seed: int = 0) -> KeypointNet:
@@ -24,7 +25,7 @@ def network(architecture: Architecture, seed: int = 0) -> KeypointNet:
                 module.momentum = None
                 module.weight.uniform_(0.5, 1.5)
                 module.bias.normal_(0.0, 0.3)
-        for last in (net.convDb, net.convPb):
+        for last in (net.convDb, net.convR if architecture.peaks else net.convPb):
             last.weight.mul_(4.0)
         net.train()
         for number in range(4):

@@ -17,7 +17,7 @@ from vioframe_keypointnet import vioframe_detectors  # noqa: E402
 from vioframe_keypointnet import weights as weights_file  # noqa: E402
 from vioframe_keypointnet.folding import fold  # noqa: E402
 from vioframe_keypointnet.runtimes import cuda  # noqa: E402
-from vioframe_keypointnet.selection import Rules, candidate_places, padded_to_cells, select  # noqa: E402
+from vioframe_keypointnet.selection import OFFSET_PX, Rules, candidate_places, padded_to_cells, select  # noqa: E402
 from vioframe_keypointnet.torch_selection import TorchSelection  # noqa: E402
 
 FACTORY = vioframe_detectors()["keypointnet"]
@@ -34,6 +34,12 @@ def tiny(tmp_path_factory):
 
 def random_heads(h=30, w=40, seed=0):
     return np.random.default_rng(seed).normal(size=(3, h, w)).astype(np.float32)
+
+
+def scores_and_offsets(heads):
+    """What the device gets of the same heads."""
+    tensor = torch.from_numpy(heads)
+    return tensor[0], OFFSET_PX * torch.tanh(tensor[1:])
 
 
 def by_definition(heads, image, shape, rules):
@@ -80,7 +86,7 @@ def test_selection_on_the_device_is_the_same(nms_px, shape):
     image = padded_to_cells(half_blank(shape))
     xy, score = select(heads, image, shape, 300, rules)
     selection = TorchSelection(image.shape, shape, rules, "cpu")
-    rows = selection(torch.from_numpy(heads), torch.from_numpy(image).float(), None, 300)
+    rows = selection(*scores_and_offsets(heads), torch.from_numpy(image).float(), None, 300)
     found = cuda.keypoints(rows.numpy())
     assert len(found.xy) == len(xy) > 20
     assert np.abs(found.xy - xy).max() < 1e-4
@@ -96,7 +102,7 @@ def test_equal_scores_leave_one_of_two_neighbours():
     gap = np.linalg.norm(xy[:, None] - xy[None], axis=2)
     assert gap[np.triu_indices(len(xy), 1)].min() >= 4.0
     selection = TorchSelection((240, 320), (240, 320), rules, "cpu")
-    rows = selection(torch.from_numpy(heads), torch.from_numpy(image).float(), None, 10_000)
+    rows = selection(*scores_and_offsets(heads), torch.from_numpy(image).float(), None, 10_000)
     same = cuda.keypoints(rows.numpy()).xy
     assert {tuple(p) for p in np.round(same, 3)} == {tuple(p) for p in np.round(xy, 3)}
 
@@ -179,7 +185,7 @@ def on_cpu(folded, rules, image) -> Keypoints:
     from vioframe_keypointnet.detector import OnCpu
     from vioframe_keypointnet.runtimes.torch import TorchOnCpu
 
-    return OnCpu(TorchOnCpu(folded, 1), rules)(padded_to_cells(image), image.shape, 60)
+    return OnCpu(TorchOnCpu(folded, 1), rules, folded.architecture.peaks)(padded_to_cells(image), image.shape, 60)
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")

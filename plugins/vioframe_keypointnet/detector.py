@@ -33,10 +33,12 @@ class OnCpu:
 
     run: runtimes.Run
     rules: Rules
+    peaks: bool
 
     def __call__(self, padded: Image, shape: tuple[int, int], max_points: int) -> Keypoints:
         heads, *described = self.run(padded)
-        xy, score = select(heads, padded, shape, max_points, self.rules)
+        likely = described.pop(0) if self.peaks else None
+        xy, score = select(heads, padded, shape, max_points, self.rules, likely)
         return Keypoints(xy, score, describe(described[0], xy) if described else None)
 
 
@@ -70,5 +72,5 @@ def keypointnet(options: KeypointNetOptions) -> Detector:
         engine = OnCuda(network, rules, precision)
     else:
         run = runtimes.on_cpu(runtime, precision, network, weights.activation_ranges, options.threads)
-        engine = OnCpu(run, rules)
+        engine = OnCpu(run, rules, network.architecture.peaks)
     return KeypointNet(engine, runtime, precision, device)

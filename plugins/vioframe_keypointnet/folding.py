@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vioframe_keypointnet.architecture import Architecture
-from vioframe_keypointnet.tensors import HEADS, OUT, Tensors
+from vioframe_keypointnet.tensors import HEADS, OUT, RESPONSE, Tensors
 from vioframe_keypointnet.weights import Weights
 
 LEAK = 0.01
@@ -22,6 +22,9 @@ LEAK = 0.01
 
 NEUTRAL_GREY = 127.5
 """The grey that the network sees as 0; also what lies around the image."""
+
+LARGEST_EXPONENT = 60.0
+"""Responses are cut off there, so that the sum over a cell of their exponentials is a float."""
 
 _SCALE = 0.225 / 255.0
 _BATCH_NORM_EPSILON = 1e-5
@@ -49,6 +52,12 @@ class Convolution:
 class Operations(Protocol[NodeT]):
     """What a library must offer; a node is a tensor, or its name in a graph."""
 
+    def centred(self, image: NodeT) -> NodeT:
+        """Grey levels less :data:`NEUTRAL_GREY`."""
+
+    def normalised(self, image: NodeT) -> NodeT:
+        """What :func:`vioframe_keypointnet.network.locally_normalised` makes of grey levels."""
+
     def convolve(self, layer: Convolution, x: NodeT) -> NodeT: ...
 
     def pool(self, x: NodeT) -> NodeT:
@@ -60,36 +69,48 @@ class Operations(Protocol[NodeT]):
     def join(self, a: NodeT, b: NodeT) -> NodeT:
         """The channels of ``a``, then those of ``b``."""
 
+    def exponential(self, x: NodeT) -> NodeT: ...
+
+    def log_sum_of_cells(self, x: NodeT) -> NodeT:
+        """(B, 4, H/2, W/2) -> (B, 1, H/8, W/8): the logarithm of the sum over each cell."""
+
+    def add(self, a: NodeT, b: NodeT) -> NodeT: ...
+
 
 @dataclass(frozen=True, slots=True)
 class FoldedNetwork:
-    """Layers of the detector, from grey images less :data:`NEUTRAL_GREY`, and those of the descriptors if wanted."""
+    """Layers of the detector, for grey images, and those of the descriptors if wanted."""
 
     architecture: Architecture
     encoder: tuple[Convolution, ...]
     heads: tuple[Convolution, Convolution]
+    response: Convolution | None = None
+    """For a network of peaks: that which gives 2 x 2 pixels of the response at each place of the second block."""
     description: tuple[Convolution, ...] = ()
     """Fa, Fb, Faa, Fbb, or nothing."""
 
     def build(self, operations: Operations[NodeT], image: NodeT) -> tuple[NodeT, ...]:
-        """(B, 1, H, W) -> (B, 3, H/8, W/8), before sigmoid and tanh: score, x, y; then (B, D, H/4, W/4) if described.
+        """From (B, 1, H, W) grey levels: (B, 3, H/8, W/8), before sigmoid and tanh, the score, x and y of each cell.
 
-        The descriptors are not normalised yet.
+        For a network of peaks: (B, 1, H/8, W/8) the score, and (B, 4, H/2, W/2) the exponential of the response, 2 x 2
+        pixels in each place. Then, if it describes, (B, D, H/4, W/4) descriptors, not normalised yet.
         """
-        x = skip = image
+        x = operations.centred(image) if self.response is None else operations.normalised(image)
+        after = {}
         for layer in self.encoder:
-            x = operations.convolve(layer, x)
-            if layer.name.startswith("3"):
-                skip = x
+            x = after[layer.name[0]] = operations.convolve(layer, x)
             if layer.name in self.architecture.pooled:
                 x = operations.pool(x)
         hidden, out = self.heads
-        found = operations.convolve(out, operations.convolve(hidden, x))
+        found: tuple[NodeT, ...] = (operations.convolve(out, operations.convolve(hidden, x)),)
+        if self.response is not None:
+            likely = operations.exponential(operations.convolve(self.response, after["2"]))
+            found = operations.add(found[0], operations.log_sum_of_cells(likely)), likely
         if not self.description:
-            return (found,)
+            return found
         first, second, third, fourth = self.description
         x = operations.shuffle(operations.convolve(second, operations.convolve(first, x)))
-        return found, operations.convolve(fourth, operations.convolve(third, operations.join(x, skip)))
+        return *found, operations.convolve(fourth, operations.convolve(third, operations.join(x, after["3"])))
 
 
 def fold(weights: Weights, descriptors: bool = False) -> FoldedNetwork:
@@ -97,13 +118,19 @@ def fold(weights: Weights, descriptors: bool = False) -> FoldedNetwork:
     architecture, tensors = weights.architecture, weights.tensors
     encoder = [_normalised(tensors, name) for name, *_ in architecture.encoder]
     encoder[0] = _on_grey_levels(encoder[0], architecture)
-    hidden = _stacked(HEADS, [_normalised(tensors, "Da"), _normalised(tensors, "Pa")])
+    hidden = [_normalised(tensors, "Da")]
+    if architecture.peaks:
+        out = Convolution(OUT, tensors["convDb.weight"], tensors["convDb.bias"], activated=False)
+        response = Convolution(RESPONSE, tensors["convR.weight"], tensors["convR.bias"], activated=False)
+    else:
+        hidden.append(_normalised(tensors, "Pa"))
+        out, response = _joint_output(tensors), None
     description: tuple[Convolution, ...] = ()
     if descriptors:
         first, second, third = (_normalised(tensors, name, name != "Fb") for name in ("Fa", "Fb", "Faa"))
         last = Convolution("Fbb", tensors["convFbb.weight"], tensors["convFbb.bias"], activated=False)
         description = (first, second, third, last)
-    return FoldedNetwork(architecture, tuple(encoder), (hidden, _joint_output(tensors)), description)
+    return FoldedNetwork(architecture, tuple(encoder), (_stacked(HEADS, hidden), out), response, description)
 
 
 def _normalised(tensors: Tensors, name: str, activated: bool = True) -> Convolution:
@@ -119,12 +146,16 @@ def _normalised(tensors: Tensors, name: str, activated: bool = True) -> Convolut
 def _on_grey_levels(first: Convolution, architecture: Architecture) -> Convolution:
     """The first layer on (grey level - 127.5) of one channel, in place of (x / 255 - 0.5) * 0.225 of all.
 
+    For a network of peaks, on the one normalised channel in place of all.
+
     Only the factor may go into the weights: the shift has to stay before the padding, whose zeros mean neutral grey.
     A 3 x 3 convolution on folded pixels is one of 6 x 6 and stride 2 on the image: the folded pixel of row r holds the
     rows 2 r + dy in its channels 2 dy + dx, so that kernel row k reaches the rows 2 (r + k - 1) + dy.
     """
     out = len(first.weight)
-    weight = first.weight.reshape(out, architecture.image_channels, -1, 3, 3).sum(axis=1) * np.float32(_SCALE)
+    weight = first.weight.reshape(out, architecture.image_channels, -1, 3, 3).sum(axis=1)
+    if not architecture.peaks:
+        weight *= np.float32(_SCALE)
     if not architecture.folds_pixels:
         return Convolution(first.name, weight, first.bias)
     # (out, dy, dx, row, column) -> (out, row, dy, column, dx)

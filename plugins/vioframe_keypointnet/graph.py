@@ -14,14 +14,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vioframe_keypointnet.folding import LEAK, NEUTRAL_GREY, Convolution, FoldedNetwork
+from vioframe_keypointnet.architecture import CELL_PX, FAINT
+from vioframe_keypointnet.folding import LARGEST_EXPONENT, LEAK, NEUTRAL_GREY, Convolution, FoldedNetwork
 from vioframe_keypointnet.optional import needs
-from vioframe_keypointnet.tensors import OUT
+from vioframe_keypointnet.tensors import OUT, RESPONSE
 
 _OPSET, _IR = 17, 9
 
 _MIDDLE_GREY = 128
 """The whole number nearest to :data:`NEUTRAL_GREY`, so that an image's own 8 bits can be multiplied."""
+
+_MOST_DEVIATIONS = 6.0
+"""Locally normalised images reach that far in 8 bits; what lies farther out is noise on a blank surface."""
 
 
 def onnx_model(
@@ -35,11 +39,8 @@ def onnx_model(
         from onnx import TensorProto, helper
 
     graph = _Graph(activation_ranges or {})
-    if activation_ranges:
-        outputs = _seeing_integers(network).build(graph, graph.dequantised("image", np.float32(1.0), _MIDDLE_GREY))
-    else:
-        floats = graph.add("Cast", ["image"], to=TensorProto.FLOAT)
-        outputs = network.build(graph, graph.add("Sub", [floats, graph.constant(np.float32(NEUTRAL_GREY))]))
+    seen = _seeing_integers(network) if activation_ranges and network.response is None else network
+    outputs = seen.build(graph, "image")
     height, width = shape
     image = helper.make_tensor_value_info("image", TensorProto.UINT8, [1, 1, height, width])
     found = [helper.make_tensor_value_info(name, TensorProto.FLOAT, None) for name in outputs]
@@ -67,35 +68,70 @@ class _Graph:
         self._steps: dict[str, np.float32] = {}
         """Values that have 8 bits, and the step of these."""
 
+    def centred(self, image: str) -> str:
+        if self._ranges:
+            return self.dequantised(image, np.float32(1.0), _MIDDLE_GREY)
+        return self.node("Sub", [self._floats_of(image), self.constant(np.float32(NEUTRAL_GREY))])
+
+    def normalised(self, image: str) -> str:
+        grey = self._floats_of(image)
+        flat = self.node("Sub", [grey, self._smooth(grey)])
+        faint = self.constant(np.float32((255.0 * FAINT) ** 2))
+        deviation = self.node("Sqrt", [self.add(self._smooth(self.node("Mul", [flat, flat])), faint)])
+        x = self.node("Div", [flat, deviation])
+        return self._quantised(x, np.float32(_MOST_DEVIATIONS / 127.0), _MIDDLE_GREY) if self._ranges else x
+
+    def _smooth(self, x: str) -> str:
+        coarse = self.node("AveragePool", [x], kernel_shape=[4, 4], strides=[4, 4])
+        around = self.constant(np.array([0, 0, 2, 2, 0, 0, 2, 2], np.int64))
+        mean = self.node("AveragePool", [self.node("Pad", [coarse, around], mode="edge")], kernel_shape=[5, 5])
+        scales = self.constant(np.array([1, 1, 4, 4], np.float32))
+        return self.node("Resize", [mean, "", scales], mode="linear", coordinate_transformation_mode="half_pixel")
+
+    def _floats_of(self, image: str) -> str:
+        from onnx import TensorProto
+
+        return self.node("Cast", [image], to=TensorProto.FLOAT)
+
     def convolve(self, layer: Convolution, x: str) -> str:
-        integer = x in self._steps and (layer.name in self._ranges or layer.name == OUT)
+        integer = x in self._steps and (layer.name in self._ranges or layer.name in (OUT, RESPONSE))
         weight, bias = self._integers(layer, self._steps[x]) if integer else self._floats(layer)
-        y = self.add("Conv", [x, weight, bias], pads=[layer.pad] * 4, strides=[layer.stride] * 2)
+        y = self.node("Conv", [x, weight, bias], pads=[layer.pad] * 4, strides=[layer.stride] * 2)
         if layer.name in self._ranges:
-            step = np.float32(self._ranges[layer.name] / 255.0)
-            of = [self.constant(step), self.constant(np.uint8(0))]
-            return self.dequantised(self.add("QuantizeLinear", [self.add("Relu", [y]), *of]), step, 0)
-        return self.add("LeakyRelu", [y], alpha=LEAK) if layer.activated else y
+            return self._quantised(self.node("Relu", [y]), np.float32(self._ranges[layer.name] / 255.0), 0)
+        return self.node("LeakyRelu", [y], alpha=LEAK) if layer.activated else y
 
     def pool(self, x: str) -> str:
-        y = self.add("MaxPool", [x], kernel_shape=[2, 2], strides=[2, 2])
+        y = self.node("MaxPool", [x], kernel_shape=[2, 2], strides=[2, 2])
         if x in self._steps:
             self._steps[y] = self._steps[x]
         return y
 
     def shuffle(self, x: str) -> str:
-        return self.add("DepthToSpace", [x], blocksize=2, mode="CRD")
+        return self.node("DepthToSpace", [x], blocksize=2, mode="CRD")
 
     def join(self, a: str, b: str) -> str:
-        return self.add("Concat", [a, b], axis=1)
+        return self.node("Concat", [a, b], axis=1)
+
+    def exponential(self, x: str) -> str:
+        return self.node("Exp", [self.node("Min", [x, self.constant(np.float32(LARGEST_EXPONENT))])])
+
+    def log_sum_of_cells(self, x: str) -> str:
+        side = CELL_PX // 2
+        mean = self.node("AveragePool", [x], kernel_shape=[side, side], strides=[side, side])
+        total = self.node("ReduceSum", [mean, self.constant(np.array([1], np.int64))], keepdims=1)
+        return self.node("Log", [self.node("Mul", [total, self.constant(np.float32(side * side))])])
+
+    def add(self, a: str, b: str) -> str:
+        return self.node("Add", [a, b])
 
     def dequantised(self, x: str, step: np.float32, zero: int) -> str:
         """The values of ``x`` uint8, of which convolutions may make use as they are."""
-        y = self.add("DequantizeLinear", [x, self.constant(step), self.constant(np.uint8(zero))])
+        y = self.node("DequantizeLinear", [x, self.constant(step), self.constant(np.uint8(zero))])
         self._steps[y] = step
         return y
 
-    def add(self, kind: str, inputs: list[str], **attributes: Any) -> str:
+    def node(self, kind: str, inputs: list[str], **attributes: Any) -> str:
         from onnx import helper
 
         name = f"{kind}_{len(self.nodes)}"
@@ -108,6 +144,10 @@ class _Graph:
         name = f"constant_{len(self.constants)}"
         self.constants.append(numpy_helper.from_array(np.asarray(value), name))
         return name
+
+    def _quantised(self, x: str, step: np.float32, zero: int) -> str:
+        integers = self.node("QuantizeLinear", [x, self.constant(step), self.constant(np.uint8(zero))])
+        return self.dequantised(integers, step, zero)
 
     def _floats(self, layer: Convolution) -> tuple[str, str]:
         return self.constant(layer.weight), self.constant(layer.bias)
@@ -122,4 +162,4 @@ class _Graph:
 
     def _of_channels(self, integers: NDArray[np.generic], steps: NDArray[np.float32]) -> str:
         zeros = self.constant(np.zeros(len(steps), integers.dtype))
-        return self.add("DequantizeLinear", [self.constant(integers), self.constant(steps), zeros], axis=0)
+        return self.node("DequantizeLinear", [self.constant(integers), self.constant(steps), zeros], axis=0)

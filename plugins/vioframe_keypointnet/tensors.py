@@ -12,8 +12,8 @@ from vioframe_keypointnet.architecture import Architecture
 Tensors = Mapping[str, NDArray[np.float32]]
 """The state of a network by the names of the published checkpoints, without the counters of batches."""
 
-HEADS, OUT = "heads", "out"
-"""Names of the two layers into which those of the score and the location are joined to run."""
+HEADS, OUT, RESPONSE = "heads", "out", "R"
+"""Names of the two layers into which those of score and location are joined to run, and of that of the peaks."""
 
 
 def shapes(architecture: Architecture) -> dict[str, tuple[int, ...]]:
@@ -22,7 +22,7 @@ def shapes(architecture: Architecture) -> dict[str, tuple[int, ...]]:
     normalised = [
         *architecture.encoder,
         ("Da", deepest, head),
-        ("Pa", deepest, head),
+        *([] if architecture.peaks else [("Pa", deepest, head)]),
         ("Fa", deepest, head),
         ("Fb", head, 4 * skip),
         ("Faa", 2 * skip, head),
@@ -32,8 +32,9 @@ def shapes(architecture: Architecture) -> dict[str, tuple[int, ...]]:
         found[f"conv{name}.0.weight"] = (after, before, 3, 3)
         for statistic in ("weight", "bias", "running_mean", "running_var"):
             found[f"conv{name}.1.{statistic}"] = (after,)
-    for name, after in (("Db", 1), ("Pb", 2), ("Fbb", architecture.descriptor)):
-        found[f"conv{name}.weight"] = (after, head, 3, 3)
+    place = ("R", architecture.blocks[1][-1], 4) if architecture.peaks else ("Pb", head, 2)
+    for name, before, after in (("Db", head, 1), place, ("Fbb", head, architecture.descriptor)):
+        found[f"conv{name}.weight"] = (after, before, 3, 3)
         found[f"conv{name}.bias"] = (after,)
     return found
 

@@ -11,7 +11,7 @@ from torch.nn import functional
 
 from vioframe_keypointnet.architecture import CELL_PX
 from vioframe_keypointnet.network import describe
-from vioframe_keypointnet.selection import CONTRAST_REACH_PX, OFFSET_PX, Rules
+from vioframe_keypointnet.selection import CONTRAST_REACH_PX, Rules
 
 _NEVER = float("-inf")
 
@@ -33,21 +33,24 @@ class TorchSelection:
         self._first = (torch.arange(neighbours) < neighbours // 2)[:, None].to(device)
         """Of a cell's neighbours, row by row, those before it: they win where scores are equal."""
 
-    def __call__(self, heads: Tensor, image: Tensor, descriptors: Tensor | None, max_points: int) -> Tensor:
+    def __call__(
+        self, score: Tensor, places: Tensor, image: Tensor, descriptors: Tensor | None, max_points: int
+    ) -> Tensor:
         """(K, 3 + D): x, y px, score before the sigmoid, descriptor; strongest first, and -inf where there are no more.
 
-        ``heads`` (3, h, w), ``image`` (8 h, 8 w) and ``descriptors`` (D, 2 h, 2 w) are floats.
+        ``score`` (h, w) is before the sigmoid, ``places`` (2, h, w) are x, y px from the cells' centres; ``image``
+        (8 h, 8 w) and ``descriptors`` (D, 2 h, 2 w) are floats.
         """
-        score = heads[0].masked_fill(~self._inner, _NEVER)
-        xy = torch.minimum((self._centres + OFFSET_PX * torch.tanh(heads[1:])).clamp(min=0.0), self._limits)
+        score = score.masked_fill(~self._inner, _NEVER)
+        xy = torch.minimum((self._centres + places).clamp(min=0.0), self._limits)
         barred = self._suppressed(score, xy) | (xy > self._last).any(dim=0) | self._flat(image, xy)
         score = score.masked_fill(barred, _NEVER).flatten()
         best, cells = score.topk(min(max_points, len(score)))
-        places = xy.flatten(1)[:, cells].T
-        found = torch.cat([places, best[:, None]], dim=1)
+        chosen = xy.flatten(1)[:, cells].T
+        found = torch.cat([chosen, best[:, None]], dim=1)
         if descriptors is None:
             return found
-        return torch.cat([found, describe(descriptors[None], places[None])[0]], dim=1)
+        return torch.cat([found, describe(descriptors[None], chosen[None])[0]], dim=1)
 
     def _suppressed(self, score: Tensor, xy: Tensor) -> Tensor:
         """(h, w) whether a stronger candidate is too near."""

@@ -10,15 +10,17 @@ import numpy as np
 
 from vioframe.errors import ConfigError
 from vioframe.types import Image, Keypoints
-from vioframe_keypointnet.folding import NEUTRAL_GREY, FoldedNetwork
+from vioframe_keypointnet.folding import FoldedNetwork
 from vioframe_keypointnet.optional import needs
 from vioframe_keypointnet.runtimes.torch import TorchOperations
-from vioframe_keypointnet.selection import Rules
+from vioframe_keypointnet.selection import OFFSET_PX, Rules
 from vioframe_keypointnet.torch_selection import TorchSelection
 
 with needs("torch", "keypointnet"):
     import torch
     from torch import Tensor
+
+    from vioframe_keypointnet.network import cells_of, peak_places
 
 _WARM_UP_RUNS = 3
 
@@ -54,10 +56,13 @@ def detection(
     operations, selection = TorchOperations(device, dtype), TorchSelection(padded, shape, rules, device)
 
     def detect(image: Tensor) -> Tensor:
-        grey = image.to(dtype)
-        heads, *described = network.build(operations, (grey - NEUTRAL_GREY).to(memory_format=torch.channels_last))
-        descriptors = described[0][0].float() if described else None
-        return selection(heads[0].float(), grey[0, 0], descriptors, max_points)
+        grey = image.float()
+        heads, *rest = (output[0].float() for output in network.build(operations, grey))
+        if network.response is None:
+            places = OFFSET_PX * torch.tanh(heads[1:])
+        else:
+            places = peak_places(cells_of(rest.pop(0).log()[None]))[0]
+        return selection(heads[0], places, grey[0, 0], rest[0] if rest else None, max_points)
 
     return detect
 

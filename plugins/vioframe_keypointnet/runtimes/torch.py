@@ -6,13 +6,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vioframe.types import Image
-from vioframe_keypointnet.folding import LEAK, NEUTRAL_GREY, Convolution, FoldedNetwork
+from vioframe_keypointnet.architecture import CELL_PX
+from vioframe_keypointnet.folding import LARGEST_EXPONENT, LEAK, NEUTRAL_GREY, Convolution, FoldedNetwork
 from vioframe_keypointnet.optional import needs
 
 with needs("torch", "keypointnet"):
     import torch
     from torch import Tensor
     from torch.nn import functional
+
+    from vioframe_keypointnet.network import locally_normalised
 
 
 class TorchOperations:
@@ -21,6 +24,12 @@ class TorchOperations:
     def __init__(self, device: str = "cpu", dtype: torch.dtype = torch.float32) -> None:
         self._device, self._dtype = device, dtype
         self._layers: dict[str, tuple[Tensor, Tensor]] = {}
+
+    def centred(self, image: Tensor) -> Tensor:
+        return (image - NEUTRAL_GREY).to(self._dtype, memory_format=torch.channels_last)
+
+    def normalised(self, image: Tensor) -> Tensor:
+        return locally_normalised(image / 255.0).to(self._dtype, memory_format=torch.channels_last)
 
     def convolve(self, layer: Convolution, x: Tensor) -> Tensor:
         if layer.name not in self._layers:
@@ -39,6 +48,15 @@ class TorchOperations:
     def join(self, a: Tensor, b: Tensor) -> Tensor:
         return torch.cat([a, b], dim=1)
 
+    def exponential(self, x: Tensor) -> Tensor:
+        return x.float().clamp(max=LARGEST_EXPONENT).exp()
+
+    def log_sum_of_cells(self, x: Tensor) -> Tensor:
+        return functional.avg_pool2d(x, CELL_PX // 2, divisor_override=1).sum(dim=1, keepdim=True).log()
+
+    def add(self, a: Tensor, b: Tensor) -> Tensor:
+        return a + b
+
 
 class TorchOnCpu:
     """Runs a network on images of any size; the number of threads, if given, is set for torch as a whole."""
@@ -51,6 +69,6 @@ class TorchOnCpu:
     @torch.inference_mode()
     def __call__(self, image: Image) -> tuple[NDArray[np.float32], ...]:
         # A copy: torch wants no memory that it may not write to.
-        x = torch.from_numpy(image.astype(np.float32))[None, None] - NEUTRAL_GREY
-        outputs = self._network.build(self._operations, x.to(memory_format=torch.channels_last))
+        x = torch.from_numpy(image.astype(np.float32))[None, None]
+        outputs = self._network.build(self._operations, x)
         return tuple(output[0].contiguous().numpy() for output in outputs)
