@@ -3,6 +3,7 @@
 import subprocess
 import sys
 
+import cv2
 import numpy as np
 import pytest
 
@@ -10,6 +11,8 @@ torch = pytest.importorskip("torch")
 
 from keypointnet_helpers import ARCHITECTURES, TINY, network, texture, weights  # noqa: E402
 
+from vioframe.bench.detectors.metrics import score_pair  # noqa: E402
+from vioframe.bench.detectors.pairs import random_homography  # noqa: E402
 from vioframe.errors import ConfigError  # noqa: E402
 from vioframe.testing import check_detector  # noqa: E402
 from vioframe.types import Keypoints  # noqa: E402
@@ -18,6 +21,7 @@ from vioframe_keypointnet import weights as weights_file  # noqa: E402
 from vioframe_keypointnet.folding import fold  # noqa: E402
 from vioframe_keypointnet.runtimes import cuda  # noqa: E402
 from vioframe_keypointnet.selection import OFFSET_PX, Rules, candidate_places, padded_to_cells, select  # noqa: E402
+from vioframe_keypointnet.tensors import ranged_layers  # noqa: E402
 from vioframe_keypointnet.torch_selection import TorchSelection  # noqa: E402
 
 FACTORY = vioframe_detectors()["keypointnet"]
@@ -208,6 +212,37 @@ def test_without_a_gpu_cuda_is_refused(tiny, monkeypatch):
 def test_the_conformance_kit_agrees_whatever_the_weights(tiny, runtime):
     pytest.importorskip(runtime)
     check_detector(FACTORY, weights=tiny, runtime=runtime, device="cpu", threads=1)
+
+
+@pytest.mark.parametrize("name", weights_file.shipped())
+def test_weights_that_ship_conform_and_say_what_they_are(name):
+    shipped = weights_file.load(name)
+    assert shipped.card
+    assert set(shipped.activation_ranges) == set(ranged_layers(shipped.architecture))
+    check_detector(FACTORY, weights=name, device="cpu", threads=1)
+
+
+@pytest.mark.parametrize("name", weights_file.shipped())
+def test_int8_costs_weights_that_ship_little_repeatability(name, shared_data):
+    """At most 0.02, on photographs that none were trained on, as seen under homographies."""
+    pytest.importorskip("openvino")
+    files = sorted((shared_data / "photographs" / "bsds500_val").glob("*.jpg"))[:25]
+    assert len(files) == 25
+    precise, coarse = (
+        repeatability(FACTORY(weights=name, device="cpu", runtime="openvino", precision=p, threads=1), files)
+        for p in ("float32", "int8")
+    )
+    assert coarse > precise - 0.02
+
+
+def repeatability(detector, files):
+    rng, resolution, scores = np.random.default_rng(0), (320, 240), []
+    for file in files:
+        image = cv2.resize(cv2.imread(str(file), cv2.IMREAD_GRAYSCALE), resolution, interpolation=cv2.INTER_AREA)
+        H_21 = random_homography(rng, resolution)
+        found = [detector.detect(view, 1000) for view in (image, cv2.warpPerspective(image, H_21, resolution))]
+        scores.append(score_pair(*found, H_21, resolution, top_k=300).repeatability)
+    return np.mean(scores)
 
 
 def test_naming_the_detector_loads_nothing_heavy():
