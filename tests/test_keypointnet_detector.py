@@ -120,6 +120,16 @@ def test_the_outermost_cells_are_left_out():
     assert (score == 0.5).all()
 
 
+def test_cells_that_say_nothing_give_nothing():
+    heads = random_heads(15, 20)
+    heads[0] = -np.inf
+    heads[0, 5, 5:8] = [3.0, -200.0, np.nan]
+    xy, score = select(heads, texture(), (120, 160), 1000, NO_RULES)
+    assert len(xy) == 2
+    assert score[0] == pytest.approx(1.0 / (1.0 + np.exp(-3.0)))
+    assert 0.0 < score[1] < 1e-30
+
+
 @pytest.mark.parametrize("max_points", [0, 1, 50])
 def test_no_more_points_than_asked_for(tiny, max_points):
     assert len(FACTORY(weights=tiny, threads=1).detect(texture(), max_points).xy) <= max_points

@@ -72,8 +72,14 @@ def select(
     radius2, reach = np.float32(rules.nms_px**2), rules.reach_cells
     count = _take(cells, order, scores, xs, ys, likely, image, shape[0], shape[1], radius2, reach, rules.min_contrast)
     taken = cells[:count]
-    score = 1.0 / (1.0 + np.exp(-scores.ravel()[taken]))
-    return np.stack([xs.ravel()[taken], ys.ravel()[taken]], axis=1), score
+    return np.stack([xs.ravel()[taken], ys.ravel()[taken]], axis=1), sigmoid(scores.ravel()[taken])
+
+
+def sigmoid(x: Array) -> Array:
+    """In (0, 1), and without a warning however negative ``x`` is."""
+    one = np.float32(1.0)
+    y: Array = one / (one + np.exp(np.minimum(-x, np.float32(80.0))))
+    return y
 
 
 def candidate_places(heads: Array) -> tuple[Array, Array]:
@@ -107,7 +113,7 @@ def _take(
         if count == len(cells):
             break
         row, column = cell // w, cell % w
-        if row == 0 or column == 0 or row == h - 1 or column == w - 1:
+        if row == 0 or column == 0 or row == h - 1 or column == w - 1 or not np.isfinite(scores[row, column]):
             continue
         if likely.size > 0:
             xs[row, column], ys[row, column] = _peak(likely, row, column)

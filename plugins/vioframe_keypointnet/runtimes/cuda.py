@@ -13,7 +13,7 @@ from vioframe.types import Image, Keypoints
 from vioframe_keypointnet.folding import FoldedNetwork
 from vioframe_keypointnet.optional import needs
 from vioframe_keypointnet.runtimes.torch import TorchOperations
-from vioframe_keypointnet.selection import OFFSET_PX, Rules
+from vioframe_keypointnet.selection import OFFSET_PX, Rules, sigmoid
 from vioframe_keypointnet.torch_selection import TorchSelection
 
 with needs("torch", "keypointnet"):
@@ -97,5 +97,4 @@ class _Graph:
 def keypoints(found: np.ndarray[tuple[int, int], np.dtype[np.float32]]) -> Keypoints:
     """Those of the rows (K, 3 + D) that :class:`TorchSelection` gives which are keypoints; copied."""
     taken = found[np.isfinite(found[:, 2])].copy()
-    score = (1.0 / (1.0 + np.exp(-taken[:, 2]))).astype(np.float32)
-    return Keypoints(taken[:, :2], score, taken[:, 3:] if taken.shape[1] > 3 else None)
+    return Keypoints(taken[:, :2], sigmoid(taken[:, 2]), taken[:, 3:] if taken.shape[1] > 3 else None)
