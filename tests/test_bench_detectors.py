@@ -3,9 +3,9 @@
 import json
 from itertools import pairwise
 
-import cv2
 import numpy as np
 import pytest
+from image_helpers import textured
 
 from vioframe.bench.detectors.degradations import KINDS, Circumstances, Degradation, choose, line_kernel
 from vioframe.bench.detectors.leads import lead_of_pairs, lead_of_shares
@@ -42,11 +42,6 @@ def keypoints(xy, descriptors=None):
 def grid(step=20):
     x, y = np.meshgrid(np.arange(30.0, 290.0, step), np.arange(30.0, 210.0, step))
     return np.column_stack([x.ravel(), y.ravel()])
-
-
-def textured(seed=0, size=SIZE):
-    noise = cv2.GaussianBlur(np.random.default_rng(seed).normal(size=size[::-1]), (0, 0), 2.0)
-    return np.clip(128 + 40 * noise / noise.std(), 0, 255).astype(np.uint8)
 
 
 def still(seed=0):

@@ -194,10 +194,7 @@ def _quality(
         "top_k": quality.TOP_K,
         "baseline": BASELINE,
     }
-    shown = [tables.quality_table(rows, settings)]
-    if len(chosen) > 1:
-        for figure, title in (("repeatability", "Repeatability"), ("distinct", "Repeatability of distinct points")):
-            shown.append(tables.sweep_table(rows, chosen, figure, title, BASELINE))
+    shown = [tables.quality_table(rows, settings), *tables.sweep_tables(rows, chosen, "quality")]
     return _Answer(rows, settings, shown, lined_up)
 
 
@@ -213,7 +210,6 @@ def _frontend(
     from vioframe.bench.detectors import flight, tables
     from vioframe.bench.detectors.degradations import choose
     from vioframe.bench.detectors.entrants import line_up
-    from vioframe.bench.detectors.leads import BASELINE
     from vioframe.bench.processes import usable_cores
 
     if dataset is None:
@@ -236,11 +232,7 @@ def _frontend(
         "epipolar_baseline_frames": flight.BASELINE_FRAMES,
         "epipolar_inlier_px": flight.INLIER_PX,
     }
-    shown = [tables.frontend_table(rows, settings)]
-    if len(chosen) > 1:
-        for frames in map(str, flight.SURVIVAL_FRAMES):
-            title = f"Share of tracks alive after {frames} frames"
-            shown.append(tables.sweep_table(rows, chosen, f"survival.{frames}", title, BASELINE))
+    shown = [tables.frontend_table(rows, settings), *tables.sweep_tables(rows, chosen, "frontend")]
     return _Answer(rows, settings, shown, lined_up)
 
 

@@ -10,11 +10,28 @@ from rich.table import Table
 from rich.text import Text
 
 from vioframe.bench.detectors.degradations import Degradation
+from vioframe.bench.detectors.flight import SURVIVAL_FRAMES
+from vioframe.bench.detectors.leads import BASELINE
 from vioframe.bench.detectors.metrics import CORNERS_WITHIN_PX
 from vioframe.bench.detectors.quoted import FROM_PAPER, FROM_THESIS, TABLE_3_2
 from vioframe.bench.results import Row, reach
 
 _NOTHING = "-"
+
+_SWEPT = {
+    "quality": {
+        "repeatability": ("Repeatability", ".3f"),
+        "distinct": ("Repeatability of distinct points", ".3f"),
+    },
+    "frontend": {
+        **{f"survival.{n}": (f"Share of tracks alive after {n} frames", ".3f") for n in SURVIVAL_FRAMES},
+        "median_life": ("Frames after which fewer than half of the tracks are alive", "d"),
+        "alive": ("Tracks alive in a frame", ".0f"),
+        "epipolar_inliers": ("Share of epipolar inliers", ".3f"),
+        "coverage": ("Share of the grid's cells covered", ".3f"),
+    },
+}
+"""What is shown at every level: key, title and format."""
 
 
 def speed_table(rows: Sequence[Row], absent: Mapping[str, str], settings: Mapping[str, Any]) -> Group:
@@ -109,29 +126,31 @@ def frontend_table(rows: Sequence[Row], settings: Mapping[str, Any]) -> Group:
     return _group(heading, table)
 
 
-def sweep_table(rows: Sequence[Row], degradations: Sequence[Degradation], key: str, title: str, baseline: str) -> Group:
-    """``key`` of every detector at every level, with the lead over ``baseline`` where that takes part."""
-    labels = list(dict.fromkeys(row["detector"] for row in rows))
-    led = baseline in labels
-    heading = f"{title} by degradation" + (f"; in brackets the lead over {baseline}" if led else "")
+def sweep_tables(rows: Sequence[Row], degradations: Sequence[Degradation], question: str) -> list[Group]:
+    """A table for each figure that matters to ``question`` (quality or frontend), if there is any degradation."""
+    if len(degradations) < 2:
+        return []
+    return [_sweep(rows, degradations, key, title, spec) for key, (title, spec) in _SWEPT[question].items()]
+
+
+def _sweep(rows: Sequence[Row], degradations: Sequence[Degradation], key: str, title: str, spec: str) -> Group:
+    """The figure ``key`` of every detector at every level, with its lead where that is known."""
+    led = any(reach(row, f"lead.{key}") for row in rows)
+    heading = f"{title}, by degradation" + (f"; in brackets the lead over {BASELINE}" if led else "")
     table = _table()
     table.add_column("degradation", no_wrap=True)
+    labels = list(dict.fromkeys(row["detector"] for row in rows))
     for label in labels:
         table.add_column(Text(label), justify="right", no_wrap=True)
     for degradation in degradations:
-        of_it = {row["detector"]: row for row in _of(rows, degradation)}
-        reference = _mean(of_it[baseline], key) if led else None
-        cells = [_led(of_it[label], key, None if label == baseline else reference) for label in labels]
-        table.add_row(Text(degradation.label), *cells)
+        cells = {row["detector"]: _led(row, key, spec) for row in _of(rows, degradation)}
+        table.add_row(Text(degradation.label), *(cells[label] for label in labels))
     return _group(heading, table)
 
 
-def _led(row: Row, key: str, reference: float | None) -> str:
-    value = _mean(row, key)
-    if value is None or reference is None:
-        return _number(value, ".3f")
-    verdict = reach(row, f"lead.{key}.verdict")
-    return f"{value:.3f} ({value - reference:+.3f}{'' if verdict is None else f' {verdict}'})"
+def _led(row: Row, key: str, spec: str) -> str:
+    figure, lead = _number(_mean(row, key), spec), reach(row, f"lead.{key}")
+    return figure if lead is None else f"{figure} ({lead['mean']:+.3f} {lead['verdict']})"
 
 
 def _mean(row: Row, key: str) -> float | None:
