@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatch
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ from numpy.typing import NDArray
 from vioframe import registry
 from vioframe.errors import ConfigError, DatasetError
 from vioframe.images import decode_image, to_gray8
+from vioframe.interfaces import Dataset
 from vioframe.types import Frame
 
 _SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".ppm", ".pgm", ".tif", ".tiff", ".webp"})
@@ -37,10 +39,15 @@ def gather(sources: Sequence[Path], channels: int, frames_per_recording: int) ->
     for source in sources:
         if not source.exists():
             raise ConfigError(f"{source} does not exist; --images takes folders of photographs and recordings")
-        found = _photographs(source, channels) if source.is_dir() else []
-        if not found:
-            found = _frames(source, channels, frames_per_recording)
-        pictures += found
+        try:
+            dataset = registry.load().open_dataset(source)
+        except DatasetError as error:
+            found = _photographs(source, channels) if source.is_dir() else []
+            if not found:
+                raise ConfigError(f"{source} holds neither photographs nor a recording: {error}") from error
+            pictures += found
+        else:
+            pictures += _frames(dataset, channels, frames_per_recording, str(source))
     return pictures
 
 
@@ -69,18 +76,11 @@ def _photographs(folder: Path, channels: int) -> list[Picture]:
     return out
 
 
-def _frames(source: Path, channels: int, count: int) -> list[Picture]:
-    try:
-        dataset = registry.load().open_dataset(source)
-    except DatasetError as error:
-        raise ConfigError(f"{source} holds neither photographs nor a recording: {error}") from error
+def _frames(dataset: Dataset, channels: int, count: int, where: str) -> list[Picture]:
     every = max(1, (dataset.frame_count or count) // count)
     frames = (m for m in dataset.measurements() if isinstance(m, Frame))
-    return [
-        Picture(f"{source}#{k}", _with_channels(frame.image, channels, str(source)))
-        for k, frame in enumerate(frames)
-        if k % every == 0
-    ][:count]
+    taken = islice(enumerate(frames), 0, every * count, every)
+    return [Picture(f"{where}#{k}", _with_channels(frame.image, channels, where)) for k, frame in taken]
 
 
 def _with_channels(pixels: NDArray[np.generic], channels: int, where: str) -> NDArray[np.uint8]:

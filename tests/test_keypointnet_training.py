@@ -1,0 +1,312 @@
+"""Training a KeypointNet: the loss falls, a resumed training is one not interrupted, and what can go wrong says so."""
+
+import csv
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+torch = pytest.importorskip("torch")
+
+from keypointnet_helpers import texture  # noqa: E402
+
+from vioframe import registry  # noqa: E402
+from vioframe.cli import main  # noqa: E402
+from vioframe.errors import ConfigError  # noqa: E402
+from vioframe.interfaces import Trainer  # noqa: E402
+from vioframe.types import TrainingJob  # noqa: E402
+from vioframe_keypointnet import vioframe_trainers, weights  # noqa: E402
+from vioframe_keypointnet.training.images import Picture, gather, split  # noqa: E402
+from vioframe_keypointnet.training.loop import Training, step_losses  # noqa: E402
+from vioframe_keypointnet.training.options import TrainingOptions  # noqa: E402
+from vioframe_keypointnet.training.photometric import PhotometricRange, disturbed, motion_kernel  # noqa: E402
+from vioframe_keypointnet.training.samples import batch, pair  # noqa: E402
+from vioframe_keypointnet.training.validation import validate  # noqa: E402
+
+SMALL = TrainingOptions(width=0.25, size=(96, 64), batch=2, epochs=2, epoch_samples=4, threads=1)
+PUBLISHED = replace(SMALL, network="full", width=0.0625)
+FLAGS = ["-o", "width=0.25", "-o", "size=[96, 64]", "-o", "batch=2", "-o", "epoch_samples=4", "-o", "threads=1"]
+
+
+def scene(seed):
+    """Patches with corners: what a detector can learn to find."""
+    rng = np.random.default_rng(seed)
+    image = texture((100, 140), seed)
+    for _ in range(12):
+        x, y = rng.integers(0, 120), rng.integers(0, 80)
+        cv2.rectangle(image, (int(x), int(y)), (int(x) + 22, int(y) + 15), int(rng.integers(0, 255)), -1)
+    return image
+
+
+@pytest.fixture(scope="module")
+def pictures():
+    return [Picture(f"scene{k}.png", scene(k)) for k in range(3)]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("images")
+    for k in range(4):
+        cv2.imwrite(str(folder / f"scene{k}.png"), scene(k))
+    return folder
+
+
+@pytest.mark.parametrize("options", [SMALL, PUBLISHED], ids=["compact", "full"])
+@pytest.mark.parametrize("taught", [True, False], ids=["lessons", "published losses"])
+def test_steps_lower_the_loss_of_a_fixed_batch(pictures, options, taught):
+    options = replace(options, dropout=0.0)
+    if options.network == "full":
+        pictures = [Picture(p.name, np.repeat(p.pixels[..., None], 3, axis=2)) for p in pictures]
+    training = Training(options, pictures)
+    pairs = batch(pictures, options, 0)
+    optimiser = torch.optim.Adam([*training.network.parameters(), *training.judge.parameters()], lr=1e-3)
+    totals = []
+    for _ in range(12):
+        values = step_losses(training.network, training.judge, options, pairs, taught=taught)
+        optimiser.zero_grad()
+        values["total"].backward()
+        optimiser.step()
+        totals.append(values["total"].item())
+        assert np.isfinite(totals[-1])
+    assert totals[-1] < 0.9 * totals[0]
+
+
+def states(training):
+    return [*training.network.state_dict().values(), *training.judge.state_dict().values()]
+
+
+@pytest.mark.parametrize("stop", [1, 3])
+def test_a_resumed_training_is_one_not_interrupted(pictures, tmp_path, stop):
+    options = replace(SMALL, lesson_epochs=1)
+    whole = Training(options, pictures)
+    for _ in whole.steps():
+        pass
+    first = Training(options, pictures)
+    for _ in range(stop):
+        next(first.steps())
+    first.save(tmp_path / "checkpoint.pt", [{"epoch": 1.0}])
+    torch.manual_seed(999)
+    second = Training(options, pictures)
+    assert second.resume(tmp_path / "checkpoint.pt") == [{"epoch": 1.0}]
+    for _ in second.steps():
+        pass
+    assert second.step == whole.step == 4
+    assert all(torch.equal(a, b) for a, b in zip(states(whole), states(second), strict=True))
+
+
+def test_a_checkpoint_of_another_training_is_refused(pictures, tmp_path):
+    path = tmp_path / "checkpoint.pt"
+    Training(SMALL, pictures).save(path, [])
+    Training(replace(SMALL, epochs=9), pictures).resume(path)
+    with pytest.raises(ConfigError, match=r"other options \(learning_rate\)"):
+        Training(replace(SMALL, learning_rate=1e-5), pictures).resume(path)
+    path.write_bytes(path.read_bytes()[:1000])
+    with pytest.raises(ConfigError, match="damaged"):
+        Training(SMALL, pictures).resume(path)
+
+
+def test_the_learning_rate_is_halved_where_asked(pictures):
+    training = Training(replace(SMALL, halve_at=(1,)), pictures)
+    rates = [training._optimiser.param_groups[0]["lr"] for _ in training.steps()]
+    assert rates == [1e-3, 1e-3, 5e-4, 5e-4]
+
+
+def test_pairs_are_views_of_one_image(pictures):
+    """The target, warped back by the homography, is the source, where light does not differ."""
+    options = replace(SMALL, photometric_probability=0.0)
+    for number in range(6):
+        one = pair(pictures[0], options, number)
+        back = cv2.warpPerspective(
+            one.target, np.linalg.inv(one.homography), options.size, borderMode=cv2.BORDER_CONSTANT, borderValue=np.nan
+        )
+        seen = np.isfinite(back)
+        assert seen.mean() > 0.2
+        assert np.median(np.abs(back - one.source)[seen]) < 0.03
+        again = pair(pictures[0], options, number)
+        np.testing.assert_array_equal(again.source, one.source)
+        np.testing.assert_array_equal(again.homography, one.homography)
+
+
+def test_an_epoch_takes_every_image(pictures, monkeypatch):
+    from vioframe_keypointnet.training import samples
+
+    order = [samples._order(k, 7, seed=0) for k in range(21)]
+    assert sorted(order[:7]) == sorted(order[7:14]) == list(range(7))
+    assert order[:7] != order[7:14]
+
+
+def test_each_photometric_effect_does_what_it_says():
+    rng = np.random.default_rng(0)
+    image = np.clip(rng.normal(0.5, 0.15, (60, 80)), 0.0, 1.0).astype(np.float32)
+    none = PhotometricRange(1.0, 0.0, (1.0, 1.0), (1.0, 1.0), (1.0, 1.0), 0.0, 0.0, 0.0)
+    np.testing.assert_allclose(disturbed(image, rng, none), image, atol=1e-6)
+    np.testing.assert_allclose(
+        disturbed(image, rng, replace(none, exposure=(1.5, 1.5))), np.minimum(1.5 * image, 1.0), atol=1e-6
+    )
+    np.testing.assert_allclose(disturbed(image, rng, replace(none, gamma=(2.0, 2.0))), image**2, atol=1e-6)
+    assert disturbed(image, rng, replace(none, contrast=(0.4, 0.4))).std() == pytest.approx(0.4 * image.std(), rel=1e-3)
+    noisy = disturbed(image, np.random.default_rng(2), replace(none, noise_sigma=0.1))
+    assert 0.001 < (noisy - image).std() < 0.1
+    assert disturbed(image, rng, replace(none, motion_blur_px=9.0)).std() < 0.9 * image.std()
+    assert disturbed(image, rng, replace(none, blur_sigma_px=2.0)).std() < 0.99 * image.std()
+    assert abs(disturbed(image, np.random.default_rng(1), replace(none, brightness=0.2)).mean() - image.mean()) > 0.005
+
+
+def test_motion_blur_moves_nothing():
+    for length, angle in ((1.0, 0.3), (7.3, 1.1), (9.0, np.pi / 2)):
+        kernel = motion_kernel(length, angle)
+        half = kernel.shape[0] // 2
+        rows, columns = np.indices(kernel.shape) - half
+        assert kernel.sum() == pytest.approx(1.0)
+        assert (kernel * rows).sum() == pytest.approx(0.0, abs=1e-6)
+        assert (kernel * columns).sum() == pytest.approx(0.0, abs=1e-6)
+        spread = np.sqrt((kernel * (rows**2 + columns**2)).sum())
+        assert spread == pytest.approx(length / np.sqrt(12.0), abs=0.6)
+
+
+def test_images_come_from_folders_in_grey_or_colour(tmp_path):
+    (tmp_path / "deep").mkdir()
+    colour = np.zeros((80, 100, 3), np.uint8)
+    colour[..., 2] = 200  # red, in OpenCV's order
+    cv2.imwrite(str(tmp_path / "deep" / "red.png"), colour)
+    cv2.imwrite(str(tmp_path / "small.png"), np.zeros((20, 20), np.uint8))
+    (tmp_path / "notes.txt").write_text("no image")
+    (rgb,) = gather([tmp_path], 3, 10)
+    assert rgb.pixels.shape == (80, 100, 3)
+    assert rgb.pixels[0, 0].tolist() == [200, 0, 0]
+    (grey,) = gather([tmp_path], 1, 10)
+    assert grey.pixels.shape == (80, 100)
+
+
+def test_images_come_from_recordings(shared_data):
+    frames = gather([shared_data / "euroc/MH_01_easy_15s"], 1, 7)
+    assert len(frames) == 7
+    assert len({f.name for f in frames}) == 7
+    assert frames[0].pixels.shape == (480, 752)
+    assert not np.array_equal(frames[0].pixels, frames[-1].pixels)
+
+
+def test_images_are_held_out_by_name(pictures):
+    train, held = split(pictures, ["scene1"])
+    assert [p.name for p in held] == ["scene1.png"]
+    assert len(train) == 2
+    assert [p.name for p in split(pictures, ["*[02].png"])[1]] == ["scene0.png", "scene2.png"]
+    with pytest.raises(ConfigError, match="every image is held out"):
+        split(pictures, ["scene"])
+    with pytest.raises(ConfigError, match="no image is named like"):
+        split(pictures, ["dog"])
+
+
+def test_validation_of_points_that_never_move(pictures):
+    """A network whose score and place are those of the view's pixels finds nothing again; validation is a share."""
+    found = validate(Training(SMALL, pictures).network, pictures, seed=0)
+    assert 0.0 <= found.repeatability < 0.8
+    assert 0.0 < found.localisation_px <= 3.0
+
+
+def train(*arguments):
+    return CliRunner().invoke(main, ["train", "keypointnet", *map(str, arguments)])
+
+
+def test_command_trains_resumes_and_finetunes(folder, tmp_path):
+    out = tmp_path / "training"
+    done = train("--images", folder, "--hold-out", "scene3", "--out", out, "-o", "epochs=1", *FLAGS)
+    assert done.exit_code == 0, done.output
+    assert {p.name for p in out.iterdir()} == {"checkpoint.pt", "log.csv", "keypointnet.safetensors"}
+    again = train("--images", folder, "--out", out, *FLAGS)
+    assert again.exit_code == 2
+    assert "--resume" in again.output
+    more = train("--images", folder, "--hold-out", "scene3", "--out", out, "--resume", "-o", "epochs=2", *FLAGS)
+    assert more.exit_code == 0, more.output
+    assert "4 steps" in more.output
+    rows = list(csv.DictReader((out / "log.csv").open()))
+    assert [float(row["epoch"]) for row in rows] == [1.0, 2.0]
+    assert float(rows[-1]["total"]) > 0.0
+    assert 0.0 <= float(rows[-1]["repeatability"]) <= 1.0
+    made = weights.load(out / "keypointnet.safetensors")
+    assert made.architecture.name == "compact-x0.25"
+    assert made.card["trained_on"] == 3
+    assert made.card["options"]["epochs"] == 2
+    tuned = tmp_path / "tuned"
+    made_file = out / "keypointnet.safetensors"
+    fine = train(
+        "--images",
+        folder,
+        "--finetune",
+        made_file,
+        "--out",
+        tuned,
+        "-o",
+        "epochs=1",
+        "-o",
+        "learning_rate=1e-9",
+        *FLAGS,
+    )
+    assert fine.exit_code == 0, fine.output
+    before, after = made.tensors, weights.load(tuned / "keypointnet.safetensors").tensors
+    np.testing.assert_allclose(after["conv2a.0.weight"], before["conv2a.0.weight"], atol=1e-6)
+
+
+def test_command_reads_options_from_a_file(folder, tmp_path):
+    (tmp_path / "options.yaml").write_text("width: 0.25\nsize: [96, 64]\nbatch: 2\nepoch_samples: 2\nepochs: 1\n")
+    done = train("--images", folder, "--config", tmp_path / "options.yaml", "--out", tmp_path / "out", "-o", "seed=3")
+    assert done.exit_code == 0, done.output
+    assert "1 steps" in done.output
+    card = weights.load(tmp_path / "out" / "keypointnet.safetensors").card
+    assert (card["options"]["seed"], card["options"]["batch"]) == (3, 2)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--images", "/nowhere"], "/nowhere does not exist"),
+        (["--images", "{folder}", "-o", "epochs=0"], "epochs must be at least 1"),
+        (["--images", "{folder}", "-o", "epoch=1"], "did you mean 'epochs'"),
+        (["--images", "{folder}", "-o", "size=[90, 64]"], "multiples of 8"),
+        (["--images", "{folder}", "--resume"], "nothing to resume"),
+        (["--images", "{folder}", "--finetune", "/nowhere.ckpt"], "/nowhere.ckpt"),
+        (["--images", "{folder}", "--hold-out", "cat"], "no image is named like"),
+        (["--images", "{empty}"], "holds neither photographs nor a recording"),
+    ],
+)
+def test_bad_input_is_one_line_and_leaves_nothing(folder, tmp_path, arguments, message):
+    (tmp_path / "empty").mkdir()
+    given = [a.format(folder=folder, empty=tmp_path / "empty") for a in arguments]
+    result = train(*given, "--out", tmp_path / "out", *FLAGS[:2])
+    assert result.exit_code == 2
+    assert message in result.output
+    assert len(result.output.strip().splitlines()) == 1
+    assert not (tmp_path / "out").exists()
+
+
+def test_unknown_trainer_lists_those_installed(folder):
+    result = CliRunner().invoke(main, ["train", "keypoint", "--images", str(folder)])
+    assert result.exit_code == 2
+    assert "did you mean 'keypointnet'" in result.output
+
+
+def test_trainer_is_a_part_like_any(folder, tmp_path):
+    part = registry.load().find(registry.TRAINER, "keypointnet")
+    job = TrainingJob((folder,), tmp_path / "out")
+    trainer = part.create(job, options={"width": 0.25, "size": [96, 64], "batch": 2, "epoch_samples": 2, "epochs": 1})
+    assert isinstance(trainer, Trainer)
+    assert set(vioframe_trainers()) == {"keypointnet"}
+    (step,) = trainer.train()
+    assert (step.done, step.total) == (1, 1)
+    assert step.epoch is not None
+
+
+def test_an_interrupted_training_keeps_what_is_done(folder, tmp_path):
+    part = registry.load().find(registry.TRAINER, "keypointnet")
+    options = {"width": 0.25, "size": [96, 64], "batch": 2, "epoch_samples": 20, "epochs": 1}
+    steps = part.create(TrainingJob((folder,), tmp_path / "out"), options=options).train()
+    for _ in range(3):
+        next(steps)
+    steps.close()
+    assert [p.name for p in Path(tmp_path / "out").iterdir()] == ["checkpoint.pt"]
+    rest = part.create(TrainingJob((folder,), tmp_path / "out", resume=True), options=options).train()
+    assert next(rest).done == 4
+    rest.close()
