@@ -241,6 +241,14 @@ def test_the_lead_is_over_shi_tomasi_at_the_same_degradation():
     json.dumps(rows, allow_nan=False)
 
 
+def test_the_lead_can_be_over_any_other():
+    both = {("orb", Degradation()): scores(0.6, 0.6), ("sift", Degradation()): scores(0.4, 0.4)}
+    orb, sift = quality_rows(both, "orb")
+    assert "lead" not in orb
+    assert sift["lead"]["distinct"]["mean"] == pytest.approx(-0.2)
+    assert all("lead" not in row for row in quality_rows(both))
+
+
 # Tracks
 
 

@@ -383,6 +383,8 @@ def test_a_recording_without_truth_or_images_is_refused(flight):
         (["--quality", "--rounds", "3"], "--rounds would do nothing here: it is about speed alone"),
         (["--quality", "--images", ".", "--degradation", "fog"], "no degradation is called 'fog'"),
         (["--quality", "--images", ".", "--hpatches", "."], "two sets of pairs"),
+        (["--quality", "--images", ".", "--baseline", "orbb"], "--baseline orbb does not take part; one of "),
+        (["--baseline", "orb"], "--baseline would do nothing here: it goes with --quality or --frontend"),
         (["--quality", "--images", "nowhere"], "nowhere is not a folder"),
         (["--images", "nowhere"], "nowhere is not a folder"),
         (["--detector", "nobody"], "no detector is called 'nobody'"),

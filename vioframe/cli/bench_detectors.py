@@ -25,8 +25,8 @@ _SPEED_IMAGES, _SPEED_ROUNDS, _FLIGHT_S = 8, 10, 10.0
 
 _USES = {
     "speed": ("images", "limit", "rounds"),
-    "quality": ("images", "hpatches", "limit", "degradations", "workers"),
-    "frontend": ("dataset", "degradations", "start", "duration", "ground_truth", "workers"),
+    "quality": ("images", "hpatches", "limit", "degradations", "baseline", "workers"),
+    "frontend": ("dataset", "degradations", "baseline", "start", "duration", "ground_truth", "workers"),
 }
 """Of the arguments that not every question has a use for, those that each has."""
 _ARGUMENTS = {"dataset": "DATASET", "degradations": "--degradation"}
@@ -64,6 +64,7 @@ class _Answer:
 @click.option(
     "--degradation", "degradations", metavar="NAME", multiple=True, help="Degrade by this alone.  [default: each]"
 )
+@click.option("--baseline", metavar="NAME[:...]", help="State leads over this detector.  [default: shi_tomasi]")
 @click.option("--rounds", type=click.IntRange(1), metavar="N", help=f"Rounds to time.  [default: {_SPEED_ROUNDS}]")
 @click.option("--start", type=click.FloatRange(0.0), metavar="S", help="Skip the first S seconds of DATASET.")
 @click.option("--duration", type=float, metavar="S", help=f"Seconds of DATASET.  [default: {_FLIGHT_S:g}]")
@@ -160,19 +161,19 @@ def _quality(
     hpatches: Path | None,
     limit: int | None,
     degradations: tuple[str, ...],
+    baseline: str | None,
     workers: int | None,
 ) -> _Answer:
     from vioframe.bench.detectors import quality, tables
     from vioframe.bench.detectors.degradations import choose
     from vioframe.bench.detectors.entrants import line_up
     from vioframe.bench.detectors.images import evenly
-    from vioframe.bench.detectors.leads import BASELINE
     from vioframe.bench.detectors.pairs import hpatches_pairs, synthetic_pairs
     from vioframe.bench.processes import usable_cores
 
     if images is not None and hpatches is not None:
         raise ConfigError("--images and --hpatches are two sets of pairs; measure one at a time")
-    chosen = choose(degradations)
+    chosen, over = choose(degradations), _baseline(request, baseline)
     if images is not None:
         pairs, source = synthetic_pairs(images, request.seed), f"{images.name}, synthetic homographies"
     elif hpatches is not None:
@@ -186,15 +187,15 @@ def _quality(
         scores = quality.score_detectors(
             entrants, pairs, chosen, seed=request.seed, workers=workers or usable_cores(), on_pairs=on_done
         )
-    rows = quality.quality_rows(scores)
+    rows = quality.quality_rows(scores, over)
     settings = {
         "pairs": source,
         "pair_count": len(pairs),
         "resolution": quality.RESOLUTION,
         "top_k": quality.TOP_K,
-        "baseline": BASELINE,
+        "baseline": over,
     }
-    shown = [tables.quality_table(rows, settings), *tables.sweep_tables(rows, chosen, "quality")]
+    shown = [tables.quality_table(rows, settings), *tables.sweep_tables(rows, chosen, "quality", over)]
     return _Answer(rows, settings, shown, lined_up)
 
 
@@ -202,6 +203,7 @@ def _frontend(
     request: _Request,
     dataset: Path | None,
     degradations: tuple[str, ...],
+    baseline: str | None,
     start: float | None,
     duration: float | None,
     ground_truth: Path | None,
@@ -216,24 +218,41 @@ def _frontend(
         raise DatasetError(
             "no recording given: `vioframe bench detectors --frontend DATASET`; `vioframe simulate` makes some"
         )
-    chosen = choose(degradations)
+    chosen, over = choose(degradations), _baseline(request, baseline)
     stretch = flight.Stretch(dataset, start or 0.0, _FLIGHT_S if duration is None else duration, ground_truth)
     name = flight.check(stretch, request.installed)
     lined_up = line_up(request.entrants, request.installed)
     entrants = [entrant for entrant, _ in lined_up.ready]
     with _watch("flights", len(chosen), request.quiet) as on_done:
         rows = flight.fly_detectors(
-            entrants, stretch, chosen, seed=request.seed, workers=workers or usable_cores(), on_flight=on_done
+            entrants,
+            stretch,
+            chosen,
+            seed=request.seed,
+            workers=workers or usable_cores(),
+            baseline=over,
+            on_flight=on_done,
         )
     settings = {
         "dataset": name,
         "start_s": stretch.start_s,
         "duration_s": stretch.duration_s,
+        "baseline": over,
         "epipolar_baseline_frames": flight.BASELINE_FRAMES,
         "epipolar_inlier_px": flight.INLIER_PX,
     }
-    shown = [tables.frontend_table(rows, settings), *tables.sweep_tables(rows, chosen, "frontend")]
+    shown = [tables.frontend_table(rows, settings), *tables.sweep_tables(rows, chosen, "frontend", over)]
     return _Answer(rows, settings, shown, lined_up)
+
+
+def _baseline(request: _Request, given: str | None) -> str:
+    """The detector to lead over; raises :class:`ConfigError` where the one asked for does not take part."""
+    from vioframe.bench.detectors.leads import BASELINE
+
+    labels = [entrant.label for entrant in request.entrants]
+    if given is not None and given not in labels:
+        raise ConfigError(f"--baseline {given} does not take part; one of {', '.join(labels)} can be led over")
+    return given or BASELINE
 
 
 @contextmanager

@@ -50,6 +50,7 @@ class _Job:
     entrants: tuple[Entrant, ...]
     degradation: Degradation
     seed: int
+    baseline: str
 
 
 def fly_detectors(
@@ -59,10 +60,14 @@ def fly_detectors(
     *,
     seed: int,
     workers: int,
+    baseline: str = BASELINE,
     on_flight: Callable[[int], None] = lambda count: None,
 ) -> list[Row]:
-    """A row an entrant and degradation, the same whatever the number of ``workers``; ``on_flight`` counts flights."""
-    jobs = [_Job(stretch, tuple(entrants), degradation, seed) for degradation in degradations]
+    """A row an entrant and degradation, the same whatever the number of ``workers``.
+
+    Leads are over the entrant of the label ``baseline``; ``on_flight`` counts flights.
+    """
+    jobs = [_Job(stretch, tuple(entrants), degradation, seed, baseline) for degradation in degradations]
     parts = map_in_processes(_fly, jobs, workers, lambda part: on_flight(1))
     return [row for part in parts for row in part]
 
@@ -106,7 +111,7 @@ def _fly(job: _Job) -> list[Row]:
         }
         for label, tracks in steps.items()
     ]
-    baseline = next((row for row in rows if row["detector"] == BASELINE), None)
+    baseline = next((row for row in rows if row["detector"] == job.baseline), None)
     return rows if baseline is None else [_with_leads(row, baseline) for row in rows]
 
 

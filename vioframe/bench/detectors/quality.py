@@ -93,10 +93,10 @@ def _degraded(views: Views, degradation: Degradation, seed: tuple[int, ...]) -> 
     return first, second
 
 
-def quality_rows(scores: Scores) -> list[Row]:
-    """A row a detector and degradation: means over the pairs, and spreads; see :func:`quality_row`."""
+def quality_rows(scores: Scores, baseline: str = BASELINE) -> list[Row]:
+    """A row a detector and degradation: means over the pairs, spreads, and leads over the label ``baseline``."""
     return [
-        quality_row(label, degradation, of_it, scores.get((BASELINE, degradation)))
+        quality_row(label, degradation, of_it, None if label == baseline else scores.get((baseline, degradation)))
         for (label, degradation), of_it in scores.items()
     ]
 
@@ -123,7 +123,7 @@ def quality_row(
     errors = [s.corner_error_px for s in scores if s.corner_error_px is not None]
     if errors:
         row["homography"] = {f"{px:g}px": float(np.mean(np.array(errors) <= px)) for px in CORNERS_WITHIN_PX}
-    if baseline is not None and label != BASELINE:
+    if baseline is not None:
         row["lead"] = {
             figure: lead_of_pairs(*(np.array([getattr(s, figure) for s in of]) for of in (scores, baseline)))
             for figure in LEADS

@@ -11,7 +11,6 @@ from rich.text import Text
 
 from vioframe.bench.detectors.degradations import Degradation
 from vioframe.bench.detectors.flight import SURVIVAL_FRAMES
-from vioframe.bench.detectors.leads import BASELINE
 from vioframe.bench.detectors.metrics import CORNERS_WITHIN_PX
 from vioframe.bench.detectors.quoted import FROM_PAPER, FROM_THESIS, TABLE_3_2
 from vioframe.bench.results import Row, reach
@@ -126,17 +125,23 @@ def frontend_table(rows: Sequence[Row], settings: Mapping[str, Any]) -> Group:
     return _group(heading, table)
 
 
-def sweep_tables(rows: Sequence[Row], degradations: Sequence[Degradation], question: str) -> list[Group]:
+def sweep_tables(rows: Sequence[Row], degradations: Sequence[Degradation], question: str, baseline: str) -> list[Group]:
     """A table for each figure that matters to ``question`` (quality or frontend), if there is any degradation."""
     if len(degradations) < 2:
         return []
-    return [_sweep(rows, degradations, key, title, spec) for key, (title, spec) in _SWEPT[question].items()]
+    return [
+        _sweep(rows, degradations, key, _led_title(rows, key, title, baseline), spec)
+        for key, (title, spec) in _SWEPT[question].items()
+    ]
 
 
-def _sweep(rows: Sequence[Row], degradations: Sequence[Degradation], key: str, title: str, spec: str) -> Group:
-    """The figure ``key`` of every detector at every level, with its lead where that is known."""
+def _led_title(rows: Sequence[Row], key: str, title: str, baseline: str) -> str:
     led = any(reach(row, f"lead.{key}") for row in rows)
-    heading = f"{title}, by degradation" + (f"; in brackets the lead over {BASELINE}" if led else "")
+    return f"{title}, by degradation" + (f"; in brackets the lead over {baseline}" if led else "")
+
+
+def _sweep(rows: Sequence[Row], degradations: Sequence[Degradation], key: str, heading: str, spec: str) -> Group:
+    """The figure ``key`` of every detector at every level, with its lead where that is known."""
     table = _table()
     table.add_column("degradation", no_wrap=True)
     labels = list(dict.fromkeys(row["detector"] for row in rows))
