@@ -11,12 +11,10 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import avg_pool2d, grid_sample, interpolate, normalize, pad, pixel_shuffle, pixel_unshuffle
 
-from vioframe_keypointnet.architecture import CELL_PX, FULL, Architecture
+from vioframe_keypointnet.architecture import CELL_PX, FAINT, FULL, PEAK_REACH_PX, Architecture
 
 _CROSS_RATIO = 2.0
 """How far a regressed keypoint may lie from its cell's centre, in half cells: neighbours reach into each other."""
-_FAINT = 0.02
-"""Deviation, of a range of one, that local normalisation takes for noise rather than contrast."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,7 +93,7 @@ def locally_normalised(images: Tensor) -> Tensor:
         return interpolate(avg_pool2d(coarse, 5, stride=1), scale_factor=4.0, mode="bilinear")
 
     flat = images - smooth(images)
-    return flat / (smooth(flat.square()) + _FAINT**2).sqrt()
+    return flat / (smooth(flat.square()) + FAINT**2).sqrt()
 
 
 def cells_of(response: Tensor) -> Tensor:
@@ -111,7 +109,7 @@ def peak_places(response: Tensor) -> Tensor:
     along = torch.arange(CELL_PX, device=response.device)
     rows, columns = (x.reshape(1, -1, 1, 1) for x in torch.meshgrid(along, along, indexing="ij"))
     peak = response.argmax(dim=1, keepdim=True)
-    far = ((rows - peak // CELL_PX).abs() > 2) | ((columns - peak % CELL_PX).abs() > 2)
+    far = ((rows - peak // CELL_PX).abs() > PEAK_REACH_PX) | ((columns - peak % CELL_PX).abs() > PEAK_REACH_PX)
     weights = torch.softmax(response.masked_fill(far, -torch.inf), dim=1)
     return torch.stack([(weights * axis).sum(dim=1) for axis in (columns, rows)], dim=1) - (CELL_PX - 1) / 2
 
