@@ -18,6 +18,7 @@ from common import benchmark, present
 from vioframe import config as configuration
 from vioframe import registry
 from vioframe.bench import Row
+from vioframe.bench.detectors.entrants import line_up, parse_entrants
 from vioframe.config import Config, DatasetConfig, PartConfig
 from vioframe.convert import convert
 from vioframe.experiment import prepare, record
@@ -43,11 +44,11 @@ COLUMNS = {
 
 
 @benchmark
-@click.option("--detector", "detectors", multiple=True, help="Default: all that are installed.")
+@click.option("--detector", "detectors", multiple=True, help="Default: all that need nothing more.")
 def main(data: Path, backend: str, assignments: tuple[str, ...], keep: bool, detectors: tuple[str, ...]) -> None:
     """Real EuRoC images, from bag to trajectory."""
     installed = registry.load()
-    names = detectors or tuple(installed.names(DETECTOR))
+    names = detectors or _ready(installed)
 
     def rows() -> Iterator[Row]:
         with TemporaryDirectory() as temporary:
@@ -68,6 +69,14 @@ def main(data: Path, backend: str, assignments: tuple[str, ...], keep: bool, det
 
     settings = {"backend": backend, "options": list(assignments)}
     present("euroc_clips", f"{backend}: real EuRoC images", rows(), COLUMNS, settings, keep)
+
+
+def _ready(installed: Registry) -> tuple[str, ...]:
+    """Detectors that can be made as they are: no library or file of weights is missing."""
+    return tuple(
+        entrant.name
+        for entrant, _ in line_up(parse_entrants(installed.names(DETECTOR), (), installed), installed).ready
+    )
 
 
 def run(config: Config, installed: Registry, folder: Path) -> Row:
