@@ -228,6 +228,7 @@ def test_command_trains_resumes_and_finetunes(folder, tmp_path):
     assert 0.0 <= float(rows[-1]["repeatability"]) <= 1.0
     made = weights.load(out / "keypointnet.safetensors")
     assert made.architecture.name == "compact-x0.25"
+    assert made.activation_ranges
     assert made.card["trained_on"] == 3
     assert made.card["options"]["epochs"] == 2
     tuned = tmp_path / "tuned"

@@ -9,14 +9,19 @@ from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from vioframe.errors import ConfigError
-from vioframe.types import TrainingJob, TrainingStep
+from vioframe.types import Image, TrainingJob, TrainingStep
 from vioframe_keypointnet import weights
+from vioframe_keypointnet.quantisation import measure_ranges
 from vioframe_keypointnet.training.images import gather, split
 from vioframe_keypointnet.training.loop import Training
 from vioframe_keypointnet.training.options import TrainingOptions
 from vioframe_keypointnet.training.validation import validate
+
+_CALIBRATION_IMAGES = 64
+"""Images on which the reach of each layer is measured for int8."""
 
 CHECKPOINT, LOG, WEIGHTS = "checkpoint.pt", "log.csv", "keypointnet.safetensors"
 
@@ -38,6 +43,8 @@ class KeypointNetTrainer:
         self._held_out = held_out[: options.validation_images]
         self._training = Training(options, train)
         self._counts = len(train), len(held_out)
+        every = max(1, len(train) // _CALIBRATION_IMAGES)
+        self._sample = [_grey(picture.pixels) for picture in train[::every][:_CALIBRATION_IMAGES]]
         self._history: list[Mapping[str, float]] = []
         if job.resume:
             self._history = self._training.resume(checkpoint)
@@ -81,7 +88,15 @@ class KeypointNetTrainer:
             "options": asdict(options),
             "result": dict(self._history[-1]) if self._history else {},
         }
-        weights.save(self._job.out / WEIGHTS, self._training.tensors(), options.architecture, card)
+        tensors, architecture = self._training.tensors(), options.architecture
+        ranges = measure_ranges(weights.Weights(architecture, tensors), self._sample)
+        weights.save(self._job.out / WEIGHTS, tensors, architecture, card, ranges)
+
+
+def _grey(pixels: NDArray[np.uint8]) -> Image:
+    import cv2
+
+    return pixels if pixels.ndim == 2 else cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY)
 
 
 def _write_csv(path: Path, rows: list[Mapping[str, float]]) -> None:
