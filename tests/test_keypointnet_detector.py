@@ -19,10 +19,11 @@ from vioframe.types import Keypoints  # noqa: E402
 from vioframe_keypointnet import vioframe_detectors  # noqa: E402
 from vioframe_keypointnet import weights as weights_file  # noqa: E402
 from vioframe_keypointnet.folding import fold  # noqa: E402
+from vioframe_keypointnet.peaks import select_peaks  # noqa: E402
 from vioframe_keypointnet.runtimes import cuda  # noqa: E402
 from vioframe_keypointnet.selection import OFFSET_PX, Rules, candidate_places, padded_to_cells, select  # noqa: E402
 from vioframe_keypointnet.tensors import ranged_layers  # noqa: E402
-from vioframe_keypointnet.torch_selection import TorchSelection  # noqa: E402
+from vioframe_keypointnet.torch_selection import TorchPeaks, TorchSelection  # noqa: E402
 
 FACTORY = vioframe_detectors()["keypointnet"]
 NO_RULES = Rules(nms_px=0.0, min_contrast=0)
@@ -95,6 +96,70 @@ def test_selection_on_the_device_is_the_same(nms_px, shape):
     assert len(found.xy) == len(xy) > 20
     assert np.abs(found.xy - xy).max() < 1e-4
     assert np.abs(found.score - score).max() < 1e-6
+
+
+def response_of_peaks(shape=(120, 160), seed=0):
+    return cv2.GaussianBlur(np.random.default_rng(seed).normal(size=shape).astype(np.float32), (0, 0), 1.0)
+
+
+def peaks_by_definition(response, image, shape, rules):
+    reach = max(int(np.ceil(rules.nms_px)) - 1, 1)
+    kept = []
+    for y in range(8, min(response.shape[0] - 8, shape[0])):
+        for x in range(8, min(response.shape[1] - 8, shape[1])):
+            around = response[max(y - reach, 0) : y + reach + 1, max(x - reach, 0) : x + reach + 1]
+            window = image[max(y - 8, 0) : y + 9, max(x - 8, 0) : x + 9].astype(int)
+            if response[y, x] == around.max() and window.max() - window.min() >= rules.min_contrast:
+                kept.append((y, x))
+    kept.sort(key=lambda at: -response[at])
+    return np.array(kept)
+
+
+@pytest.mark.parametrize("nms_px", [0.0, 3.0, 4.5, 15.0])
+def test_peaks_are_as_defined(nms_px):
+    response, image, rules = response_of_peaks(), half_blank((120, 160)), Rules(nms_px, min_contrast=4)
+    xy, score = select_peaks(response, image, (110, 155), 1000, rules)
+    expected = peaks_by_definition(response, image, (110, 155), rules)
+    assert len(expected) > 5
+    assert np.array_equal(np.round(xy)[:, ::-1], expected)
+    assert np.allclose(score, 1.0 / (1.0 + np.exp(-response[tuple(expected.T)])))
+    assert 0.05 < np.abs(xy - np.round(xy)).mean() < 0.35
+    first, _ = select_peaks(response, image, (110, 155), 7, rules)
+    assert np.array_equal(first, xy[:7])
+
+
+def test_a_peak_between_pixels_is_found_there():
+    rows, columns = np.indices((40, 48), dtype=np.float32)
+    response = -((columns - 20.3) ** 2) - (rows - 17.6) ** 2
+    xy, _ = select_peaks(response, texture((40, 48)), (40, 48), 5, Rules(4.0, 0))
+    assert np.abs(xy - [[20.3, 17.6]]).max() < 1e-3
+
+
+@pytest.mark.parametrize("nms_px", [0.0, 3.0, 15.0])
+@pytest.mark.parametrize("shape", [(120, 160), (115, 157)])
+def test_peaks_on_the_device_are_the_same(nms_px, shape):
+    response, rules = response_of_peaks(), Rules(nms_px, min_contrast=4)
+    image = padded_to_cells(half_blank(shape))
+    xy, score = select_peaks(response, image, shape, 100, rules)
+    rows = TorchPeaks(image.shape, shape, rules, "cpu")(
+        torch.from_numpy(response), torch.from_numpy(image).float(), None, 100
+    )
+    found = cuda.keypoints(rows.numpy())
+    assert len(found.xy) == len(xy) > 5
+    assert np.abs(found.xy - xy).max() < 1e-4
+    assert np.abs(found.score - score).max() < 1e-6
+
+
+def test_of_a_plateau_the_first_pixel_is_the_peak():
+    response = np.zeros((40, 48), np.float32)
+    response[20:22, 30:33] = 1.0
+    image, rules = texture((40, 48)), Rules(3.0, 0)
+    xy, _ = select_peaks(response, image, (40, 48), 1, rules)
+    rows = TorchPeaks((40, 48), (40, 48), rules, "cpu")(
+        torch.from_numpy(response), torch.from_numpy(image).float(), None, 1
+    )
+    assert np.array_equal(xy, rows[:, :2].numpy())
+    assert np.abs(xy - [[30.5, 20.5]]).max() < 1e-6
 
 
 def test_equal_scores_leave_one_of_two_neighbours():

@@ -14,15 +14,16 @@ from vioframe_keypointnet import runtimes  # noqa: E402
 from vioframe_keypointnet.description import describe  # noqa: E402
 from vioframe_keypointnet.folding import fold  # noqa: E402
 from vioframe_keypointnet.network import describe as describe_in_torch  # noqa: E402
+from vioframe_keypointnet.peaks import unfolded  # noqa: E402
 from vioframe_keypointnet.quantisation import measure_ranges  # noqa: E402
-from vioframe_keypointnet.selection import Rules, candidate_places, select  # noqa: E402
+from vioframe_keypointnet.selection import candidate_places  # noqa: E402
 
 NOT_TORCH = [runtime for runtime in runtimes.ON_CPU if runtime != "torch"]
 each_architecture = pytest.mark.parametrize("architecture", ARCHITECTURES.values(), ids=ARCHITECTURES)
 
 
 def as_trained(net, image):
-    """What the runtimes should give, the exponential replaced by its logarithm, and what the network itself gives."""
+    """What the runtimes should give, and what the network itself gives."""
     caught = {}
     place = "R" if net.architecture.peaks else "Pb"
     hooks = [
@@ -34,19 +35,13 @@ def as_trained(net, image):
         found = net(images.expand(-1, net.architecture.image_channels, -1, -1))
     for hook in hooks:
         hook.remove()
-    if net.architecture.peaks:
-        outputs = [caught["Db"] + found.response[0].logsumexp(dim=0), caught["R"]]
-    else:
-        outputs = [torch.cat([caught["Db"], caught["Pb"]])]
-    return [output.numpy() for output in (*outputs, found.descriptors[0])], found
+    heads = caught["R"] if net.architecture.peaks else torch.cat([caught["Db"], caught["Pb"]])
+    return [output.numpy() for output in (heads, found.descriptors[0])], found
 
 
 def run_by(runtime, precision, net, image, ranges=None):
     """The same by a runtime."""
-    outputs = [*runtimes.on_cpu(runtime, precision, fold(weights(net), descriptors=True), ranges, 1)(image)]
-    if net.architecture.peaks:
-        outputs[1] = np.log(outputs[1])
-    return outputs
+    return runtimes.on_cpu(runtime, precision, fold(weights(net), descriptors=True), ranges, 1)(image)
 
 
 def relative_error(found, expected):
@@ -105,11 +100,11 @@ def test_ranges_leave_out_what_is_rare_and_far():
     net = network(COMPACT)
     ranges = measure_ranges(weights(net), [texture(seed=number) for number in range(4)])
     outputs = []
-    hook = net.conv4a.register_forward_hook(lambda _, __, output: outputs.append(output.numpy().copy()))
+    hook = net.conv2b.register_forward_hook(lambda _, __, output: outputs.append(output.numpy().copy()))
     as_trained(net, texture(seed=0))
     hook.remove()
     positive = outputs[0][outputs[0] > 0.0]
-    assert np.quantile(positive, 0.99) < ranges["4a"] <= 1.5 * positive.max()
+    assert np.quantile(positive, 0.99) < ranges["2b"] <= 1.5 * positive.max()
     with pytest.raises(ConfigError, match="there are none"):
         measure_ranges(weights(net), [])
 
@@ -119,15 +114,17 @@ def test_places_are_those_of_the_trained_network():
     assert np.abs(np.stack(candidate_places(heads)) - found.xy[0].numpy()).max() < 1e-3
 
 
-def test_peaks_are_those_of_the_trained_network():
-    image = texture()
-    (score, response, _), found = as_trained(network(COMPACT), image)
-    xy, _ = select(score, image, image.shape, 1000, Rules(0.0, 0), np.exp(response))
-    expected = found.xy[0, :, 1:-1, 1:-1].flatten(1).T.numpy()
-    assert len(xy) == len(expected)
-    distance = np.linalg.norm(xy[:, None] - expected[None], axis=2)
-    assert distance.min(axis=0).max() < 1e-3
-    assert np.abs(xy[0] - found.xy[0].flatten(1)[:, found.score.argmax()].numpy()).max() < 1e-3
+def test_the_response_of_each_pixel_is_that_of_the_trained_network():
+    (response, _), found = as_trained(network(COMPACT), texture())
+    by_cells = torch.nn.functional.pixel_shuffle(found.response, 8)[0, 0].numpy()
+    assert np.array_equal(unfolded(response), by_cells)
+
+
+@pytest.mark.parametrize("descriptors", [False, True])
+def test_only_what_is_needed_is_run(descriptors):
+    made = weights(network(COMPACT))
+    names = [layer.name for layer in fold(made, descriptors).encoder]
+    assert names == (["2a", "2b", "2c", "3a", "4a"] if descriptors else ["2a", "2b", "2c"])
 
 
 def test_descriptors_are_sampled_as_in_training():

@@ -15,6 +15,7 @@ from vioframe_keypointnet import runtimes
 from vioframe_keypointnet.description import describe
 from vioframe_keypointnet.folding import fold
 from vioframe_keypointnet.options import KeypointNetOptions
+from vioframe_keypointnet.peaks import select_peaks, unfolded
 from vioframe_keypointnet.selection import Rules, padded_to_cells, select
 from vioframe_keypointnet.weights import load
 
@@ -36,9 +37,11 @@ class OnCpu:
     peaks: bool
 
     def __call__(self, padded: Image, shape: tuple[int, int], max_points: int) -> Keypoints:
-        heads, *described = self.run(padded)
-        likely = described.pop(0) if self.peaks else None
-        xy, score = select(heads, padded, shape, max_points, self.rules, likely)
+        found, *described = self.run(padded)
+        if self.peaks:
+            xy, score = select_peaks(unfolded(found), padded, shape, max_points, self.rules)
+        else:
+            xy, score = select(found, padded, shape, max_points, self.rules)
         return Keypoints(xy, score, describe(described[0], xy) if described else None)
 
 

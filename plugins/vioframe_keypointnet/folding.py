@@ -23,9 +23,6 @@ LEAK = 0.01
 NEUTRAL_GREY = 127.5
 """The grey that the network sees as 0; also what lies around the image."""
 
-LARGEST_EXPONENT = 60.0
-"""Responses are cut off there, so that the sum over a cell of their exponentials is a float."""
-
 _SCALE = 0.225 / 255.0
 _BATCH_NORM_EPSILON = 1e-5
 
@@ -69,13 +66,6 @@ class Operations(Protocol[NodeT]):
     def join(self, a: NodeT, b: NodeT) -> NodeT:
         """The channels of ``a``, then those of ``b``."""
 
-    def exponential(self, x: NodeT) -> NodeT: ...
-
-    def log_sum_of_cells(self, x: NodeT) -> NodeT:
-        """(B, 4, H/2, W/2) -> (B, 1, H/8, W/8): the logarithm of the sum over each cell."""
-
-    def add(self, a: NodeT, b: NodeT) -> NodeT: ...
-
 
 @dataclass(frozen=True, slots=True)
 class FoldedNetwork:
@@ -83,54 +73,52 @@ class FoldedNetwork:
 
     architecture: Architecture
     encoder: tuple[Convolution, ...]
-    heads: tuple[Convolution, Convolution]
-    response: Convolution | None = None
-    """For a network of peaks: that which gives 2 x 2 pixels of the response at each place of the second block."""
+    """Of a network of peaks that does not describe, the first two blocks: its response needs no more."""
+    heads: tuple[Convolution, ...]
+    """Hidden layer and output of score and place; of a network of peaks the one that gives the response."""
     description: tuple[Convolution, ...] = ()
     """Fa, Fb, Faa, Fbb, or nothing."""
 
     def build(self, operations: Operations[NodeT], image: NodeT) -> tuple[NodeT, ...]:
         """From (B, 1, H, W) grey levels: (B, 3, H/8, W/8), before sigmoid and tanh, the score, x and y of each cell.
 
-        For a network of peaks: (B, 1, H/8, W/8) the score, and (B, 4, H/2, W/2) the exponential of the response, 2 x 2
-        pixels in each place. Then, if it describes, (B, D, H/4, W/4) descriptors, not normalised yet.
+        For a network of peaks: (B, 4, H/2, W/2) the response, 2 x 2 pixels in each place. Then, if it describes,
+        (B, D, H/4, W/4) descriptors, not normalised yet.
         """
-        x = operations.centred(image) if self.response is None else operations.normalised(image)
+        peaks = self.architecture.peaks
+        x = operations.normalised(image) if peaks else operations.centred(image)
         after = {}
         for layer in self.encoder:
             x = after[layer.name[0]] = operations.convolve(layer, x)
             if layer.name in self.architecture.pooled:
                 x = operations.pool(x)
-        hidden, out = self.heads
-        found: tuple[NodeT, ...] = (operations.convolve(out, operations.convolve(hidden, x)),)
-        if self.response is not None:
-            likely = operations.exponential(operations.convolve(self.response, after["2"]))
-            found = operations.add(found[0], operations.log_sum_of_cells(likely)), likely
+        found = after["2"] if peaks else x
+        for layer in self.heads:
+            found = operations.convolve(layer, found)
         if not self.description:
-            return found
+            return (found,)
         first, second, third, fourth = self.description
         x = operations.shuffle(operations.convolve(second, operations.convolve(first, x)))
-        return *found, operations.convolve(fourth, operations.convolve(third, operations.join(x, after["3"])))
+        return found, operations.convolve(fourth, operations.convolve(third, operations.join(x, after["3"])))
 
 
 def fold(weights: Weights, descriptors: bool = False) -> FoldedNetwork:
     """The network of ``weights`` for grey images, which equals the trained one on R = G = B exactly."""
     architecture, tensors = weights.architecture, weights.tensors
-    encoder = [_normalised(tensors, name) for name, *_ in architecture.encoder]
+    needed = [name for name, *_ in architecture.encoder if descriptors or not architecture.peaks or name < "3"]
+    encoder = [_normalised(tensors, name) for name in needed]
     encoder[0] = _on_grey_levels(encoder[0], architecture)
-    hidden = [_normalised(tensors, "Da")]
+    heads: tuple[Convolution, ...]
     if architecture.peaks:
-        out = Convolution(OUT, tensors["convDb.weight"], tensors["convDb.bias"], activated=False)
-        response = Convolution(RESPONSE, tensors["convR.weight"], tensors["convR.bias"], activated=False)
+        heads = (Convolution(RESPONSE, tensors["convR.weight"], tensors["convR.bias"], activated=False),)
     else:
-        hidden.append(_normalised(tensors, "Pa"))
-        out, response = _joint_output(tensors), None
+        heads = _stacked(HEADS, [_normalised(tensors, name) for name in ("Da", "Pa")]), _joint_output(tensors)
     description: tuple[Convolution, ...] = ()
     if descriptors:
         first, second, third = (_normalised(tensors, name, name != "Fb") for name in ("Fa", "Fb", "Faa"))
         last = Convolution("Fbb", tensors["convFbb.weight"], tensors["convFbb.bias"], activated=False)
         description = (first, second, third, last)
-    return FoldedNetwork(architecture, tuple(encoder), (_stacked(HEADS, hidden), out), response, description)
+    return FoldedNetwork(architecture, tuple(encoder), heads, description)
 
 
 def _normalised(tensors: Tensors, name: str, activated: bool = True) -> Convolution:

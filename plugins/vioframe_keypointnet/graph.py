@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vioframe_keypointnet.architecture import CELL_PX, FAINT
-from vioframe_keypointnet.folding import LARGEST_EXPONENT, LEAK, NEUTRAL_GREY, Convolution, FoldedNetwork
+from vioframe_keypointnet.architecture import FAINT
+from vioframe_keypointnet.folding import LEAK, NEUTRAL_GREY, Convolution, FoldedNetwork
 from vioframe_keypointnet.optional import needs
 from vioframe_keypointnet.tensors import OUT, RESPONSE
 
@@ -39,7 +39,7 @@ def onnx_model(
         from onnx import TensorProto, helper
 
     graph = _Graph(shape, activation_ranges or {})
-    seen = _seeing_integers(network) if activation_ranges and network.response is None else network
+    seen = _seeing_integers(network) if activation_ranges and not network.architecture.peaks else network
     outputs = seen.build(graph, "image")
     height, width = shape
     image = helper.make_tensor_value_info("image", TensorProto.UINT8, [1, 1, height, width])
@@ -94,7 +94,7 @@ class _Graph:
         grey = self._floats_of(image)
         flat = self.node("Sub", [grey, self._smooth(grey)])
         faint = self.constant(np.float32((255.0 * FAINT) ** 2))
-        deviation = self.node("Sqrt", [self.add(self._smooth(self.node("Mul", [flat, flat])), faint)])
+        deviation = self.node("Sqrt", [self.node("Add", [self._smooth(self.node("Mul", [flat, flat])), faint])])
         x = self.node("Div", [flat, deviation])
         return self._quantised(x, np.float32(_MOST_DEVIATIONS / 127.0), _MIDDLE_GREY) if self._ranges else x
 
@@ -127,18 +127,6 @@ class _Graph:
 
     def join(self, a: str, b: str) -> str:
         return self.node("Concat", [a, b], axis=1)
-
-    def exponential(self, x: str) -> str:
-        return self.node("Exp", [self.node("Min", [x, self.constant(np.float32(LARGEST_EXPONENT))])])
-
-    def log_sum_of_cells(self, x: str) -> str:
-        side = CELL_PX // 2
-        mean = self.node("AveragePool", [x], kernel_shape=[side, side], strides=[side, side])
-        total = self.node("ReduceSum", [mean, self.constant(np.array([1], np.int64))], keepdims=1)
-        return self.node("Log", [self.node("Mul", [total, self.constant(np.float32(side * side))])])
-
-    def add(self, a: str, b: str) -> str:
-        return self.node("Add", [a, b])
 
     def dequantised(self, x: str, step: np.float32, zero: int) -> str:
         """The values of ``x`` uint8, of which convolutions may make use as they are."""

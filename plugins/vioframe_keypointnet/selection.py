@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from vioframe.jit import kernel
 from vioframe.types import Image
-from vioframe_keypointnet.architecture import CELL_PX, PEAK_REACH_PX
+from vioframe_keypointnet.architecture import CELL_PX
 
 OFFSET_PX = 2.0 * (CELL_PX - 1) / 2
 """How far a keypoint may lie from its cell's centre: the network's cross ratio of 2 times half a cell."""
@@ -45,32 +45,19 @@ def padded_to_cells(image: Image) -> Image:
     return np.ascontiguousarray(image)
 
 
-def select(
-    heads: Array,
-    image: Image,
-    shape: tuple[int, int],
-    max_points: int,
-    rules: Rules,
-    likely: Array | None = None,
-) -> tuple[Array, Array]:
+def select(heads: Array, image: Image, shape: tuple[int, int], max_points: int, rules: Rules) -> tuple[Array, Array]:
     """``xy`` (N, 2) px and ``score`` (N,) in (0, 1), strongest first, of the candidates ``heads`` (3, h, w).
 
-    ``heads`` are the score, x and y of each cell as the network gives them before sigmoid and tanh; for a network of
-    peaks (1, h, w) the score alone, and ``likely`` (4, 4 h, 4 w), 2 x 2 pixels in each place, tells where. ``image``
-    (8 h, 8 w) is what the network saw. Not taken: the outermost ring of cells, which sees less than it should, and what
+    ``heads`` are the score, x and y of each cell as the network gives them before sigmoid and tanh; ``image``
+    (8 h, 8 w) is what it saw. Not taken: the outermost ring of cells, which sees less than it should, and what
     lies outside the image's first ``shape`` (H, W) pixels, which are not padding.
     """
     scores = heads[0]
-    if likely is None:
-        likely = np.empty((4, 0, 0), np.float32)
-        xs, ys = candidate_places(heads)
-    else:
-        # Found as they are come to, strongest first: what is not a number yet suppresses nothing.
-        xs, ys = np.full((2, *scores.shape), np.nan, np.float32)
+    xs, ys = candidate_places(heads)
     order = np.argsort(scores, axis=None)[::-1]
     cells = np.empty(max(min(max_points, scores.size), 0), np.int64)
     radius2, reach = np.float32(rules.nms_px**2), rules.reach_cells
-    count = _take(cells, order, scores, xs, ys, likely, image, shape[0], shape[1], radius2, reach, rules.min_contrast)
+    count = _take(cells, order, scores, xs, ys, image, shape[0], shape[1], radius2, reach, rules.min_contrast)
     taken = cells[:count]
     return np.stack([xs.ravel()[taken], ys.ravel()[taken]], axis=1), sigmoid(scores.ravel()[taken])
 
@@ -98,7 +85,6 @@ def _take(
     scores: Array,
     xs: Array,
     ys: Array,
-    likely: Array,
     image: Image,
     height: int,
     width: int,
@@ -115,40 +101,16 @@ def _take(
         row, column = cell // w, cell % w
         if row == 0 or column == 0 or row == h - 1 or column == w - 1 or not np.isfinite(scores[row, column]):
             continue
-        if likely.size > 0:
-            xs[row, column], ys[row, column] = _peak(likely, row, column)
         x, y = xs[row, column], ys[row, column]
         if x > width - 1 or y > height - 1:
             continue
         if _suppressed(row, column, scores, xs, ys, radius2, reach):
             continue
-        if not _varies(image, round(x), round(y), height, width, min_contrast):
+        if not varies(image, round(x), round(y), height, width, min_contrast):
             continue
         cells[count] = cell
         count += 1
     return count
-
-
-@kernel
-def _peak(likely: Array, row: int, column: int) -> tuple[float, float]:
-    """(x, y) px of the most likely pixel of a cell and what is about it, weighted."""
-    top, left = CELL_PX * row, CELL_PX * column
-    best_y, best_x, most = 0, 0, np.float32(-1.0)
-    for y in range(CELL_PX):
-        for x in range(CELL_PX):
-            value = likely[2 * (y % 2) + x % 2, (top + y) // 2, (left + x) // 2]
-            if value > most:
-                best_y, best_x, most = y, x, value
-    total = sum_x = sum_y = 0.0
-    for y in range(max(best_y - PEAK_REACH_PX, 0), min(best_y + PEAK_REACH_PX + 1, CELL_PX)):
-        for x in range(max(best_x - PEAK_REACH_PX, 0), min(best_x + PEAK_REACH_PX + 1, CELL_PX)):
-            value = likely[2 * (y % 2) + x % 2, (top + y) // 2, (left + x) // 2]
-            total += value
-            sum_x += value * x
-            sum_y += value * y
-    if total == 0.0:  # nothing there is even a float's worth of likely
-        return left + best_x, top + best_y
-    return left + sum_x / total, top + sum_y / total
 
 
 @kernel
@@ -165,7 +127,7 @@ def _suppressed(row: int, column: int, scores: Array, xs: Array, ys: Array, radi
 
 
 @kernel
-def _varies(image: Image, x: int, y: int, height: int, width: int, min_contrast: int) -> bool:
+def varies(image: Image, x: int, y: int, height: int, width: int, min_contrast: int) -> bool:
     """Whether grey levels around (x, y) differ by ``min_contrast``."""
     low = high = int(image[y, x])
     if min_contrast <= 0:

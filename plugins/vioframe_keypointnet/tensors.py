@@ -41,7 +41,8 @@ def shapes(architecture: Architecture) -> dict[str, tuple[int, ...]]:
 
 def ranged_layers(architecture: Architecture) -> tuple[str, ...]:
     """Names of the layers whose outputs int8 inference represents in 8 bits: all of the detector's but the last."""
-    return (*(name for name, *_ in architecture.encoder), HEADS)
+    names = tuple(name for name, *_ in architecture.encoder)
+    return tuple(name for name in names if name < "3") if architecture.peaks else (*names, HEADS)
 
 
 def untrained(architecture: Architecture) -> dict[str, NDArray[np.float32]]:

@@ -11,6 +11,7 @@ from torch.nn import functional
 
 from vioframe_keypointnet.architecture import CELL_PX
 from vioframe_keypointnet.network import describe
+from vioframe_keypointnet.peaks import reach_px
 from vioframe_keypointnet.selection import CONTRAST_REACH_PX, Rules
 
 _NEVER = float("-inf")
@@ -66,8 +67,50 @@ class TorchSelection:
     def _flat(self, image: Tensor, xy: Tensor) -> Tensor:
         """(h, w) whether grey levels around the candidates hardly differ."""
         column, row = xy.round().long()
-        range_ = _spread(image[None])[0] + _spread(-image[None])[0]
-        return range_[row, column] < self._rules.min_contrast
+        return _range(image)[row, column] < self._rules.min_contrast
+
+
+class TorchPeaks:
+    """Selects among the peaks of a response: what :mod:`peaks` does."""
+
+    def __init__(self, padded: tuple[int, int], shape: tuple[int, int], rules: Rules, device: str) -> None:
+        self._inner = torch.zeros(padded, dtype=torch.bool)
+        rows, columns = (slice(CELL_PX, min(side - CELL_PX, seen)) for side, seen in zip(padded, shape, strict=True))
+        self._inner[rows, columns] = True
+        self._inner = self._inner.to(device)
+        # Floats tell whole numbers apart up to 2^24, more than there are pixels.
+        self._place = torch.arange(padded[0] * padded[1], 0, -1.0, device=device).view(padded)
+        self._columns, self._reach, self._rules = padded[1], reach_px(rules), rules
+
+    def __call__(self, response: Tensor, image: Tensor, descriptors: Tensor | None, max_points: int) -> Tensor:
+        """(K, 3 + D) as :class:`TorchSelection` gives it, of ``response`` (H, W)."""
+        highest = self._highest(response) == response
+        first = torch.where(highest, self._place, 0.0)
+        peak = highest & (self._highest(first) == first) & self._inner & (_range(image) >= self._rules.min_contrast)
+        best, pixels = response.masked_fill(~peak, _NEVER).flatten().topk(min(max_points, response.numel()))
+        row, column = pixels // self._columns, pixels % self._columns
+        around = functional.pad(response, [1, 1, 1, 1])
+        x, y = (
+            middle + _summits(around[row + 1 - dy, column + 1 - dx], best, around[row + 1 + dy, column + 1 + dx])
+            for middle, dx, dy in ((column, 1, 0), (row, 0, 1))
+        )
+        found = torch.stack([x, y, best], dim=1)
+        if descriptors is None:
+            return found
+        return torch.cat([found, describe(descriptors[None], found[None, :, :2])[0]], dim=1)
+
+    def _highest(self, x: Tensor) -> Tensor:
+        return functional.max_pool2d(x[None], 2 * self._reach + 1, stride=1, padding=self._reach)[0]
+
+
+def _summits(before: Tensor, here: Tensor, after: Tensor) -> Tensor:
+    bend = 2.0 * here - before - after
+    return torch.where(bend > 0.0, 0.5 * (after - before) / bend, 0.0)
+
+
+def _range(image: Tensor) -> Tensor:
+    """By how much grey levels of ``image`` (H, W) differ around each pixel."""
+    return _spread(image[None])[0] + _spread(-image[None])[0]
 
 
 def _spread(image: Tensor) -> Tensor:

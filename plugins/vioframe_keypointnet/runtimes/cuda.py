@@ -14,13 +14,12 @@ from vioframe_keypointnet.folding import FoldedNetwork
 from vioframe_keypointnet.optional import needs
 from vioframe_keypointnet.runtimes.torch import TorchOperations
 from vioframe_keypointnet.selection import OFFSET_PX, Rules, sigmoid
-from vioframe_keypointnet.torch_selection import TorchSelection
+from vioframe_keypointnet.torch_selection import TorchPeaks, TorchSelection
 
 with needs("torch", "keypointnet"):
     import torch
     from torch import Tensor
-
-    from vioframe_keypointnet.network import cells_of, peak_places
+    from torch.nn.functional import pixel_shuffle
 
 _WARM_UP_RUNS = 3
 
@@ -53,16 +52,16 @@ def detection(
     device: str,
 ) -> Callable[[Tensor], Tensor]:
     """From an image (1, 1, H, W) uint8 on ``device`` to what :class:`TorchSelection` selects; nothing leaves it."""
-    operations, selection = TorchOperations(device, dtype), TorchSelection(padded, shape, rules, device)
+    operations = TorchOperations(device, dtype)
+    cells, peaks = TorchSelection(padded, shape, rules, device), TorchPeaks(padded, shape, rules, device)
 
     def detect(image: Tensor) -> Tensor:
         grey = image.float()
-        heads, *rest = (output[0].float() for output in network.build(operations, grey))
-        if network.response is None:
-            places = OFFSET_PX * torch.tanh(heads[1:])
-        else:
-            places = peak_places(cells_of(rest.pop(0).log()[None]))[0]
-        return selection(heads[0], places, grey[0, 0], rest[0] if rest else None, max_points)
+        found, *rest = (output[0].float() for output in network.build(operations, grey))
+        descriptors = rest[0] if rest else None
+        if network.architecture.peaks:
+            return peaks(pixel_shuffle(found, 2)[0], grey[0, 0], descriptors, max_points)
+        return cells(found[0], OFFSET_PX * torch.tanh(found[1:]), grey[0, 0], descriptors, max_points)
 
     return detect
 

@@ -6,8 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vioframe.types import Image
-from vioframe_keypointnet.architecture import CELL_PX
-from vioframe_keypointnet.folding import LARGEST_EXPONENT, LEAK, NEUTRAL_GREY, Convolution, FoldedNetwork
+from vioframe_keypointnet.folding import LEAK, NEUTRAL_GREY, Convolution, FoldedNetwork
 from vioframe_keypointnet.optional import needs
 
 with needs("torch", "keypointnet"):
@@ -47,15 +46,6 @@ class TorchOperations:
 
     def join(self, a: Tensor, b: Tensor) -> Tensor:
         return torch.cat([a, b], dim=1)
-
-    def exponential(self, x: Tensor) -> Tensor:
-        return x.float().clamp(max=LARGEST_EXPONENT).exp()
-
-    def log_sum_of_cells(self, x: Tensor) -> Tensor:
-        return functional.avg_pool2d(x, CELL_PX // 2, divisor_override=1).sum(dim=1, keepdim=True).log()
-
-    def add(self, a: Tensor, b: Tensor) -> Tensor:
-        return a + b
 
 
 class TorchOnCpu:

@@ -8,9 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch.nn.functional import pixel_shuffle
 
 from vioframe.types import Float
+from vioframe_keypointnet.architecture import CELL_PX
 from vioframe_keypointnet.network import KeypointNet
+from vioframe_keypointnet.peaks import select_peaks
+from vioframe_keypointnet.selection import Rules
 from vioframe_keypointnet.training.homography import HomographyRange, random_homography, transfer
 from vioframe_keypointnet.training.images import Picture
 
@@ -52,6 +56,10 @@ def _strongest(network: KeypointNet, image: NDArray[np.uint8]) -> Float:
     pixels = torch.from_numpy(np.atleast_3d(image)).to(device).permute(2, 0, 1)[None].float() / 255.0
     with torch.no_grad():
         seen = network(pixels)
+    if seen.response is not None:
+        response = pixel_shuffle(seen.response, CELL_PX)[0, 0].cpu().numpy()
+        grey = image if image.ndim == 2 else image[..., 1]
+        return select_peaks(response, grey, grey.shape, 4 * _TOP, Rules(_NMS_PX, 0))[0].astype(np.float64)
     order = seen.score.flatten().argsort(descending=True)[: 4 * _TOP]
     xy: Float = seen.xy[0].flatten(1).T[order].cpu().double().numpy()
     taken = np.ones(len(xy), bool)
