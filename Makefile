@@ -11,7 +11,7 @@ CODE := vioframe plugins tests docs/example-plugin
 DEMO := build/demo
 FLIGHT ?= inspection
 FLIGHT_BAG := $(DEMO)/$(FLIGHT).bag
-DETECTORS := shi_tomasi fast orb sift
+DETECTORS := shi_tomasi fast orb sift keypointnet
 RUNS := $(DETECTORS:%=$(DEMO)/%) $(DEMO)/sliding_window
 
 # What Open3D's wheel needs from the system.

@@ -76,6 +76,7 @@ def machine_hall(shared_data: Path, tmp_path_factory: pytest.TempPathFactory) ->
         pytest.param("akaze", "msckf", 0.015, marks=pytest.mark.slow),
         pytest.param("brisk", "msckf", 0.015, marks=pytest.mark.slow),
         pytest.param("surf", "msckf", 0.015, marks=pytest.mark.slow),
+        ("keypointnet", "msckf", 0.020),
         ("shi_tomasi", "sliding_window", 0.012),
     ],
 )

@@ -28,7 +28,7 @@ from vioframe_keypointnet.training.homography import (  # noqa: E402
     random_homography,
     transfer,
 )
-from vioframe_keypointnet.training.lessons import corners, lesson, lesson_loss  # noqa: E402
+from vioframe_keypointnet.training.lessons import corners, lesson, lesson_loss, matching_loss  # noqa: E402
 from vioframe_keypointnet.training.losses import Candidates  # noqa: E402
 
 SIZE = (96, 64)
@@ -295,6 +295,23 @@ def test_a_lesson_learnt_is_a_smaller_loss(peaks):
     (place, corner), (place_before, corner_before) = lesson_loss(taught, wanted), lesson_loss(ignorant, wanted)
     assert place < 0.8 * place_before
     assert corner < 0.5 * corner_before
+
+
+def test_descriptors_that_tell_places_apart_match():
+    """Of 60 candidates off the border, 36 px apart from none, one descriptor for all says nothing: ln 60."""
+    places = keypoint_places(torch.zeros(1, 2, 8, 12))
+    h, w = 16, 24
+    rows, columns = torch.meshgrid(torch.linspace(-1, 1, h), torch.linspace(-1, 1, w), indexing="ij")
+    telling = torch.stack([torch.cos(3 * columns), torch.sin(3 * columns), torch.cos(3 * rows), torch.sin(3 * rows)])[
+        None
+    ]
+    saying_nothing = torch.ones(1, 4, h, w)
+    losses_ = [
+        matching_loss(*(Detection(torch.zeros(1, 8, 12), places, d) for _ in range(2)), torch.eye(3)[None]).item()
+        for d in (saying_nothing, telling)
+    ]
+    assert losses_[0] == pytest.approx(math.log(60.0), abs=1e-4)
+    assert losses_[1] < 0.6 * losses_[0]
 
 
 def test_architectures_that_cannot_be_are_refused():

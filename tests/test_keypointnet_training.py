@@ -19,6 +19,9 @@ from vioframe.errors import ConfigError  # noqa: E402
 from vioframe.interfaces import Trainer  # noqa: E402
 from vioframe.types import TrainingJob  # noqa: E402
 from vioframe_keypointnet import vioframe_trainers, weights  # noqa: E402
+from vioframe_keypointnet.folding import fold  # noqa: E402
+from vioframe_keypointnet.runtimes.torch import TorchOnCpu  # noqa: E402
+from vioframe_keypointnet.selection import padded_to_cells  # noqa: E402
 from vioframe_keypointnet.training.images import Picture, gather, split  # noqa: E402
 from vioframe_keypointnet.training.loop import Training, step_losses  # noqa: E402
 from vioframe_keypointnet.training.options import TrainingOptions  # noqa: E402
@@ -72,6 +75,23 @@ def test_steps_lower_the_loss_of_a_fixed_batch(pictures, options, taught):
         totals.append(values["total"].item())
         assert np.isfinite(totals[-1])
     assert totals[-1] < 0.9 * totals[0]
+
+
+@pytest.mark.parametrize("options", [SMALL, PUBLISHED], ids=["compact", "full"])
+def test_descriptors_alone_are_trained_beside_a_detector_left_as_it_is(pictures, options):
+    if options.network == "full":
+        pictures = [Picture(p.name, np.repeat(p.pixels[..., None], 3, axis=2)) for p in pictures]
+    training = Training(replace(options, descriptors_only=True, lesson_epochs=1), pictures)
+    before = weights.Weights(options.architecture, training.tensors())
+    totals = [values["total"] for values in training.steps()]
+    after = weights.Weights(options.architecture, training.tensors())
+    assert len(totals) == 4
+    assert np.isfinite(totals).all()
+    grey = pictures[0].pixels if options.network == "compact" else pictures[0].pixels[..., 0]
+    image = padded_to_cells(np.ascontiguousarray(grey))
+    found = [TorchOnCpu(fold(w, descriptors=True), 1)(image) for w in (before, after)]
+    np.testing.assert_array_equal(found[0][0], found[1][0])
+    assert np.abs(found[0][1] - found[1][1]).max() > 1e-4
 
 
 def states(training):

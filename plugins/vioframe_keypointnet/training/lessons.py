@@ -11,16 +11,18 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
-from torch.nn.functional import binary_cross_entropy, pixel_unshuffle
+from torch.nn.functional import binary_cross_entropy, cross_entropy, pixel_unshuffle
 
 from vioframe.types import Float
 from vioframe_keypointnet.architecture import CELL_PX
-from vioframe_keypointnet.network import Detection
+from vioframe_keypointnet.network import Detection, describe
 from vioframe_keypointnet.training.homography import transfer
+from vioframe_keypointnet.training.losses import NEAR_PX, Candidates, warp
 
 _MOST, _QUALITY, _APART_PX, _BLOCK_PX = 600, 0.005, 5.0, 3
 _SCORE_WEIGHT = 4.0
 _SPOT_PX = 0.7
+_TEMPERATURE = 0.1
 _WEAKEST = 0.2
 """Score to be given to the weakest corner; the strongest has one, cells without any zero."""
 
@@ -71,10 +73,29 @@ def lesson_loss(seen: Detection, wanted: Tensor) -> tuple[Tensor, Tensor]:
     return place, score
 
 
+def matching_loss(a: Detection, b: Detection, homography: Tensor) -> Tensor:
+    """Cross entropy of telling each candidate's own place in the target from all others', by descriptors.
+
+    Every other place is a negative, not the hardest alone: that one pulls descriptors that know nothing yet to one
+    point, where the published loss leaves them.
+    """
+    source = Candidates.of(a)
+    h, w = a.score.shape[1:]
+    warped = warp(homography, source.xy.detach())
+    limit = warped.new_tensor([CELL_PX * w - 1.0, CELL_PX * h - 1.0])
+    seen = ((warped >= 0.0) & (warped <= limit)).all(dim=-1) & source.off_border
+    likeness = describe(a.descriptors, source.xy.detach()) @ describe(b.descriptors, warped).transpose(1, 2)
+    itself = torch.eye(h * w, dtype=torch.bool, device=warped.device)
+    beside = (torch.cdist(warped, warped) < NEAR_PX) & ~itself
+    logits = (likeness / _TEMPERATURE).masked_fill(beside | ~seen[:, None, :], -torch.inf)[seen]
+    own = torch.arange(h * w, device=warped.device).expand_as(seen)[seen]
+    return cross_entropy(logits, own) if len(own) else likeness.sum() * 0.0
+
+
 def teach(a: Detection, b: Detection, lesson_a: Tensor, lesson_b: Tensor) -> dict[str, Tensor]:
-    """The losses of a step of lessons, over both views: ``place``, ``corner`` and their weighted sum ``total``."""
+    """The losses of a step of lessons, mean of both views: ``place`` and, weighted, ``corner``."""
     place, score = (0.5 * (x + y) for x, y in zip(lesson_loss(a, lesson_a), lesson_loss(b, lesson_b), strict=True))
-    return {"place": place, "corner": score, "total": place + _SCORE_WEIGHT * score}
+    return {"place": place, "corner": _SCORE_WEIGHT * score}
 
 
 def _spots(xy: Tensor) -> Tensor:

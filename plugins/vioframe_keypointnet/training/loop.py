@@ -12,12 +12,13 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
+from torch.nn import Module
 from torch.optim import Adam
 
 from vioframe.errors import ConfigError
 from vioframe_keypointnet.network import InlierOutlierNet, KeypointNet
 from vioframe_keypointnet.training.images import Picture
-from vioframe_keypointnet.training.lessons import teach
+from vioframe_keypointnet.training.lessons import matching_loss, teach
 from vioframe_keypointnet.training.losses import losses
 from vioframe_keypointnet.training.options import TrainingOptions
 from vioframe_keypointnet.training.samples import Batch, batch
@@ -39,7 +40,11 @@ class Training:
         network = KeypointNet(options.architecture, options.dropout)
         self.network = network.to(self._device, memory_format=torch.channels_last)
         self.judge = InlierOutlierNet().to(self._device)
-        self._optimiser = Adam([*self.network.parameters(), *self.judge.parameters()], lr=options.learning_rate)
+        self._frozen = _detecting(self.network) if options.descriptors_only else []
+        for part in self._frozen:
+            part.requires_grad_(False)
+        trained = [p for p in (*self.network.parameters(), *self.judge.parameters()) if p.requires_grad]
+        self._optimiser = Adam(trained, lr=options.learning_rate)
         self.step = 0
 
     @property
@@ -65,6 +70,8 @@ class Training:
         """Train to the end; yields each step's losses by name."""
         self.network.train()
         self.judge.train()
+        for part in self._frozen:
+            part.eval()
         while self.step < self.total_steps:
             epoch = self.step // self.epoch_steps
             rate = self.options.learning_rate * 0.5 ** sum(epoch >= e for e in self.options.halve_at)
@@ -136,8 +143,13 @@ def step_losses(
         seen = [network(x.contiguous(memory_format=torch.channels_last)) for x in (pairs.source, pairs.target)]
     a, b = (replace(d, descriptors=d.descriptors.float()) for d in seen)
     if taught:
-        return teach(a, b, pairs.source_lesson, pairs.target_lesson)
+        values = {"matching": matching_loss(a, b, pairs.homography)}
+        if not options.descriptors_only:
+            values |= teach(a, b, pairs.source_lesson, pairs.target_lesson)
+        return values | {"total": sum(values.values(), torch.zeros(()))}
     values = dict(losses(a, b, pairs.homography, judge, options.top))
+    if options.descriptors_only:
+        return {"descriptor": values["descriptor"], "total": values["descriptor"]}
     values["total"] = (
         options.location_weight * values["location"]
         + options.descriptor_weight * values["descriptor"]
@@ -145,6 +157,15 @@ def step_losses(
         + values["inlier"]
     )
     return values
+
+
+def _detecting(network: KeypointNet) -> list[Module]:
+    """The layers that keypoints depend on; the rest only serves descriptors and, of a network of peaks, training."""
+    if network.architecture.peaks:
+        names = [*(f"conv{name}" for name, *_ in network.architecture.encoder if name < "3"), "convR"]
+    else:
+        names = [*(f"conv{name}" for name, *_ in network.architecture.encoder), "convDa", "convDb", "convPa", "convPb"]
+    return [network.get_submodule(name) for name in names]
 
 
 _OTHER_NETWORK = "the weights to start from are of another network than {!r}; choose it with -o network="

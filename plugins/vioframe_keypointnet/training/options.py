@@ -31,6 +31,8 @@ class TrainingOptions:
     """Epochs to train."""
     lesson_epochs: int = 0
     """First epochs in which corners are taught instead; what makes hours of training out of days."""
+    descriptors_only: bool = False
+    """Leave the detector as it is and train what only descriptors need; with --finetune."""
     halve_at: tuple[int, ...] = (40,)
     """Epochs after which the learning rate is halved."""
     epoch_samples: int | None = None
