@@ -22,7 +22,10 @@ class Detection:
     """What the network sees in (B, C, H, W) images: one candidate a cell of a grid of h x w = H/8 x W/8."""
 
     score: Tensor
-    """(B, h, w) in [0, 1]; 0 in the outermost ring of cells, which sees less than it should."""
+    """(B, h, w) in [0, 1]; 0 in the outermost ring of cells, which sees less than it should.
+
+    Of a network of peaks it serves training alone: peaks ranked by their response are found again more often.
+    """
     xy: Tensor
     """(B, 2, h, w) px."""
     descriptors: Tensor
