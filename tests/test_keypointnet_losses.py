@@ -87,7 +87,7 @@ def test_a_peak_is_weighted_with_its_neighbours_only():
 
 
 def test_light_and_contrast_are_taken_out_of_images():
-    image = torch.from_numpy(texture(64, 96).astype(np.float32) / 255.0)[None, None]
+    image = torch.from_numpy(texture((64, 96)).astype(np.float32) / 255.0)[None, None]
     plain = locally_normalised(image)
     assert plain.abs().mean() > 0.3
     torch.testing.assert_close(locally_normalised(0.6 * image + 0.3), plain, atol=0.15, rtol=0.0)
