@@ -1,6 +1,6 @@
 # Everything on a fresh Debian or Ubuntu machine with Python >= 3.11, make and a compiler:
 #   make demo   set up, then the main job on a simulated flight: bag -> runs -> evaluation, plots and a view
-#   make test   set up, then lint, types and all tests
+#   make test   set up, then lint, types and the tests; make test-all: those that take minutes as well
 PYTHON ?= $(shell for p in python3 python3.13 python3.12 python3.11 python; do \
 	$$p -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null && echo $$p && break; done)
 VENV := .venv
@@ -20,13 +20,16 @@ SYSTEM_LIBRARIES := libusb-1.0-0 libgl1 libgomp1 libx11-6 libegl1
 export OMP_NUM_THREADS := 1
 export OPENBLAS_NUM_THREADS := 1
 
-.PHONY: demo test test-fast lint install system-libraries clean
+.PHONY: demo test test-all test-fast lint install system-libraries clean
 
 test: lint
+	$(BIN)/pytest -n 2 -m "not very_slow"
+
+test-all: lint
 	$(BIN)/pytest -n 2
 
 test-fast: lint
-	$(BIN)/pytest -n 2 -m "not slow"
+	$(BIN)/pytest -n 2 -m "not slow and not very_slow"
 
 lint: install
 	$(BIN)/ruff check .

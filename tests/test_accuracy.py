@@ -72,10 +72,10 @@ def machine_hall(shared_data: Path, tmp_path_factory: pytest.TempPathFactory) ->
         ("shi_tomasi", "msckf", 0.015),
         ("fast", "msckf", 0.025),
         ("orb", "msckf", 0.025),
-        pytest.param("sift", "msckf", 0.025, marks=pytest.mark.slow),
-        pytest.param("akaze", "msckf", 0.015, marks=pytest.mark.slow),
-        pytest.param("brisk", "msckf", 0.015, marks=pytest.mark.slow),
-        pytest.param("surf", "msckf", 0.015, marks=pytest.mark.slow),
+        pytest.param("sift", "msckf", 0.025, marks=pytest.mark.very_slow),
+        pytest.param("akaze", "msckf", 0.015, marks=pytest.mark.very_slow),
+        pytest.param("brisk", "msckf", 0.015, marks=pytest.mark.very_slow),
+        pytest.param("surf", "msckf", 0.015, marks=pytest.mark.very_slow),
         ("keypointnet", "msckf", 0.020),
         ("shi_tomasi", "sliding_window", 0.012),
     ],
@@ -126,7 +126,7 @@ def test_april_grid_under_strong_motion(shared_data, backend, limit_m):
     assert row["ate_m"] <= limit_m
 
 
-@pytest.mark.slow
+@pytest.mark.very_slow
 @pytest.mark.parametrize("name", REAL_MOTION_SEQUENCES)
 def test_real_motion(shared_data, name):
     """Both back-ends on the same tracks: the optimiser is at least as accurate as the filter."""
