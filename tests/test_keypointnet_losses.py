@@ -10,6 +10,7 @@ torch = pytest.importorskip("torch")
 
 from keypointnet_helpers import texture  # noqa: E402
 
+from vioframe.bench.detectors.metrics import warp as transfer  # noqa: E402
 from vioframe_keypointnet.architecture import COMPACT, FULL, Architecture  # noqa: E402
 from vioframe_keypointnet.network import (  # noqa: E402
     Detection,
@@ -26,7 +27,6 @@ from vioframe_keypointnet.training.homography import (  # noqa: E402
     HomographyRange,
     homography_of,
     random_homography,
-    transfer,
 )
 from vioframe_keypointnet.training.lessons import corners, lesson, lesson_loss, matching_loss  # noqa: E402
 from vioframe_keypointnet.training.losses import Candidates  # noqa: E402

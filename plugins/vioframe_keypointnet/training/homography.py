@@ -58,11 +58,3 @@ def homography_of(source: Float, target: Float) -> Float:
         rows += [[x, y, 1, 0, 0, 0, -u * x, -u * y], [0, 0, 0, x, y, 1, -v * x, -v * y]]
     h = np.linalg.solve(np.array(rows), np.asarray(target, np.float64).ravel())
     return np.append(h, 1.0).reshape(3, 3)
-
-
-def transfer(H: Float, xy: Float) -> Float:
-    """(N, 2) px where ``H`` (3, 3) takes ``xy`` (N, 2) px; not finite behind the horizon."""
-    moved = np.column_stack([xy, np.ones(len(xy))]) @ H.T
-    depth = np.where(moved[:, 2:] > 0.0, moved[:, 2:], np.nan)
-    out: Float = moved[:, :2] / depth
-    return out

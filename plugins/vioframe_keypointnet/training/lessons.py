@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.functional import binary_cross_entropy, cross_entropy, pixel_unshuffle
 
+from vioframe.bench.detectors.metrics import warp as warped_by
 from vioframe.types import Float
 from vioframe_keypointnet.architecture import CELL_PX
 from vioframe_keypointnet.network import Detection, describe
-from vioframe_keypointnet.training.homography import transfer
 from vioframe_keypointnet.training.losses import NEAR_PX, Candidates, warp
 
 _MOST, _QUALITY, _APART_PX, _BLOCK_PX = 600, 0.005, 5.0, 3
@@ -47,8 +47,7 @@ def lesson(points: Float, H: Float, size: tuple[int, int]) -> NDArray[np.float32
     """
     w, h = size[0] // CELL_PX, size[1] // CELL_PX
     out = np.zeros((3, h, w), np.float32)
-    xy = transfer(H, points[:, :2])
-    # nan, behind the horizon, is in no view.
+    xy = warped_by(H, points[:, :2])
     inside = ((xy > -0.5) & (xy < np.array([w, h]) * CELL_PX - 0.5)).all(axis=1)
     xy, score = xy[inside][::-1], points[inside, 2][::-1]
     column, row = ((xy + 0.5) // CELL_PX).astype(int).T

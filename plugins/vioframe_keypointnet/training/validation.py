@@ -10,17 +10,19 @@ import torch
 from numpy.typing import NDArray
 from torch.nn.functional import pixel_shuffle
 
+from vioframe.bench.detectors.metrics import lands_inside, repeated
+from vioframe.bench.detectors.thinning import distinct
 from vioframe.types import Float
 from vioframe_keypointnet.architecture import CELL_PX
 from vioframe_keypointnet.network import KeypointNet
 from vioframe_keypointnet.peaks import select_peaks
 from vioframe_keypointnet.selection import Rules
-from vioframe_keypointnet.training.homography import HomographyRange, random_homography, transfer
+from vioframe_keypointnet.training.homography import HomographyRange, random_homography
 from vioframe_keypointnet.training.images import Picture
 
 _SIZE = (320, 240)
 _TOP = 300
-_NEAR_PX = 3.0
+_MOST = 4 * _TOP  # some of them the other view does not show
 _NMS_PX = 4.0
 
 
@@ -47,7 +49,9 @@ def validate(network: KeypointNet, pictures: Sequence[Picture], seed: int) -> Va
         target = cv2.warpPerspective(image, H, _SIZE, flags=cv2.INTER_LINEAR)
         found.append(_repeatability(_strongest(network, image), _strongest(network, target), H))
     network.train(was_training)
-    return Validation(*(float(np.nanmean(column)) for column in zip(*found, strict=True)))
+    # Where nothing was found again there is no distance.
+    shares, distances = (np.array(column, np.float64) for column in zip(*found, strict=True))
+    return Validation(float(shares.mean()), float(np.nanmean(distances)))
 
 
 def _strongest(network: KeypointNet, image: NDArray[np.uint8]) -> Float:
@@ -59,30 +63,14 @@ def _strongest(network: KeypointNet, image: NDArray[np.uint8]) -> Float:
     if seen.response is not None:
         response = pixel_shuffle(seen.response, CELL_PX)[0, 0].cpu().numpy()
         grey = image if image.ndim == 2 else image[..., 1]
-        return select_peaks(response, grey, grey.shape, 4 * _TOP, Rules(_NMS_PX, 0))[0].astype(np.float64)
-    order = seen.score.flatten().argsort(descending=True)[: 4 * _TOP]
+        return select_peaks(response, grey, grey.shape, _MOST, Rules(_NMS_PX, 0))[0].astype(np.float64)
+    order = seen.score.flatten().argsort(descending=True)
     xy: Float = seen.xy[0].flatten(1).T[order].cpu().double().numpy()
-    taken = np.ones(len(xy), bool)
-    near = np.linalg.norm(xy[:, None] - xy, axis=-1) < _NMS_PX
-    for k in range(len(xy)):
-        taken[k] = not (near[k, :k] & taken[:k]).any()
-    return xy[taken]
+    return xy[distinct(xy, _NMS_PX, _MOST)]
 
 
-def _repeatability(a: Float, b: Float, H: Float) -> tuple[float, float]:
+def _repeatability(a: Float, b: Float, H: Float) -> tuple[float, float | None]:
     """Of the strongest points that both views could see: the share found in both, and their mean distance, px."""
-    a = _seen(a, H)[:_TOP]
-    b = _seen(b, np.linalg.inv(H))[:_TOP]
-    if not len(a) or not len(b):
-        return 0.0, float("nan")
-    distance = np.linalg.norm(transfer(H, a)[:, None] - b, axis=-1)
-    nearest = np.concatenate([distance.min(axis=0), distance.min(axis=1)])
-    matched = nearest[nearest <= _NEAR_PX]
-    return len(matched) / len(nearest), float(matched.mean()) if len(matched) else float("nan")
-
-
-def _seen(xy: Float, H: Float) -> Float:
-    moved = transfer(H, xy)
-    with np.errstate(invalid="ignore"):
-        inside = ((moved >= 0.0) & (moved <= np.array(_SIZE) - 1.0)).all(axis=1)
-    return xy[inside]
+    a = a[lands_inside(a, H, _SIZE)][:_TOP]
+    b = b[lands_inside(b, np.linalg.inv(H), _SIZE)][:_TOP]
+    return repeated(a, b, H)
