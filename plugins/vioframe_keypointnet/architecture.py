@@ -11,8 +11,6 @@ CELL_PX = 8
 """Side of the cells of which each gives one candidate keypoint."""
 FAINT = 0.02
 """Deviation, of a range of one, that local normalisation takes for noise rather than contrast."""
-PEAK_REACH_PX = 2
-"""How far along either axis, and in the same cell, pixels count towards the place of a peak."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,10 +11,12 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import avg_pool2d, grid_sample, interpolate, normalize, pad, pixel_shuffle, pixel_unshuffle
 
-from vioframe_keypointnet.architecture import CELL_PX, FAINT, FULL, PEAK_REACH_PX, Architecture
+from vioframe_keypointnet.architecture import CELL_PX, FAINT, FULL, Architecture
 
 _CROSS_RATIO = 2.0
 """How far a regressed keypoint may lie from its cell's centre, in half cells: neighbours reach into each other."""
+_PEAK_REACH_PX = 2
+"""How far along either axis, and in the same cell, pixels count towards the place of a peak."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,7 +114,7 @@ def peak_places(response: Tensor) -> Tensor:
     along = torch.arange(CELL_PX, device=response.device)
     rows, columns = (x.reshape(1, -1, 1, 1) for x in torch.meshgrid(along, along, indexing="ij"))
     peak = response.argmax(dim=1, keepdim=True)
-    far = ((rows - peak // CELL_PX).abs() > PEAK_REACH_PX) | ((columns - peak % CELL_PX).abs() > PEAK_REACH_PX)
+    far = ((rows - peak // CELL_PX).abs() > _PEAK_REACH_PX) | ((columns - peak % CELL_PX).abs() > _PEAK_REACH_PX)
     weights = torch.softmax(response.masked_fill(far, -torch.inf), dim=1)
     return torch.stack([(weights * axis).sum(dim=1) for axis in (columns, rows)], dim=1) - (CELL_PX - 1) / 2
 

@@ -77,10 +77,11 @@ class Training:
             rate = self.options.learning_rate * 0.5 ** sum(epoch >= e for e in self.options.halve_at)
             for group in self._optimiser.param_groups:
                 group["lr"] = rate
-            pairs = batch(self._pictures, self.options, self.step).to(self._device)
+            taught = epoch < self.options.lesson_epochs
+            corners_taught = taught and not self.options.descriptors_only
+            pairs = batch(self._pictures, self.options, self.step, corners_taught=corners_taught).to(self._device)
             # Dropout, too, depends on the number of the step alone.
             torch.manual_seed(int(np.random.default_rng([self.options.seed, 3, self.step]).integers(2**62)))
-            taught = epoch < self.options.lesson_epochs
             values = step_losses(self.network, self.judge, self.options, pairs, taught=taught)
             self._optimiser.zero_grad(set_to_none=True)
             values["total"].backward()  # type: ignore[no-untyped-call]

@@ -15,17 +15,17 @@ Picture = NDArray[np.float32]
 class PhotometricRange:
     """How far each effect may go; ``probability`` is that of each."""
 
-    probability: float = 0.5
-    brightness: float = 0.2
+    probability: float
+    brightness: float
     """Largest shift."""
-    contrast: tuple[float, float] = (0.4, 1.4)
-    gamma: tuple[float, float] = (0.5, 2.0)
-    exposure: tuple[float, float] = (0.3, 2.0)
+    contrast: tuple[float, float]
+    gamma: tuple[float, float]
+    exposure: tuple[float, float]
     """Factor, after which the image saturates."""
-    blur_sigma_px: float = 1.5
-    motion_blur_px: float = 9.0
+    blur_sigma_px: float
+    motion_blur_px: float
     """Longest path during the exposure."""
-    noise_sigma: float = 0.05
+    noise_sigma: float
 
 
 def disturbed(picture: Picture, rng: np.random.Generator, limits: PhotometricRange) -> Picture:

@@ -50,11 +50,17 @@ class Pair:
     target_lesson: NDArray[np.float32]
 
 
-def batch(pictures: Sequence[Picture], options: TrainingOptions, step: int) -> Batch:
-    """The pairs of a step, made of nothing but the arguments, so that a training resumed is one not interrupted."""
+def batch(pictures: Sequence[Picture], options: TrainingOptions, step: int, *, corners_taught: bool = True) -> Batch:
+    """The pairs of a step, made of nothing but the arguments, so that a training resumed is one not interrupted.
+
+    Unless ``corners_taught``, none are looked for, and the lessons name none.
+    """
     first = step * options.batch
     numbers = range(first, first + options.batch)
-    pairs = [pair(pictures[_order(k, len(pictures), options.seed)], options, k) for k in numbers]
+    pairs = [
+        pair(pictures[_order(k, len(pictures), options.seed)], options, k, corners_taught=corners_taught)
+        for k in numbers
+    ]
     return Batch(
         _images([p.source for p in pairs]),
         _images([p.target for p in pairs]),
@@ -64,7 +70,7 @@ def batch(pictures: Sequence[Picture], options: TrainingOptions, step: int) -> B
     )
 
 
-def pair(picture: Picture, options: TrainingOptions, number: int) -> Pair:
+def pair(picture: Picture, options: TrainingOptions, number: int, *, corners_taught: bool = True) -> Pair:
     """The ``number``-th pair, of ``picture``."""
     import cv2
 
@@ -81,7 +87,7 @@ def pair(picture: Picture, options: TrainingOptions, number: int) -> Pair:
     if rng.random() < 0.5:
         first, second = second, first
     between = second @ np.linalg.inv(first)
-    points = corners(shrunk)
+    points = corners(shrunk) if corners_taught else np.empty((0, 3))
     return Pair(
         disturbed(_view(shrunk, first, options.size), rng, options.photometric),
         disturbed(_view(shrunk, second, options.size), rng, options.photometric),
