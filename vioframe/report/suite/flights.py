@@ -43,6 +43,10 @@ class Flight:
         return cls(task, _outcome(task, figures), figures)
 
     @property
+    def seed(self) -> int:
+        return self.task.labels.seed if self.task.labels else 0
+
+    @property
     def evaluated(self) -> bool:
         return "ate_m" in self.figures
 

@@ -174,7 +174,7 @@ def groups(results: SuiteResults) -> list[Group]:
     for flight in flights(results):
         if (cell := _cell(flight.task, data_of)) is not None:
             members[cell].append(flight)
-    made = [Group(cell, tuple(sorted(found, key=_seed))) for cell, found in members.items()]
+    made = [Group(cell, tuple(sorted(found, key=lambda flight: flight.seed))) for cell, found in members.items()]
     return sorted(made, key=_suite_order(results.suite, [group.cell for group in made]))
 
 
@@ -199,10 +199,6 @@ def averages(
             spreads = {figure: Spread(tuple(values)) for figure, values in means.items() if values}
             out.append(Average(*shared, detector, backend, tuple(common), len(by_sequence), spreads))
     return out
-
-
-def _seed(flight: Flight) -> int:
-    return flight.task.labels.seed if flight.task.labels else 0
 
 
 def _data_kinds(results: SuiteResults) -> dict[tuple[str, str], Data]:
