@@ -6,6 +6,7 @@ second description. :func:`complete` fills in every default: the configuration k
 
 from __future__ import annotations
 
+import re
 import textwrap
 from collections.abc import Iterable, Iterator, Mapping
 from io import StringIO
@@ -20,7 +21,7 @@ from ruamel.yaml.error import YAMLError
 from vioframe.errors import ConfigError
 from vioframe.frontend import FrontendOptions
 from vioframe.options import Option, did_you_mean, options_of, validate_options
-from vioframe.registry import BACKEND, DETECTOR, LOOP_CLOSER, Registry
+from vioframe.registry import BACKEND, DETECTOR, LOOP_CLOSER, Kind, Registry
 
 SectionT = TypeVar("SectionT", bound="Section")
 
@@ -129,6 +130,23 @@ def parse_assignments(
         yield section, option.name, _parse_value(option, text.strip())
 
 
+def parse_part(spec: str, kind: Kind, registry: Registry) -> PartConfig:
+    """The part that ``NAME`` or ``NAME:KEY=VALUE,...`` asks for; a value may be a list, as in ``lengths_m=[8,16]``.
+
+    Raises :class:`PluginError` where there is no such part; its options are checked where it is created.
+    """
+    name, _, own = spec.partition(":")
+    known = {option.name: option for option in registry.find(kind, name).options}
+    options: dict[str, Any] = {}
+    # Commas within brackets belong to a value.
+    for assignment in re.split(r",(?![^\[]*\])", own) if own else []:
+        key, equals, text = (word.strip() for word in assignment.partition("="))
+        if not key or not equals:
+            raise ConfigError(f"{spec!r}: options are given as {name}:KEY=VALUE,..., got {assignment!r}")
+        options[key] = _parse_value(known[key], text) if key in known else text
+    return PartConfig(name=name, options=options)
+
+
 def complete(config: Config, registry: Registry) -> Config:
     """``config`` with every option of every part checked, coerced and its default filled in."""
     parts: dict[str, Any] = {
@@ -215,13 +233,21 @@ def _find_option(key: str, sections: Mapping[str, list[Option]]) -> tuple[str, O
 
 
 def _parse_value(option: Option, text: str) -> Any:
-    """``text`` as YAML where that suits the option (numbers, null, lists), else as it is."""
+    """``text`` as YAML where that suits the option (numbers, null, lists), else as it is.
+
+    Where neither suits it is as YAML, which says better what is wrong with it.
+    """
     try:
-        value = YAML(typ="safe", pure=True).load(text)
-        option.coerce(value)
-    except (YAMLError, ValidationError):
+        parsed = YAML(typ="safe", pure=True).load(text)
+    except YAMLError:
         return text
-    return value
+    for value in (parsed, text):
+        try:
+            option.coerce(value)
+        except ValidationError:
+            continue
+        return value
+    return parsed
 
 
 def _keys_beside(model: Any, location: tuple[int | str, ...]) -> list[str]:

@@ -14,6 +14,7 @@ from vioframe.interfaces import (
     DetectorFactory,
     FlightFactory,
     LoopCloserFactory,
+    MetricFactory,
     TrainerFactory,
     WorldFactory,
 )
@@ -58,6 +59,11 @@ def vioframe_worlds() -> Mapping[str, WorldFactory]:  # type: ignore[empty-body]
 
     ``p_WB`` (N, 3) m is the path that the world must leave free, ``rng`` a numpy Generator.
     """
+
+
+@hookspec
+def vioframe_metrics() -> Mapping[str, MetricFactory]:  # type: ignore[empty-body]
+    """Map names to factories: ``factory(**options) -> Metric``, for ``vioframe evaluate --metric NAME``."""
 
 
 @hookspec

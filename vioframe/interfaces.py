@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
@@ -23,7 +23,7 @@ from vioframe.types import (
 if TYPE_CHECKING:
     from vioframe.simulation.flights import Motion
     from vioframe.simulation.world import Mesh
-    from vioframe.trajectory import Trajectory
+    from vioframe.trajectory import Comparison, Trajectory
 
 
 @runtime_checkable
@@ -131,6 +131,19 @@ class World(Protocol):
 
 
 @runtime_checkable
+class Metric(Protocol):
+    """Says in numbers how good an estimated trajectory is."""
+
+    def measure(self, comparison: Comparison) -> Mapping[str, float]:
+        """Figures by name, a name ending in its unit (``ate_m``, ``inside_y_percent``) unless it is a pure number.
+
+        What cannot be told of this flight is left out; raises :class:`vioframe.errors.TrajectoryError`, one line
+        saying why, where that is everything.
+        """
+        ...
+
+
+@runtime_checkable
 class Trainer(Protocol):
     """Trains what a learned part needs."""
 
@@ -144,4 +157,5 @@ BackendFactory = Callable[..., Backend]
 LoopCloserFactory = Callable[..., LoopCloser]
 FlightFactory = Callable[..., Flight]
 WorldFactory = Callable[..., World]
+MetricFactory = Callable[..., Metric]
 TrainerFactory = Callable[..., Trainer]

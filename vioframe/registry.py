@@ -21,7 +21,7 @@ import pluggy
 
 from vioframe import hookspecs
 from vioframe.errors import DatasetError, PluginError, VioframeError
-from vioframe.interfaces import Backend, Dataset, Detector, Flight, LoopCloser, Trainer, World
+from vioframe.interfaces import Backend, Dataset, Detector, Flight, LoopCloser, Metric, Trainer, World
 from vioframe.options import Option, did_you_mean, options_of, plugin_factory, validate_options
 from vioframe.types import Calibration, Float
 
@@ -48,8 +48,9 @@ LOOP_CLOSER = Kind("loop closer", "vioframe_loop_closers", LoopCloser, 1)
 DATASET = Kind("dataset", "vioframe_datasets", Dataset, 1)
 FLIGHT = Kind("flight", "vioframe_flights", Flight, 2)
 WORLD = Kind("world", "vioframe_worlds", World, 2)
+METRIC = Kind("metric", "vioframe_metrics", Metric, 0)
 TRAINER = Kind("trainer", "vioframe_trainers", Trainer, 1)
-KINDS = (DETECTOR, BACKEND, LOOP_CLOSER, DATASET, FLIGHT, WORLD, TRAINER)
+KINDS = (DETECTOR, BACKEND, LOOP_CLOSER, DATASET, FLIGHT, WORLD, METRIC, TRAINER)
 
 
 @dataclass(frozen=True, slots=True)
@@ -153,6 +154,9 @@ class Registry:
         self, name: str, p_WB: Float, rng: np.random.Generator, options: Mapping[str, Any] | None = None
     ) -> World:
         return cast(World, self.find(WORLD, name).create(p_WB, rng, options=options or {}))
+
+    def create_metric(self, name: str, options: Mapping[str, Any] | None = None) -> Metric:
+        return cast(Metric, self.find(METRIC, name).create(options=options or {}))
 
     def open_dataset(
         self, path: str | Path, reader: str | None = None, options: Mapping[str, Any] | None = None

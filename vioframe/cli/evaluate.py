@@ -26,6 +26,13 @@ _WIDE = 1000
     help="Mesh to measure the landmarks against.  [default: world.ply of the simulated recording]",
 )
 @click.option(
+    "--metric",
+    "metrics",
+    metavar="NAME[:KEY=VALUE,...]",
+    multiple=True,
+    help="Measure this as well; repeatable. `vioframe plugins` lists them.",
+)
+@click.option(
     "--format",
     "format_",
     type=click.Choice(["table", "json", "csv", "markdown"]),
@@ -34,7 +41,12 @@ _WIDE = 1000
     help="What to print.",
 )
 def command(
-    runs: tuple[Path, ...], ground_truth: Path | None, alignment: str, world: Path | None, format_: str
+    runs: tuple[Path, ...],
+    ground_truth: Path | None,
+    alignment: str,
+    world: Path | None,
+    metrics: tuple[str, ...],
+    format_: str,
 ) -> None:
     """Compare each RUN, a run folder or a trajectory file, with the ground truth.
 
@@ -43,13 +55,18 @@ def command(
     own. The result is printed, and kept as `evaluation.json` (and
     `evaluation_loop.json`) in each run folder.
     """
+    from vioframe import registry
     from vioframe.recorder import write_json
     from vioframe.report.evaluated import evaluate_paths
     from vioframe.report.map_quality import measure_maps
+    from vioframe.report.metrics import create_metrics, measure_runs
     from vioframe.report.rows import notes
     from vioframe.report.tables import to_csv, to_json, to_markdown, to_rich
 
+    asked = create_metrics(metrics, registry.load()) if metrics else ()
     evaluated, on_maps = measure_maps(evaluate_paths(runs, ground_truth, alignment), world)
+    if asked:
+        evaluated = measure_runs(evaluated, asked)
     if format_ == "table":
         from rich.console import Console
 

@@ -15,7 +15,7 @@ from vioframe.options import REQUIRED, did_you_mean, summary_of
 @click.command("plugins")
 @click.argument("name", required=False)
 def command(name: str | None) -> None:
-    """List every part: detectors, back-ends, loop closers, data-set readers, flights, worlds and trainers.
+    """List every part: detectors, back-ends, loop closers, data-set readers, flights, worlds, metrics and trainers.
 
     With NAME, show the options of that part.
     """

@@ -12,6 +12,7 @@ import numpy as np
 
 from vioframe.errors import VioframeError
 from vioframe.report.map_quality import MapQuality
+from vioframe.report.metrics import Measured
 from vioframe.report.run_folder import RunFolder
 from vioframe.trajectory import Trajectory, TrajectoryErrors, evaluate, load_trajectory
 from vioframe.types import NS_PER_S, Int
@@ -36,7 +37,8 @@ _GAP_NS = NS_PER_S
 class Evaluated:
     """``folder`` is None for a bare trajectory file; ``errors`` where there is no pose or no ground truth.
 
-    ``map_quality`` is there where :func:`~vioframe.report.map_quality.measure_maps` found a world to compare with.
+    ``map_quality`` is there where :func:`~vioframe.report.map_quality.measure_maps` found a world to compare with,
+    ``measured`` where :func:`~vioframe.report.metrics.measure_runs` was asked for metrics.
     ``segment_starts_ns`` are the stamps at which tracking began again after a reset. What loop closure made of a run is
     an evaluation of its own, without a folder. ``kept_in`` is the file of the run folder that an evaluation belongs in.
     """
@@ -47,6 +49,7 @@ class Evaluated:
     ground_truth: Trajectory | None
     errors: TrajectoryErrors | None
     map_quality: MapQuality | None = None
+    measured: Measured | None = None
     segment_starts_ns: tuple[int, ...] = ()
     kept_in: Path | None = None
 
@@ -71,7 +74,8 @@ class Evaluated:
         run = {key: self.summary[key] for key in _RUN_FIGURES if key in self.summary}
         errors = {} if self.errors is None else self.errors.to_dict()
         quality = {} if self.map_quality is None else {"map": self.map_quality.to_dict()}
-        return {"name": self.name, **run, **errors, **quality, "stage_ms": self.stage_ms()}
+        measured = {} if self.measured is None else self.measured.to_dict()
+        return {"name": self.name, **run, **errors, **quality, **measured, "stage_ms": self.stage_ms()}
 
 
 def evaluate_path(path: Path, ground_truth: Trajectory | None, alignment: str = "posyaw") -> Evaluated:

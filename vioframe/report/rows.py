@@ -21,6 +21,7 @@ def sections(runs: Sequence[Evaluated]) -> list[Section]:
         ("Run", _run_rows(runs)),
         *_error_sections(runs),
         ("Landmarks, distance from the simulated world's surfaces [m]", _map_rows(runs)),
+        *_metric_sections(runs),
         ("Time, ms a frame", _timing_rows(runs)),
     ]
     known = [(title, [row for row in rows if any(cell != _UNKNOWN for cell in row[1])]) for title, rows in groups]
@@ -41,6 +42,8 @@ def notes(runs: Sequence[Evaluated]) -> Iterator[str]:
             yield f"{run.name}: no ground truth; pass --ground-truth to measure errors"
         else:
             yield from (f"{run.name}: {note}" for note in run.errors.notes)
+        if run.measured is not None:
+            yield from (f"{run.name}: metric {label}: {why}" for label, why in run.measured.left_out.items())
 
 
 def _run_rows(runs: Sequence[Evaluated]) -> Rows:
@@ -134,6 +137,16 @@ def _map_rows(runs: Sequence[Evaluated]) -> Rows:
             cells(lambda m: ", ".join(f"{100 * part:.1f}" for _, part in m.within)),
         ),
     ]
+
+
+def _metric_sections(runs: Sequence[Evaluated]) -> list[Section]:
+    figures = [run.measured.figures if run.measured else {} for run in runs]
+    out = []
+    for label in dict.fromkeys(label for each in figures for label in each):
+        found = [each.get(label, {}) for each in figures]
+        names = dict.fromkeys(name for each in found for name in each)
+        out.append((f"Metric {label}", [(n, [_or_unknown(each.get(n), ".4g") for each in found]) for n in names]))
+    return out
 
 
 def _timing_rows(runs: Sequence[Evaluated]) -> Rows:

@@ -62,6 +62,11 @@ class TrajectoryErrors:
     notes: tuple[str, ...]
 
     @property
+    def at_rest(self) -> bool:
+        """Whether the body stayed in one place, so that its path tells neither heading, scale nor drift by length."""
+        return _spread_m(self.truth) < _AT_REST_M
+
+    @property
     def max_position_m(self) -> Float:
         """(3,) largest absolute position error along x, y, z."""
         return np.asarray(np.abs(self.position_m).max(axis=0))

@@ -8,10 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from vioframe.config import parse_assignments
+from vioframe.config import parse_assignments, parse_part
 from vioframe.errors import ConfigError, PluginError, VioframeError
 from vioframe.interfaces import Detector
-from vioframe.options import Option
 from vioframe.registry import DETECTOR, Registry, describe
 from vioframe.types import Image, Keypoints
 
@@ -60,14 +59,13 @@ def parse_entrants(specs: Sequence[str], assignments: Sequence[str], installed: 
     left out where only one has such an option. Raises :class:`ConfigError` or :class:`PluginError`.
     """
     specs = list(dict.fromkeys(specs))
-    named = [(name, own) for name, _, own in (spec.partition(":") for spec in specs)]
-    options = {name: installed.find(DETECTOR, name).options for name, _ in named}
+    parts = [parse_part(spec, DETECTOR, installed) for spec in specs]
+    options = {part.name: installed.find(DETECTOR, part.name).options for part in parts}
     shared: dict[str, dict[str, Any]] = {name: {} for name in options}
     for name, key, value in parse_assignments(assignments, options):
         shared[name][key] = value
     entrants = [
-        Entrant(spec, name, {**shared[name], **_own(name, own, options)})
-        for spec, (name, own) in zip(specs, named, strict=True)
+        Entrant(spec, part.name, {**shared[part.name], **part.options}) for spec, part in zip(specs, parts, strict=True)
     ]
     for entrant in entrants:
         # What is asked for must be right; what only lacks something, as weights, is absent and no error.
@@ -102,8 +100,3 @@ def detect(entrant: Entrant, detector: Detector, image: Image, max_points: int) 
         return detector.detect(image, max_points)
     except Exception as error:
         raise PluginError(f"detector {entrant.label} failed: {describe(error)}; leave it out or repair it") from error
-
-
-def _own(name: str, own: str, options: Mapping[str, list[Option]]) -> dict[str, Any]:
-    texts = [f"{name}.{text.strip()}" for text in own.split(",")] if own else []
-    return {key: value for _, key, value in parse_assignments(texts, {name: options[name]})}
