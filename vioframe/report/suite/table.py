@@ -12,11 +12,15 @@ UNKNOWN = "–"
 
 @dataclass(frozen=True, slots=True)
 class Column:
-    """``unit`` is empty for what has none; ``text`` columns are set flush left, numbers flush right."""
+    """``unit`` is empty for what has none; ``text`` columns are set flush left, numbers flush right.
+
+    ``code`` is text to copy as it stands.
+    """
 
     title: str
     unit: str = ""
     text: bool = False
+    code: bool = False
 
     @property
     def heading(self) -> str:
@@ -69,7 +73,10 @@ class Table:
         rules = ["---" if column.text else "---:" for column in self.columns] + (["---"] if self.has_links else [])
         lines = [f"**{self.title}**", "", _markdown(headings), _markdown(rules, escape=False)]
         for row in self.rows:
-            cells = [_escape_markdown(entry.shown) for entry in row.entries]
+            cells = [
+                f"`{entry.shown}`" if column.code else _escape_markdown(entry.shown)
+                for column, entry in zip(self.columns, row.entries, strict=True)
+            ]
             if self.has_links:
                 cells.append(" ".join(f"[{label}]({to_results}/{path})" for label, path in row.links))
             lines.append(_markdown(cells, escape=False))
@@ -86,14 +93,20 @@ class Table:
             f"  \\label{{tab:{self.name}}}",
             f"  \\begin{{tabular}}{{{spec}}}",
             "    \\toprule",
-            _latex(column.heading for column in self.columns),
+            _latex(_escape_latex(column.heading) for column in self.columns),
             "    \\midrule",
-            *(_latex(entry.shown for entry in row.entries) for row in self.rows),
+            *(self._latex_row(row) for row in self.rows),
             "    \\bottomrule",
             "  \\end{tabular}",
             "\\end{table}",
         ]
         return "\n".join(lines) + "\n"
+
+    def _latex_row(self, row: Row) -> str:
+        cells = (_escape_latex(entry.shown) for entry in row.entries)
+        return _latex(
+            f"\\texttt{{{cell}}}" if column.code else cell for column, cell in zip(self.columns, cells, strict=True)
+        )
 
 
 def text(value: str) -> Entry:
@@ -143,4 +156,4 @@ def _escape_latex(value: str) -> str:
 
 
 def _latex(cells: Iterable[str]) -> str:
-    return "    " + " & ".join(map(_escape_latex, cells)) + " \\\\"
+    return "    " + " & ".join(cells) + " \\\\"

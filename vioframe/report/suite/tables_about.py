@@ -30,8 +30,8 @@ def flights_nees(found: Sequence[Group]) -> Table | None:
             rows.append(Row(entries, links(group.flights)))
     caption = (
         "Normalised estimation error squared, position and yaw fixed at the first pose: mean over time, then over the "
-        "seeds. Above the ideal, the number of degrees of freedom, the filter is surer of itself than it should be. The "
-        f"errors within a flight hang together, so a few flights are no test at a level. {data_caption(found)}"
+        "seeds. Above the ideal, the number of degrees of freedom, a filter is surer of itself than it should be. "
+        f"Errors within a flight hang together, so a few flights are no test at a level. {data_caption(found)}"
     )
     return Table("nees_flights", "Consistency (NEES) of the flights", caption, columns, tuple(rows)) if rows else None
 
@@ -101,17 +101,13 @@ def failures(found: Iterable[Flight], others: Iterable[TaskResult]) -> Table | N
         Column("reason", text=True),
         Column("attempts"),
     )
-    troubled = [
-        (flight.task, flight.outcome.value, flight.reason, run_path(flight)) for flight in found if flight.reason
-    ]
+    troubled = [(each.task, each.outcome.value, each.reason, run_path(each)) for each in found if each.reason]
     troubled += [(task, "failed", task.error, f"tasks/{task.folder.name}") for task in others if not task.ok]
     rows = [
         Row((text(task.key), text(outcome), text(reason), number(task.attempts, "d")), (("folder", path),))
         for task, outcome, reason, path in troubled
     ]
-    caption = (
-        "Every task that failed, never initialised or is not complete. All of them are counted in the other tables."
-    )
+    caption = "Every task that failed, never initialised or is not complete; all are counted in the other tables."
     return Table("failures", "What went wrong", caption, columns, tuple(rows)) if rows else None
 
 
@@ -124,7 +120,7 @@ def evo_command(flight: Flight) -> str:
 
 def evo_commands(found: Iterable[Flight]) -> Table | None:
     """A row for each flight that has an ATE by SE(3)."""
-    columns = (Column("task", text=True), Column("ATE, SE(3)", "m"), Column("command", text=True))
+    columns = (Column("task", text=True), Column("ATE, SE(3)", "m"), Column("command", text=True, code=True))
     rows = [
         Row(
             (text(flight.task.key), number(flight.figures["ate_se3_m"], ".6f"), text(evo_command(flight))),

@@ -101,8 +101,8 @@ def timing(found: Sequence[Group]) -> Table | None:
         )
         rows.append(Row(entries, tuple((flight.task.key, run_path(flight)) for flight in own)))
     caption = (
-        "Mean over all flights of a contender that initialised; stages add up to the whole, without reading and decoding images. "
-        f"Real-time factor: seconds of flight by seconds of computing, the flights' own processes. {machines(found)}"
+        "Mean over all flights of a contender that initialised; stages add up to the whole, without reading and "
+        f"decoding images. Real-time factor: seconds of flight by seconds of computing, the flights' own processes. {machines(found)}"
     )
     return Table("timing", "Time a frame", caption, columns, tuple(rows))
 

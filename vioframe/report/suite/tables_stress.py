@@ -56,7 +56,7 @@ def levels(curves: Sequence[Curve], found: Sequence[Group]) -> Table:
             )
             rows.append(Row(entries, links(group.flights)))
     caption = (
-        f"Success: complete, with an ATE below {SUCCESS_PERCENT:g} % of the path, of all flights, failed ones included, "
+        f"Success: complete, with an ATE below {SUCCESS_PERCENT:g} % of the path, of all flights, failed ones too, "
         "with Wilson's 95 % interval. ATE: of the flights that have one, so that it flatters where others failed, with "
         "Student's 95 % interval in the logarithm, its spread pooled over the levels of the curve. "
         f"Level 0 is the flight without degradation. {runs_caption(found)} {data_caption(found)}"

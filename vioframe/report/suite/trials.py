@@ -8,7 +8,7 @@ import numpy as np
 
 from vioframe.bench.consistency import PARTS, Outcome, Trial
 from vioframe.report.suite.captions import condition_text
-from vioframe.report.suite.results import Kind, SuiteResults, TaskResult
+from vioframe.report.suite.results import Kind, Labels, SuiteResults, TaskResult
 from vioframe.types import NS_PER_S
 
 _NOT_FIGURES = ("seed", "failure", "detail", "nees")
@@ -19,7 +19,7 @@ def outcomes(results: SuiteResults) -> list[Outcome]:
     members: dict[tuple[str, str], list[Trial]] = defaultdict(list)
     for task in results.of(Kind.TRIAL):
         if task.labels is not None:
-            trial = _trial(task)
+            trial = _trial(task, task.labels)
             members[trial.backend, trial.flight].append(trial)
     return [
         Outcome(backend, backend, {}, {"flight": flight}, tuple(sorted(trials, key=lambda trial: trial.seed)))
@@ -27,9 +27,7 @@ def outcomes(results: SuiteResults) -> list[Outcome]:
     ]
 
 
-def _trial(task: TaskResult) -> Trial:
-    labels = task.labels
-    assert labels is not None
+def _trial(task: TaskResult, labels: Labels) -> Trial:
     flight = labels.sequence
     if labels.condition != "clear":
         flight = f"{flight}, {condition_text(labels.condition, labels.level)}"
