@@ -296,7 +296,7 @@ def test_evo_agrees_on_a_simulated_flight(installed):
     found, own = (figures(installed, name, estimate, truth) for name in ("evo", "ate"))
     assert own["ate_se3_m"] > 0.05
     assert found == pytest.approx({**{k: own[k] for k in ("ate_se3_m", "ate_sim3_m", "scale")}, "difference_m": 0.0})
-    assert abs(found["difference_m"]) < 1e-9
+    assert abs(found["difference_m"]) < 1e-12
 
 
 @needs_evo
@@ -306,7 +306,7 @@ def test_evo_agrees_on_what_others_estimated(installed, shared_data, name):
     truth = load_trajectory(shared_data / "euroc_imu_gt" / PEERS[name])
     found = figures(installed, "evo", estimate, truth)
     assert found["ate_se3_m"] > 0.01
-    assert abs(found["difference_m"]) < 1e-6
+    assert abs(found["difference_m"]) < 1e-12
 
 
 def test_evo_absent_says_what_to_install(installed, monkeypatch):
