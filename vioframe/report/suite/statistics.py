@@ -253,7 +253,8 @@ def _suite_order(suite: Mapping[str, Any], cells: Sequence[Cell]) -> Callable[[G
 
 
 def _name(entry: object) -> str:
-    return str(entry.get("name", "")) if isinstance(entry, Mapping) else str(entry)
+    """What the labels call an entry of the suite's lists."""
+    return str(entry.get("label") or entry["name"]) if isinstance(entry, Mapping) else str(entry)
 
 
 def _by(found: Iterable[Group], key: Callable[[Group], _Key]) -> list[tuple[_Key, list[Group]]]:

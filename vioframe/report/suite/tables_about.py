@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping, Sequence
+from shlex import quote
 from typing import Any
 
 from vioframe.bench.consistency import PARTS
@@ -115,7 +116,7 @@ def evo_command(flight: Flight) -> str:
     """The command that re-derives ``ate_se3_m`` of a flight, to be run in the results folder."""
     run = run_path(flight)
     estimate = "trajectory_loop.tum" if flight.task.loop_closed else "trajectory.tum"
-    return f"evo_ape tum {run}/{MATCHED_TRUTH} {run}/{estimate} --align"
+    return f"evo_ape tum {quote(f'{run}/{MATCHED_TRUTH}')} {quote(f'{run}/{estimate}')} --align"
 
 
 def evo_commands(found: Iterable[Flight]) -> Table | None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from vioframe.report.rows import ALIGNED_BY
 from vioframe.report.suite.captions import condition_text, data_caption, links, runs_caption
 from vioframe.report.suite.pooled import BAND_M, inside_band
 from vioframe.report.suite.results import Data
@@ -101,14 +102,18 @@ def beside_published(found: Sequence[Group], published: Sequence[Mapping[str, An
     rows = []
     for system in published:
         values = [system["ate_m"].get(name) for name, _ in names]
-        about = (text(system["system"]), text(system["alignment"]), text(f"published: {system['source']}"))
+        about = (
+            text(system["system"]),
+            text(ALIGNED_BY.get(system["alignment"], system["alignment"])),
+            text(f"published: {system['source']}"),
+        )
         rows.append(Row((*about, *(number(value, ".3f") for value in values))))
     for detector, backend in dict.fromkeys(group.cell.contender for group in found):
         own: dict[tuple[str, Data | None], Group] = {
             (g.cell.sequence, g.cell.data): g for g in found if g.cell.contender == (detector, backend)
         }
         every = tuple(link for group in own.values() for link in _named_links(group))
-        for alignment, figure in (("position + yaw", "ate_m"), ("SE(3)", "ate_se3_m")):
+        for alignment, figure in ((ALIGNED_BY["posyaw"], "ate_m"), (ALIGNED_BY["se3"], "ate_se3_m")):
             about = (text(f"{detector} + {backend}"), text(alignment), text("measured here"))
             rows.append(Row((*about, *(_over_seeds(own.get(name), figure) for name in names)), every))
     caption = (
