@@ -218,6 +218,22 @@ def _cell(task: TaskResult, data_of: Mapping[tuple[str, str], Data]) -> Cell | N
     return Cell(data, labels.sequence, labels.condition, labels.level, labels.detector, labels.backend)
 
 
+def expected_tasks(suite: Mapping[str, Any]) -> int | None:
+    """How many tasks a finished sweep has, or None where the suite does not say."""
+    seeds, backends = suite.get("seeds", 1), len(suite.get("backends") or ())
+    match suite.get("kind"):
+        case "detector_speed":
+            return 1
+        case "trials":
+            return int(seeds * backends)
+        case "flights":
+            levels = sum(len(each) for each in (suite.get("conditions") or {}).values()) + bool(
+                suite.get("clear", True)
+            )
+            return int(seeds * backends * len(suite["detectors"]) * len(suite["sequences"]) * levels)
+    return None
+
+
 def unplaced(results: SuiteResults) -> list[Flight]:
     """Flights that are in none of the :func:`groups`, as their recording could not even be found."""
     data_of = _data_kinds(results)
