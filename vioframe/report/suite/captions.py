@@ -18,14 +18,18 @@ _SPELT_OUT = 2
 
 
 def data_caption(found: Iterable[Group]) -> str:
-    """Which sequences are of which kind of data, in sentences."""
+    """Which sequences are of which kind of data, and what is known about them, in sentences."""
     sequences: dict[Data, dict[str, str]] = {}
     for group in found:
         sequences.setdefault(group.cell.data, {}).setdefault(group.cell.sequence, group.data_note)
-    kinds = [f"{', '.join(sequences[data])}: {WHAT[data]}." for data in Data if data in sequences]
-    notes = dict.fromkeys(note.rstrip(".") for own in sequences.values() for note in own.values() if note)
-    spelt = [f"{note}." for note in notes] if len(notes) <= _SPELT_OUT else []
-    return " ".join(["Data:", *kinds, *spelt])
+    notes = [note for own in sequences.values() for note in own.values()]
+    spell_out = all(notes) and len(notes) <= _SPELT_OUT
+    parts = []
+    for data in sorted(sequences, key=list(Data).index):
+        own = sequences[data]
+        text = "; ".join(note.rstrip(".") for note in own.values()) if spell_out else f"{', '.join(own)}: {WHAT[data]}"
+        parts.append(f"Data ({data}): {text}.")
+    return " ".join(parts)
 
 
 def runs_caption(found: Sequence[Group]) -> str:

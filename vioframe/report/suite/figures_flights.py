@@ -26,6 +26,7 @@ _NARROWEST_INCH = 8.0
 _SPREAD = 4.0
 """Columns whose errors differ by more than this factor each have a scale of their own."""
 _BAND: dict[str, Any] = {"color": "#56B4E9", "alpha": 0.18, "lw": 0}
+_START: dict[str, Any] = {"marker": "o", "ms": 7, "color": "black", "ls": "none", "label": "start", "zorder": 20}
 _CM = round(100 * BAND_M)
 
 
@@ -88,7 +89,7 @@ class Course:
 
 def trajectories_3d(course: Course) -> Figure:
     """Paths in perspective."""
-    figure = _figure(course, 6.4)
+    figure = _figure(course, 5.6)
     low, high = course.bounds()
     columns = list(course.columns())
     for k, (backend, drawn) in enumerate(columns):
@@ -96,10 +97,11 @@ def trajectories_3d(course: Course) -> Figure:
         ax.plot(*course.truth.T, **{**TRUTH, "lw": 4.0})
         for each in drawn:
             ax.plot(*each.broken(each.errors.estimate.p_WB).T, color=_colour(course, each), lw=1.6)
+        ax.plot(*course.truth[0], **_START)
         for axis, lo, hi in zip("xyz", low, high, strict=True):
             getattr(ax, f"set_{axis}lim")(lo, hi)
-            getattr(ax, f"set_{axis}label")(f"{axis} [m]", labelpad=6)
-        ax.set_box_aspect(high - low, zoom=1.0)
+            getattr(ax, f"set_{axis}label")(f"{axis} [m]", labelpad=6 if axis != "z" else -2)
+        ax.set_box_aspect(high - low, zoom=1.08)
         ax.locator_params(nbins=5)
         ax.locator_params(axis="z", nbins=3)
         ax.view_init(elev=28, azim=-58)
@@ -135,7 +137,8 @@ def translation_error(course: Course) -> Figure:
             ax.legend(loc="lower right", bbox_to_anchor=(1.0, 0.98), ncols=len(drawn), fontsize=10.5, borderpad=0.1)
         column[0].set_title(backend, pad=24)
     _finish(figure, panels, names)
-    _scale(panels, [[each.errors.position_m for each in drawn] for _, drawn in course.columns()], symmetric=True)
+    sizes = [[each.errors.position_m for each in drawn] for _, drawn in course.columns()]
+    _scale(panels, sizes, symmetric=True, least=1.2 * BAND_M)
     _legend(figure, course, truth=False, band=True)
     about = f"Estimate minus ground truth in the world's axes, aligned by position + yaw over the whole path; ±{_CM} cm"
     course.explain(figure, f"{about} shaded, beside how much of the estimated time is inside.")
@@ -221,10 +224,10 @@ def _finish(figure: Figure, panels: Any, names: Sequence[str]) -> None:
     figure.align_ylabels(panels[:, 0])
 
 
-def _scale(panels: Any, columns: Sequence[Sequence[Float]], *, symmetric: bool) -> None:
+def _scale(panels: Any, columns: Sequence[Sequence[Float]], *, symmetric: bool, least: float = 0.0) -> None:
     """Limits (rows of ``panels``, by axis of the values): one for all columns, or one each where they differ much."""
     for k, row in enumerate(panels):
-        tops = [1.08 * max(float(np.abs(values[:, k]).max()) for values in column) for column in columns]
+        tops = [max(least, *(1.08 * float(np.abs(values[:, k]).max()) for values in column)) for column in columns]
         if max(tops) <= _SPREAD * min(tops):
             tops = [max(tops)] * len(tops)
         for ax, top in zip(row, tops, strict=True):
@@ -251,6 +254,7 @@ def _projection(course: Course, across: int, up: int, name: str, *, side_by_side
         for each in drawn:
             p_W = each.broken(each.errors.estimate.p_WB)
             ax.plot(p_W[:, across], p_W[:, up], color=_colour(course, each), lw=1.5)
+        ax.plot(*course.truth[0, [across, up]], **_START)
         ax.set_aspect("equal")
         ax.set_xlim(low[across], high[across])
         ax.set_ylim(low[up], high[up])
@@ -268,6 +272,6 @@ def _legend(figure: Figure, course: Course, *, truth: bool = True, band: bool = 
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
-    handles = [Line2D([], [], **{**TRUTH, "lw": 4.0})] if truth else []
+    handles = [Line2D([], [], **{**TRUTH, "lw": 4.0}), Line2D([], [], **_START)] if truth else []
     handles += course.look.handles(of_backends=False)
     legend_above(figure, [*handles, *([Patch(label=f"±{_CM} cm", **_BAND)] if band else [])])
