@@ -1,0 +1,27 @@
+"""The loosely coupled back-end: a visual odometry's poses up to scale, fused with the IMU by an extended Kalman filter.
+
+Weiss, Achtelik, Lynen, Chli, Siegwart, "Real-time onboard visual-inertial state estimation and self-calibration of MAVs
+in unknown environments", ICRA 2012.
+"""
+
+from collections.abc import Mapping
+
+from vioframe.hookspecs import hookimpl
+from vioframe.interfaces import Backend, BackendFactory
+from vioframe.options import plugin_factory
+from vioframe.types import Calibration
+from vioframe_loose_ekf.options import LooseEkfOptions
+
+
+def loose_ekf(calibration: Calibration, options: LooseEkfOptions) -> Backend:
+    """Loosely coupled: visual odometry up to scale, fused with the IMU by an extended Kalman filter that finds the scale."""
+    from vioframe_loose_ekf.backend import LooseEkf
+    from vioframe_loose_ekf.warm_up import warm_up
+
+    warm_up(calibration)
+    return LooseEkf(calibration, options)
+
+
+@hookimpl
+def vioframe_backends() -> Mapping[str, BackendFactory]:
+    return {"loose_ekf": plugin_factory(loose_ekf, LooseEkfOptions)}

@@ -1,0 +1,59 @@
+"""The options of the loosely coupled back-end, with the settings that serve EuRoC."""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LooseEkfOptions:
+    """Of the visual odometry, then of the filter that fuses its poses with the readings."""
+
+    pixel_sigma: float = 1.0
+    """Standard deviation of a tracked feature's position, px."""
+    bootstrap_parallax_px: float = 20.0
+    """Median motion of the tracks, rotation taken out, between the two frames that begin a map."""
+    keyframe_parallax_px: float = 15.0
+    """Median motion of the tracks since the last keyframe, rotation taken out, that makes a frame a keyframe."""
+    keyframes: int = 10
+    """Keyframes that the visual odometry remembers."""
+    held_keyframes: int = 3
+    """The oldest of them, which local bundle adjustment leaves where they are."""
+    adjustments: int = 4
+    """Steps of the local bundle adjustment at a keyframe, at most; 0 leaves the map as it was triangulated."""
+    vision_noise_factor: float = 2.0
+    """Factor on the standard deviations of the visual odometry's poses, which count its points as exact."""
+    drift_scale: float = 0.005
+    """Drift of the visual scale from one keyframe to the next, standard deviation, relative."""
+    drift_rotation_deg: float = 0.05
+    """Drift of the vision frame's orientation from one keyframe to the next, standard deviation."""
+    drift_position: float = 0.01
+    """Drift of the vision frame's position from one keyframe to the next, part of the distance between them."""
+    imu_noise_factor: float = 4.0
+    """How many times the calibration's IMU noise is assumed: in flight, vibration adds to the sensor's own."""
+    gate_quantile: float = 0.99
+    """Quantile of the chi2 distribution below which a pose of the visual odometry is accepted."""
+    unknown_camera_rotation: bool = False
+    """The camera's rotation on the body is not known: find it while initialising, whatever the calibration says."""
+    zero_velocity_update: bool = True
+    """Recognise standstill and use it."""
+    standstill_disparity_px: float = 0.7
+    """Median image motion over half a second below which the camera may be standing still."""
+    max_blind_s: float = 4.0
+    """Seconds without an accepted pose after which the filter calls itself lost and starts again."""
+
+    def __post_init__(self) -> None:
+        if self.keyframes < 3 or not 2 <= self.held_keyframes < self.keyframes or self.adjustments < 0:
+            raise ValueError("needs keyframes >= 3, 2 <= held_keyframes < keyframes and adjustments >= 0")
+        for name in (
+            "pixel_sigma",
+            "bootstrap_parallax_px",
+            "keyframe_parallax_px",
+            "vision_noise_factor",
+            "imu_noise_factor",
+            "max_blind_s",
+        ):
+            if not getattr(self, name) > 0.0:
+                raise ValueError(f"needs {name} > 0, got {getattr(self, name):g}")
+        if not min(self.drift_scale, self.drift_rotation_deg, self.drift_position) >= 0.0:
+            raise ValueError("needs drift_scale, drift_rotation_deg and drift_position >= 0")
+        if not 0.0 < self.gate_quantile < 1.0:
+            raise ValueError(f"needs 0 < gate_quantile < 1, got {self.gate_quantile:g}")
