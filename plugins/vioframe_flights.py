@@ -64,16 +64,45 @@ def inspection(duration_s: float, R_LB: Float, *, size: Size = 1.0, speed: Speed
         return np.asarray(arc + _smooth((t_s - _TAKE_OFF_S) / _CLIMB_S)[:, None] * drift)
 
     def attitude(t_s: Float) -> Float:
-        yaw = -_round_the_tank(t_s)[0]
-        # A multirotor leans the way it accelerates.
-        h = _CONTROL_INTERVAL_S
-        a_W = size * (speed / h) ** 2 * (position(t_s - h) - 2.0 * position(t_s) + position(t_s + h))
-        ahead = np.cos(yaw) * a_W[:, 0] + np.sin(yaw) * a_W[:, 1]
-        left = np.cos(yaw) * a_W[:, 1] - np.sin(yaw) * a_W[:, 0]
-        up = np.maximum(a_W[:, 2] + GRAVITY_M_S2, 0.5 * GRAVITY_M_S2)
-        return np.column_stack([yaw, np.arctan2(ahead, up), -np.arctan2(left, np.hypot(ahead, up))])
+        return _leaning(-_round_the_tank(t_s)[0], position, t_s, size, speed)
 
     return _scaled(duration_s, R_LB, position, attitude, size, speed)
+
+
+def tour(
+    duration_s: float,
+    R_LB: Float,
+    *,
+    route: Annotated[int, Field(ge=0, description="which of the many ways to go")] = 0,
+    mean_speed_m_s: Annotated[float, Field(gt=0.0, le=3.0, description="how fast on average")] = 0.8,
+    width_m: Annotated[float, Field(gt=0.0, le=50.0, description="size of the place, x and y")] = 8.0,
+    height_m: Annotated[float, Field(ge=0.0, le=10.0, description="how far up and down")] = 2.0,
+) -> ShapedFlight:
+    """A multirotor that rests, takes off and flies about a place without repeating itself, looking here and there."""
+    rng = np.random.default_rng(route)
+    phase, period = rng.random((3, 3)), rng.uniform([12.0, 7.0, 4.0], [18.0, 10.0, 6.0], (3, 3))
+    along = [(axis, 0.5 * share, period[axis, k], phase[axis, k]) for axis in range(3) for k, share in enumerate(_TOUR)]
+    path = _waves(*along)
+    looks = _waves((0, 1.2, 1.5 * period[0, 0], phase[1, 1]), (0, 0.6, period[1, 1], phase[2, 2]))
+    extent = np.array([width_m, width_m, height_m])
+    # The mean speed over so long a way that its ends do not matter.
+    u = np.arange(0.0, 1000.0, 0.1)
+    pace = mean_speed_m_s / (np.linalg.norm(np.diff(extent * path(u), axis=0), axis=1).mean() / 0.1)
+
+    def gone(t_s: Float) -> Float:
+        """How far along the way at time ``t_s``: from rest to the full pace."""
+        s = np.maximum(t_s - _TAKE_OFF_S, 0.0)
+        # The integral of the smooth step x^2 (3 - 2 x) over the time of the climb, then on at full pace.
+        x = np.minimum(s / _CLIMB_S, 1.0)
+        return np.asarray(pace * (_CLIMB_S * (x**3 - 0.5 * x**4) + np.maximum(s - _CLIMB_S, 0.0)))
+
+    def position(t_s: Float) -> Float:
+        return np.asarray(extent * path(gone(t_s)))
+
+    def attitude(t_s: Float) -> Float:
+        return _leaning(looks(gone(t_s))[:, 0], position, t_s, 1.0, 1.0)
+
+    return _scaled(duration_s, R_LB, position, attitude, 1.0, 1.0)
 
 
 def pure_rotation(duration_s: float, R_LB: Float, *, speed: Speed = 1.0) -> ShapedFlight:
@@ -87,6 +116,8 @@ def constant_velocity(duration_s: float, R_LB: Float, *, speed: Speed = 1.0) -> 
     return _scaled(duration_s, R_LB, _ahead, _still, 1.0, speed)
 
 
+_TOUR = (0.6, 0.3, 0.1)
+"""Parts that the slow, the middling and the quick waves have in a tour."""
 _TANK_M = 4.0
 """From the stops of an inspection to the axis of the tank."""
 _TAKE_OFF_S, _CLIMB_S = 2.0, 3.0
@@ -102,6 +133,16 @@ def _round_the_tank(t_s: Float) -> tuple[Float, Float]:
     low, high = (_HEIGHTS_M[(stop + k).astype(np.int64) % len(_HEIGHTS_M)] for k in (0, 1))
     climbed = _smooth((t_s - _TAKE_OFF_S) / _CLIMB_S)
     return _STEP_RAD * (stop + moved), climbed * (low + moved * (high - low))
+
+
+def _leaning(yaw: Float, position: Shape, t_s: Float, size: float, speed: float) -> Float:
+    """Yaw, pitch and roll (N, 3) rad: a multirotor leans the way it accelerates."""
+    h = _CONTROL_INTERVAL_S
+    a_W = size * (speed / h) ** 2 * (position(t_s - h) - 2.0 * position(t_s) + position(t_s + h))
+    ahead = np.cos(yaw) * a_W[:, 0] + np.sin(yaw) * a_W[:, 1]
+    left = np.cos(yaw) * a_W[:, 1] - np.sin(yaw) * a_W[:, 0]
+    up = np.maximum(a_W[:, 2] + GRAVITY_M_S2, 0.5 * GRAVITY_M_S2)
+    return np.column_stack([yaw, np.arctan2(ahead, up), -np.arctan2(left, np.hypot(ahead, up))])
 
 
 def _smooth(x: Float) -> Float:
@@ -165,6 +206,7 @@ def vioframe_flights() -> Mapping[str, FlightFactory]:
         "aggressive": aggressive,
         "stop_and_go": stop_and_go,
         "inspection": inspection,
+        "tour": tour,
         "pure_rotation": pure_rotation,
         "constant_velocity": constant_velocity,
     }

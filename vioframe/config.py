@@ -105,6 +105,14 @@ def validate(model: type[SectionT], tree: Mapping[str, Any], origin: str) -> Sec
         raise ConfigError(f"{origin}: {where}: {problem}, got {first['input']!r}") from error
 
 
+def to_yaml(section: Section) -> str:
+    """``section`` as YAML without comments, its keys in the order of their definition."""
+    yaml, stream = YAML(typ="safe", pure=True), StringIO()
+    yaml.default_flow_style, yaml.width, yaml.sort_base_mapping_type_on_output = False, 110, False  # type: ignore[assignment]
+    yaml.dump(to_jsonable_python(section.model_dump()), stream)
+    return stream.getvalue()
+
+
 def override(config: Config, registry: Registry, assignments: Iterable[str]) -> Config:
     """``config`` with options set from ``key=value`` texts, as the command line's ``-o`` gives them.
 

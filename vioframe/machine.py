@@ -19,13 +19,18 @@ def describe() -> dict[str, Any]:
         "vioframe": vioframe.__version__,
         "commit": commit(Path(vioframe.__file__).parent),
         "python": platform.python_version(),
-        "versions": {name: version(name) for name in _dependencies("vioframe")},
+        "versions": versions(),
         "platform": platform.platform(),
         "cpu": cpu_model(),
         "cpu_count": os.cpu_count(),
         "memory_gib": memory_gib(),
         "threads": threads(),
     }
+
+
+def versions() -> dict[str, str]:
+    """Of what vioframe is built on, as far as it is installed."""
+    return {name: version(name) for name in _dependencies("vioframe")}
 
 
 def commit(folder: Path) -> str | None:

@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from io import StringIO
 from pathlib import Path
 from typing import Annotated, Any, Self
 
 from pydantic import Field, model_validator
-from pydantic_core import to_jsonable_python
-from ruamel.yaml import YAML
 
-from vioframe.config import PartConfig, Section, parse_assignments, read_tree, validate
+from vioframe.config import PartConfig, Section, parse_assignments, read_tree, to_yaml, validate
 from vioframe.options import Option, options_of, validate_options
 from vioframe.registry import FLIGHT, WORLD, Registry
 from vioframe.simulation.conditions import Conditions
@@ -83,10 +80,7 @@ def complete(config: SimulationConfig, registry: Registry) -> SimulationConfig:
 
 def render(config: SimulationConfig) -> str:
     """``config`` as YAML; :func:`read` returns the same configuration."""
-    yaml, stream = YAML(typ="safe", pure=True), StringIO()
-    yaml.default_flow_style, yaml.width, yaml.sort_base_mapping_type_on_output = False, 110, False  # type: ignore[assignment]
-    yaml.dump(to_jsonable_python(config.model_dump()), stream)
-    return stream.getvalue()
+    return to_yaml(config)
 
 
 def _completed(part: PartConfig, registry: Registry, kind: Any) -> PartConfig:

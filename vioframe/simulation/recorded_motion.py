@@ -14,7 +14,7 @@ from vioframe.types import Float, Int
 _IMU_FILES = ("imu0/data.csv", "imu0/data.csv.gz")
 _STAMP_FILES = ("cam0/data.csv", "cam0/timestamps_ns.txt.gz")
 # In the order they are preferred: V1_01 has the recomputed one too, and the orientation in its csv file is off.
-_GROUND_TRUTH_FILES = (
+GROUND_TRUTH_FILES = (
     "groundtruth_pose_recomputed_tum.txt.gz",
     "groundtruth_pose_vel_merged.csv.gz",
     "state_groundtruth_estimate0/data.csv",
@@ -60,10 +60,10 @@ def load_recorded_motion(path: Path, *, start_s: float = 0.0, duration_s: float 
     Frames are those that the readings and the ground truth both cover; ``start_s`` and ``duration_s`` count from the
     first of them. Raises :class:`DatasetError` where a file is missing or no frame is left.
     """
-    folder = _sensor_folder(path)
-    imu_ns, imu = _read_csv(_find(folder, _IMU_FILES), range(1, 7))
-    frames_ns, _ = _read_csv(_find(folder, _STAMP_FILES))
-    file = _find(folder, _GROUND_TRUTH_FILES)
+    folder = sensor_folder(path)
+    readings, stamps, file = motion_files(folder)
+    imu_ns, imu = _read_csv(readings, range(1, 7))
+    frames_ns, _ = _read_csv(stamps)
     truth = load_trajectory(file)
     covered = (frames_ns >= max(truth.t_ns[0], imu_ns[0])) & (frames_ns <= min(truth.t_ns[-1], imu_ns[-1]))
     frames_ns = _window(frames_ns[covered], start_s, duration_s)
@@ -76,7 +76,7 @@ def load_recorded_motion(path: Path, *, start_s: float = 0.0, duration_s: float 
     )
 
 
-def _sensor_folder(path: Path) -> Path:
+def sensor_folder(path: Path) -> Path:
     """The folder that holds ``imu0``."""
     if not path.exists():
         raise DatasetError(f"{path} does not exist; name a EuRoC sequence or its imu0/data.csv")
@@ -85,7 +85,14 @@ def _sensor_folder(path: Path) -> Path:
     return folder / "mav0" if (folder / "mav0").is_dir() else folder
 
 
-def _find(folder: Path, names: tuple[str, ...]) -> Path:
+def motion_files(folder: Path) -> tuple[Path, Path, Path]:
+    """Readings, stamps and ground truth in a folder of sensors; raises :class:`DatasetError` where one is missing."""
+    readings, stamps, truth = (find_file(folder, names) for names in (_IMU_FILES, _STAMP_FILES, GROUND_TRUTH_FILES))
+    return readings, stamps, truth
+
+
+def find_file(folder: Path, names: tuple[str, ...]) -> Path:
+    """The first of ``names`` that ``folder`` holds; raises :class:`DatasetError` where it holds none."""
     for name in names:
         if (folder / name).is_file():
             return folder / name

@@ -1,0 +1,199 @@
+"""What a suite compares: YAML in, a frozen and validated :class:`Suite` out."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from importlib.resources import files
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self
+
+from pydantic import Field, model_validator
+
+import vioframe
+from vioframe.bench.montecarlo import Setup
+from vioframe.config import PartConfig, Section, read_tree, to_yaml, validate
+from vioframe.errors import ConfigError
+from vioframe.frontend import FrontendOptions
+from vioframe.options import did_you_mean
+from vioframe.simulation.conditions import Conditions
+
+Kind = Literal["flights", "detector_speed", "trials"]
+Names = Iterable[str]
+Level = Annotated[float, Field(gt=0.0, le=1.0)]
+
+
+class Named(Section):
+    """Something with a name; a bare name is enough."""
+
+    name: str
+
+    @model_validator(mode="before")
+    @classmethod
+    def _from_name(cls, value: Any) -> Any:
+        return {"name": value} if isinstance(value, str) else value
+
+    @property
+    def called(self) -> str:
+        """What tables and plots call it."""
+        return self.name
+
+
+class Contender(Named):
+    """A part by name with its options, to be called ``label``."""
+
+    options: dict[str, Any] = Field(default_factory=dict)
+    label: str = ""
+
+    @property
+    def called(self) -> str:
+        return self.label or self.name
+
+
+class BackendContender(Contender):
+    """A back-end, and the loop closer behind it, if any."""
+
+    loop_closure: PartConfig | None = None
+
+
+class Sequence(Named):
+    """A sequence by name. ``start_s`` and ``duration_s`` None are those usual for it."""
+
+    name: str
+    start_s: Annotated[float | None, Field(ge=0.0, allow_inf_nan=False)] = None
+    duration_s: Annotated[float | None, Field(gt=0.0, allow_inf_nan=False)] = None
+
+
+class Published(Section):
+    """Figures of somebody else's, to be shown beside: ATE in metres by sequence, as ``alignment`` has it."""
+
+    system: str
+    alignment: str
+    source: str
+    ate_m: dict[str, float]
+
+
+class Suite(Section):
+    """Everything that determines a sweep but the data.
+
+    ``flights`` runs every detector with every back-end on every sequence, as it is and under each of ``conditions`` at
+    each level, ``seeds`` times; ``detector_speed`` times detectors; ``trials`` flies back-ends on simulated tracks.
+    ``seeds_vary`` says what another seed changes: the ``start`` of the flight, by ``SEED_SHIFT_S``, or the simulated
+    ``recording`` itself. ``workers`` is for sweeps that must have it so, as one that measures time.
+    """
+
+    name: str
+    title: str
+    description: str = ""
+    kind: Kind = "flights"
+    detectors: tuple[Contender, ...] = ()
+    backends: tuple[BackendContender, ...] = ()
+    sequences: tuple[Sequence, ...] = ()
+    conditions: dict[str, tuple[Level, ...]] = Field(default_factory=dict)
+    clear: bool = True
+    seeds: Annotated[int, Field(ge=1)] = 1
+    seeds_vary: Literal["start", "recording"] = "start"
+    metrics: tuple[str, ...] = ()
+    frontend: dict[str, Any] = Field(default_factory=dict)
+    workers: Annotated[int | None, Field(ge=1)] = None
+    setup: dict[str, Any] = Field(default_factory=dict)
+    rounds: Annotated[int, Field(ge=1)] = 10
+    images: Annotated[int, Field(ge=1)] = 8
+    published: tuple[Published, ...] = ()
+
+    @model_validator(mode="after")
+    def _makes_sense(self) -> Self:
+        if self.kind == "flights" and not (self.detectors and self.backends and self.sequences):
+            raise ValueError("flights need detectors, backends and sequences")
+        if self.kind == "trials" and not self.backends:
+            raise ValueError("trials need backends")
+        for what in ("detectors", "backends", "sequences"):
+            names = [each.called for each in getattr(self, what)]
+            if twice := next((name for name in names if names.count(name) > 1), None):
+                raise ValueError(f"{what}: {twice!r} is named twice; give each a label of its own")
+        if not (self.clear or self.conditions):
+            raise ValueError("neither clear nor under a condition there is nothing to fly")
+        for name in self.conditions:
+            Conditions.of({name: 1.0})
+        _check_unused(self)
+        return self
+
+
+SEED_SHIFT_S = 0.5
+"""How much later a flight starts with each seed, where seeds vary the start."""
+
+_USES: Mapping[Kind, frozenset[str]] = {
+    "flights": frozenset(
+        ("detectors", "backends", "sequences", "conditions", "clear", "seeds", "seeds_vary", "metrics", "frontend")
+    )
+    | {"workers", "published"},
+    "detector_speed": frozenset(("detectors", "rounds", "images")),
+    "trials": frozenset(("backends", "seeds", "setup", "workers")),
+}
+_ALWAYS = frozenset(("name", "title", "description", "kind"))
+
+
+def _check_unused(suite: Suite) -> None:
+    """Raise ValueError for a key that a suite of its kind has no use for."""
+    fields = Suite.model_fields
+    unused = sorted(suite.model_fields_set - _USES[suite.kind] - _ALWAYS)
+    changed = [key for key in unused if getattr(suite, key) != fields[key].get_default(call_default_factory=True)]
+    if changed:
+        raise ValueError(f"{changed[0]} does nothing in a suite of kind {suite.kind}")
+
+
+def shipped() -> dict[str, Path]:
+    """The suites that come with vioframe, by name."""
+    packaged = Path(str(files("vioframe"))) / "data" / "suites"
+    # In a checkout they are where people look for them.
+    folder = packaged if packaged.is_dir() else Path(vioframe.__file__).parents[1] / "benchmarks" / "suites"
+    return {path.stem: path for path in sorted(folder.glob("*.yaml"))}
+
+
+def find(name: str) -> Path:
+    """The suite called ``name``, or the file of that name; raises :class:`ConfigError`."""
+    suites = shipped()
+    if name in suites:
+        return suites[name]
+    if Path(name).suffix in (".yaml", ".yml"):
+        return Path(name)
+    hint = did_you_mean(name, suites)
+    raise ConfigError(f"no suite is called {name!r}{hint}; there are {', '.join(suites)}; or name a YAML file")
+
+
+def read(path: Path) -> Suite:
+    """Raises :class:`ConfigError` naming the key that is wrong."""
+    tree = {"name": path.stem} | read_tree(path)
+    suite = validate(Suite, tree, str(path))
+    if suite.kind == "trials":
+        montecarlo_setup(suite)
+    FrontendOptions(**suite.frontend) if suite.frontend else None
+    return suite
+
+
+def narrowed(
+    suite: Suite, *, detectors: Names = (), backends: Names = (), sequences: Names = (), seeds: int | None = None
+) -> Suite:
+    """``suite`` with only what is named, or all where nothing is; raises :class:`ConfigError` for what it lacks."""
+    changes: dict[str, Any] = {} if seeds is None else {"seeds": seeds}
+    for kind, names in (("detectors", detectors), ("backends", backends), ("sequences", sequences)):
+        have = {each.called: each for each in getattr(suite, kind)}
+        for name in names:
+            if name not in have:
+                there = f"; it has {', '.join(have)}" if have else ""
+                raise ConfigError(f"the suite {suite.name} has no {name!r} among its {kind}{there}")
+        if names:
+            changes[kind] = tuple(each for name, each in have.items() if name in names)
+    return suite.model_copy(update=changes)
+
+
+def montecarlo_setup(suite: Suite) -> Setup:
+    """What the trials of ``suite`` fly through; raises :class:`ConfigError`."""
+    try:
+        return Setup(**suite.setup)
+    except TypeError as error:
+        raise ConfigError(f"setup: {error}; its keys are {', '.join(Setup.__dataclass_fields__)}") from error
+
+
+def render(suite: Suite) -> str:
+    """``suite`` as YAML; :func:`read` returns the same suite."""
+    return to_yaml(suite)
