@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -32,6 +32,9 @@ _THESIS = {
     "side_view": "fig_3_14_",
 }
 """What the thesis shows of :data:`_THESIS_FLIGHT`, with the numbers of its figures."""
+
+_OF_MANY = ("translation_error_per_axis", "top_view", "relative_error")
+"""What is drawn of each recording where there are several."""
 
 
 def write_figures(results: SuiteResults, folder: Path) -> list[Path]:
@@ -71,21 +74,30 @@ def _recordings(groups: Sequence[Group]) -> Iterator[tuple[str, Figure]]:
         if (course := Course.of(own)) is None:
             continue
         before = "" if len(by_course) == 1 else _file_name(f"{sequence}_{data}_")
-        for name, figure in _of_recording(course, own):
-            yield (_THESIS.get(name, "") if of_thesis else before) + name, figure
+        for name, draw in _of_recording(own).items():
+            if len(by_course) > 1 and name not in _OF_MANY:
+                continue
+            if (figure := draw(course)) is not None:
+                yield (_THESIS.get(name, "") if of_thesis else before) + name, figure
+    if len(by_course) > 1:
+        yield "ate_by_sequence", figures_spread.ate_by_sequence([group for _, own in by_course for group in own])
 
 
-def _of_recording(course: Course, own: Sequence[Group]) -> Iterator[tuple[str, Figure]]:
-    yield "trajectories_3d", figures_flights.trajectories_3d(course)
-    yield "translation_error_per_axis", figures_flights.translation_error(course)
-    yield "rotation_error", figures_flights.rotation_error(course)
-    yield "comparison", figures_flights.comparison(course)
-    yield "top_view", figures_flights.top_view(course)
-    yield "side_view", figures_flights.side_view(course)
-    if pools := pool_relative(own):
-        yield "relative_error", figures_spread.relative_error(pools)
-    if (nees := figures_spread.nees_over_time(course)) is not None:
-        yield "nees", nees
+def _of_recording(own: Sequence[Group]) -> dict[str, Callable[[Course], Figure | None]]:
+    def relative_error(_: Course) -> Figure | None:
+        pools = pool_relative(own)
+        return figures_spread.relative_error(pools) if pools else None
+
+    return {
+        "trajectories_3d": figures_flights.trajectories_3d,
+        "translation_error_per_axis": figures_flights.translation_error,
+        "rotation_error": figures_flights.rotation_error,
+        "comparison": figures_flights.comparison,
+        "top_view": figures_flights.top_view,
+        "side_view": figures_flights.side_view,
+        "relative_error": relative_error,
+        "nees": figures_spread.nees_over_time,
+    }
 
 
 def _stress(groups: Sequence[Group]) -> Iterator[tuple[str, Figure]]:

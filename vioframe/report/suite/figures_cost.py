@@ -109,4 +109,4 @@ def _label(ax: Any, x: float, y: float, text: str) -> None:
 
 
 def _folded(name: str) -> str:
-    return name.replace(":", ":\n", 1)
+    return name.replace(":", ":\n", 1).replace(",", ",\n")

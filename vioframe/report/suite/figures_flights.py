@@ -89,7 +89,7 @@ class Course:
 
 def trajectories_3d(course: Course) -> Figure:
     """Paths in perspective."""
-    figure = _figure(course, 5.6)
+    figure = _figure(course, 5.0)
     low, high = course.bounds()
     columns = list(course.columns())
     for k, (backend, drawn) in enumerate(columns):
@@ -101,7 +101,7 @@ def trajectories_3d(course: Course) -> Figure:
         for axis, lo, hi in zip("xyz", low, high, strict=True):
             getattr(ax, f"set_{axis}lim")(lo, hi)
             getattr(ax, f"set_{axis}label")(f"{axis} [m]", labelpad=6 if axis != "z" else -2)
-        ax.set_box_aspect(high - low, zoom=1.08)
+        ax.set_box_aspect(high - low, zoom=1.05)
         ax.locator_params(nbins=5)
         ax.locator_params(axis="z", nbins=3)
         ax.view_init(elev=28, azim=-58)

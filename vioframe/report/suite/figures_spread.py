@@ -10,6 +10,7 @@ from vioframe.report.suite.captions import data_caption
 from vioframe.report.suite.figures_flights import Course
 from vioframe.report.suite.look import Look, explain
 from vioframe.report.suite.pooled import RelativePool
+from vioframe.report.suite.statistics import Group
 from vioframe.types import Float
 
 if TYPE_CHECKING:
@@ -65,6 +66,43 @@ def relative_error(pools: Sequence[RelativePool]) -> Figure:
     return figure
 
 
+def ate_by_sequence(found: Sequence[Group]) -> Figure:
+    """ATE of every flight by recording, on a logarithmic axis; a bar marks the mean, a number the flights without."""
+    from matplotlib.figure import Figure
+
+    look = Look.of(found)
+    recordings = list(dict.fromkeys((group.cell.sequence, group.cell.data) for group in found))
+    contenders = list(dict.fromkeys(group.cell.contender for group in found))
+    figure = Figure(figsize=(max(10.0, 0.22 * len(recordings) * len(contenders) + 2.0), 6.2), layout="constrained")
+    ax: Any = figure.subplots()
+    width = 0.8 / len(contenders)
+    for group in found:
+        cell = group.cell
+        across = contenders.index(cell.contender) - 0.5 * (len(contenders) - 1)
+        place = recordings.index((cell.sequence, cell.data)) + across * width
+        shade, marker = look.colour(cell.detector), look.marker(cell.backend)
+        if (ate := group.spread("ate_m")) is not None:
+            ax.plot([place] * ate.n, ate.values, marker, ms=6, mfc="none", mec=shade, mew=1.4, ls="none")
+            ax.plot([place - 0.4 * width, place + 0.4 * width], [ate.mean] * 2, color=shade, lw=2.4)
+        if missing := group.count - group.evaluated:
+            where = {"xytext": (0, -2), "textcoords": "offset points", "xycoords": ax.get_xaxis_transform()}
+            ax.annotate(f"✗{missing}", (place, 1.0), color=shade, ha="center", va="top", fontsize=10, **where)
+    for k in range(1, len(recordings)):
+        ax.axvline(k - 0.5, color="#dddddd", lw=0.8)
+    ax.set_yscale("log")
+    ax.yaxis.set_major_formatter("{x:g}")
+    ax.set_xlim(-0.5, len(recordings) - 0.5)
+    ax.set_xticks(range(len(recordings)), [f"{name}\n{data}" for name, data in recordings], fontsize=10.5)
+    ax.tick_params(axis="x", length=0)
+    ax.set_ylabel("ATE, position + yaw [m]")
+    ax.grid(visible=False, axis="x")
+    legend_above(figure, look.handles())
+    explain(
+        figure, f"A mark a flight; the bar is their mean; ✗: flights without an error to show. {data_caption(found)}"
+    )
+    return figure
+
+
 def nees_over_time(course: Course) -> Figure | None:
     """NEES by part of the pose with the 95 % band of a single instant, a column a back-end; None without any."""
     from matplotlib.figure import Figure
@@ -85,10 +123,12 @@ def nees_over_time(course: Course) -> Figure | None:
                 dof = nees.dof
             ax.axhline(dof, color=_HONEST, lw=1.2)
             ax.set_yscale("log")
+            # The first instants are the gauge's own, without error.
+            ax.set_ylim(bottom=0.3 * nees.band[0])
             ax.yaxis.set_major_formatter("{x:g}")
             ax.legend(loc="lower right", bbox_to_anchor=(1.0, 0.98), ncols=len(drawn), fontsize=10, borderpad=0.1)
             if ax in panels[:, 0]:
-                ax.set_ylabel(f"{part} NEES (ideally {dof})")
+                ax.set_ylabel(f"{part}\nNEES (ideally {dof})")
         column[0].set_title(backend, pad=24)
         column[-1].set_xlabel("time of flight [s]")
     figure.align_ylabels(panels[:, 0])

@@ -1,8 +1,9 @@
-"""Stress curves: error and success by level, a panel a condition, with confidence bands."""
+"""Stress curves: error and success by level, a panel a condition and back-end, with confidence bands."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from itertools import product
 from typing import TYPE_CHECKING, Any
 
 from vioframe.report.style import legend_above
@@ -15,9 +16,9 @@ from vioframe.report.suite.stress import Curve, Interval, Point
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-_MOST_COLUMNS = 3
-_PANEL_INCH = (4.6, 3.7)
-_APART = 0.02
+_MOST_COLUMNS = 4
+_PANEL_INCH = (3.5, 3.1)
+_APART = 0.03
 """Curves stand apart by this on the axis of levels, so that equal values do not hide one another."""
 
 
@@ -77,30 +78,30 @@ def _panels(
     from matplotlib.figure import Figure
 
     conditions = list(dict.fromkeys(curve.condition for curve in curves))
-    columns = 2 if len(conditions) == 4 else min(len(conditions), _MOST_COLUMNS)
-    rows = -(-len(conditions) // columns)
-    size = (max(columns * _PANEL_INCH[0], 8.0), rows * _PANEL_INCH[1] + 1.5)
+    look = Look.of([point.group for curve in curves for point in curve.points])
+    columns = min(len(conditions), _MOST_COLUMNS)
+    blocks = -(-len(conditions) // columns)
+    rows = blocks * len(look.backends)
+    size = (max(columns * _PANEL_INCH[0], 8.0) + 0.8, rows * _PANEL_INCH[1] + 1.4)
     figure = Figure(figsize=size, layout="constrained")
     panels: Any = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
-    look = Look.of([point.group for curve in curves for point in curve.points])
-    contenders = list(dict.fromkeys((curve.detector, curve.backend) for curve in curves))
-    for ax, condition in zip(panels.flat, conditions, strict=False):
-        for curve in curves:
-            if curve.condition == condition:
-                place = contenders.index((curve.detector, curve.backend)) - 0.5 * (len(contenders) - 1)
-                style = {"color": look.colour(curve.detector), "ls": look.dashes(curve.backend)}
-                draw(ax, curve, _APART * place, style, look.marker(curve.backend))
-        ax.set_title(condition.replace("_", " "))
     levels = sorted({point.level for curve in curves for point in curve.points})
-    for ax in panels.flat[len(conditions) :]:
-        ax.set_visible(False)
+    for place, (condition, backend) in enumerate(product(conditions, look.backends)):
+        block, column = divmod(place // len(look.backends), columns)
+        ax = panels[block * len(look.backends) + place % len(look.backends), column]
+        for curve in curves:
+            if (curve.condition, curve.backend) == (condition, backend):
+                shift = _APART * (look.detectors.index(curve.detector) - 0.5 * (len(look.detectors) - 1))
+                style = {"color": look.colour(curve.detector), "ls": look.dashes(backend)}
+                draw(ax, curve, shift, style, look.marker(backend))
+        ax.set_title(f"{condition.replace('_', ' ')}, {backend}", fontsize=12)
+        ax.set_xticks(levels, [f"{level:g}" if level else "clear" for level in levels])
+    for ax in panels.flat:
+        ax.set_visible(ax.has_data())
     for ax in panels[:, 0]:
         ax.set_ylabel(name)
-    for k, ax in enumerate(panels.flat[: len(conditions)]):
-        ax.set_xticks(levels, [f"{level:g}" if level else "clear" for level in levels])
-        if k + columns >= len(conditions):
-            ax.set_xlabel("level of the condition")
-            ax.tick_params(labelbottom=True)
+    for ax in panels[-1]:
+        ax.set_xlabel("level of the condition")
     legend_above(figure, look.handles())
     return figure
 
@@ -111,7 +112,7 @@ def _fill(
     shown = [(point.level + shift, interval) for point in points if (interval := band(point)) is not None]
     if shown:
         low, high = ([factor * end for end in ends] for ends in zip(*((i.low, i.high) for _, i in shown), strict=True))
-        ax.fill_between([level for level, _ in shown], low, high, color=face, alpha=0.1, lw=0)
+        ax.fill_between([level for level, _ in shown], low, high, color=face, alpha=0.14, lw=0)
 
 
 def _format_log(figure: Figure) -> None:
