@@ -21,6 +21,7 @@ _COMMANDS = {
     "simulate": "Render a flight and write it as a recording with exact truth.",
     "montecarlo": "Fly many simulated flights: accuracy and consistency of back-ends.",
     "bench": "Compare parts: detectors by speed, quality and tracks.",
+    "report": "Tables, figures and a page of what `vioframe bench SUITE` found.",
     "train": "Train what a learned part needs, such as keypointnet.",
     "convert": "Convert a recording: ASL folder, ROS 1 bag, ROS 2 bag, MCAP.",
 }

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vioframe.bench.detectors.quoted import TABLE_3_2
-from vioframe.report.style import PALETTE_SIZE, colour, legend_above
-from vioframe.report.suite.look import explain
+from vioframe.report.style import PALETTE_SIZE, colour
+from vioframe.report.suite.look import explain, legend
 from vioframe.report.suite.results import TaskResult
 from vioframe.report.suite.statistics import Group
 from vioframe.report.suite.tables_cost import machines, pooled_stages
@@ -99,7 +99,7 @@ def timing(found: Sequence[Group]) -> Figure | None:
     ax.set_xlim(0.0, 1.12 * float(left.max()))
     ax.set_xlabel("mean time a frame [ms]")
     ax.grid(visible=False, axis="y")
-    legend_above(figure, handles)
+    legend(figure, handles)
     explain(figure, f"Mean over all flights that initialised; without reading and decoding images. {machines(found)}")
     return figure
 

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vioframe.report.evaluated import Evaluated
-from vioframe.report.style import TRUTH, legend_above
+from vioframe.report.style import TRUTH
 from vioframe.report.suite.captions import data_caption
-from vioframe.report.suite.look import Look, explain
+from vioframe.report.suite.look import Look, explain, legend
 from vioframe.report.suite.pooled import BAND_M, inside
 from vioframe.report.suite.statistics import Group
 from vioframe.trajectory import TrajectoryErrors
@@ -274,4 +274,4 @@ def _legend(figure: Figure, course: Course, *, truth: bool = True, band: bool = 
 
     handles = [Line2D([], [], **{**TRUTH, "lw": 4.0}), Line2D([], [], **_START)] if truth else []
     handles += course.look.handles(of_backends=False)
-    legend_above(figure, [*handles, *([Patch(label=f"±{_CM} cm", **_BAND)] if band else [])])
+    legend(figure, [*handles, *([Patch(label=f"±{_CM} cm", **_BAND)] if band else [])])

@@ -5,10 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-from vioframe.report.style import legend_above
 from vioframe.report.suite.captions import data_caption
 from vioframe.report.suite.figures_flights import Course
-from vioframe.report.suite.look import Look, explain
+from vioframe.report.suite.look import Look, explain, legend, log_scale
 from vioframe.report.suite.pooled import RelativePool
 from vioframe.report.suite.statistics import Group
 from vioframe.types import Float
@@ -55,7 +54,7 @@ def relative_error(pools: Sequence[RelativePool]) -> Figure:
         for k in range(1, len(lengths)):
             ax.axvline(k - 0.5, color="#dddddd", lw=0.8)
     figure.align_ylabels(panels)
-    legend_above(figure, handles)
+    legend(figure, handles)
     counts = sorted({pool.flights for pool in pools})
     flown = f"{counts[0]}" if len(counts) == 1 else f"{counts[0]} to {counts[-1]}"
     explain(
@@ -89,14 +88,13 @@ def ate_by_sequence(found: Sequence[Group]) -> Figure:
             ax.annotate(f"✗{missing}", (place, 1.0), color=shade, ha="center", va="top", fontsize=10, **where)
     for k in range(1, len(recordings)):
         ax.axvline(k - 0.5, color="#dddddd", lw=0.8)
-    ax.set_yscale("log")
-    ax.yaxis.set_major_formatter("{x:g}")
+    log_scale(ax)
     ax.set_xlim(-0.5, len(recordings) - 0.5)
     ax.set_xticks(range(len(recordings)), [f"{name}\n{data}" for name, data in recordings], fontsize=10.5)
     ax.tick_params(axis="x", length=0)
     ax.set_ylabel("ATE, position + yaw [m]")
     ax.grid(visible=False, axis="x")
-    legend_above(figure, look.handles())
+    legend(figure, look.handles())
     explain(
         figure, f"A mark a flight; the bar is their mean; ✗: flights without an error to show. {data_caption(found)}"
     )
@@ -132,7 +130,7 @@ def nees_over_time(course: Course) -> Figure | None:
         column[0].set_title(backend, pad=24)
         column[-1].set_xlabel("time of flight [s]")
     figure.align_ylabels(panels[:, 0])
-    legend_above(figure, course.look.handles(of_backends=False))
+    legend(figure, course.look.handles(of_backends=False))
     course.explain(
         figure,
         "Green: 95 % of the instants of an honest filter, and its mean; above, the filter is surer of itself than it "

@@ -6,10 +6,9 @@ from collections.abc import Callable, Sequence
 from itertools import product
 from typing import TYPE_CHECKING, Any
 
-from vioframe.report.style import legend_above
 from vioframe.report.suite.captions import data_caption, runs_caption
 from vioframe.report.suite.flights import SUCCESS_PERCENT
-from vioframe.report.suite.look import Look, explain
+from vioframe.report.suite.look import Look, explain, legend, log_scale
 from vioframe.report.suite.statistics import Group
 from vioframe.report.suite.stress import Curve, Interval, Point
 
@@ -37,10 +36,9 @@ def error_curves(curves: Sequence[Curve], found: Sequence[Group]) -> Figure:
             spread = point.group.spread("ate_m")
             values = spread.values if spread else ()
             ax.plot([point.level + shift] * len(values), values, ".", ms=3.5, color=style["color"], alpha=0.6)
-        ax.set_yscale("log")
+        log_scale(ax)
 
     figure = _panels(curves, "ATE, position + yaw [m]", draw)
-    _format_log(figure)
     explain(
         figure,
         "Lines: geometric mean over the seeds; small dots: every flight; bands: 95 % confidence (Student's t in the "
@@ -102,7 +100,7 @@ def _panels(
         ax.set_ylabel(name)
     for ax in panels[-1]:
         ax.set_xlabel("level of the condition")
-    legend_above(figure, look.handles())
+    legend(figure, look.handles())
     return figure
 
 
@@ -113,11 +111,6 @@ def _fill(
     if shown:
         low, high = ([factor * end for end in ends] for ends in zip(*((i.low, i.high) for _, i in shown), strict=True))
         ax.fill_between([level for level, _ in shown], low, high, color=face, alpha=0.14, lw=0)
-
-
-def _format_log(figure: Figure) -> None:
-    for ax in figure.axes:
-        ax.yaxis.set_major_formatter("{x:g}")
 
 
 def _about(found: Sequence[Group]) -> str:

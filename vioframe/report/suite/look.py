@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 _DASHES = ("-", (0, (5, 1.6)), (0, (1.5, 1.2)), (0, (6, 1.5, 1.5, 1.5)))
 _MARKERS = ("o", "s", "^", "D")
-_LETTERS_AN_INCH = 14.5
+_LETTERS_AN_INCH = 12.6
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,6 +51,23 @@ class Look:
                 for name in self.backends
             ]
         return out
+
+
+def legend(figure: Figure, handles: Sequence[Any]) -> None:
+    """One legend for all panels, above them, in as few lines as fit."""
+    names = [handle.get_label() for handle in handles]
+    columns = int(figure.get_figwidth() / (0.75 + max(map(len, names)) / 11.0))
+    figure.legend(handles, names, loc="outside upper left", ncols=min(max(columns, 1), len(names)), borderaxespad=0.2)
+
+
+def log_scale(ax: Any) -> None:
+    """A logarithmic axis upwards that says 0.1, 0.2, 0.5 and not powers of ten."""
+    from matplotlib.ticker import LogLocator, NullFormatter
+
+    ax.set_yscale("log")
+    ax.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0), numticks=12))
+    ax.yaxis.set_major_formatter("{x:g}")
+    ax.yaxis.set_minor_formatter(NullFormatter())
 
 
 def explain(figure: Figure, text: str) -> None:
