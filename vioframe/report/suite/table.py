@@ -71,14 +71,14 @@ class Table:
         """``to_results`` leads from the folder of the Markdown file to the results, for the links."""
         headings = [column.heading for column in self.columns] + (["runs"] if self.has_links else [])
         rules = ["---" if column.text else "---:" for column in self.columns] + (["---"] if self.has_links else [])
-        lines = [f"**{self.title}**", "", _markdown(headings), _markdown(rules, escape=False)]
+        lines = [f"**{_escape_markdown(self.title)}**", "", _markdown(headings), _markdown(rules, escape=False)]
         for row in self.rows:
             cells = [
-                f"`{entry.shown}`" if column.code else _escape_markdown(entry.shown)
+                f"`{entry.shown}`" if column.code and entry.value is not None else _escape_markdown(entry.shown)
                 for column, entry in zip(self.columns, row.entries, strict=True)
             ]
             if self.has_links:
-                cells.append(" ".join(f"[{label}]({to_results}/{path})" for label, path in row.links))
+                cells.append(" ".join(f"[{_escape_markdown(label)}]({to_results}/{path})" for label, path in row.links))
             lines.append(_markdown(cells, escape=False))
         return "\n".join([*lines, "", _escape_markdown(self.caption), ""])
 

@@ -1,0 +1,272 @@
+"""Tables of a suite's report: what is in them, and as CSV, Markdown and LaTeX."""
+
+import csv
+import json
+import re
+from io import StringIO
+from pathlib import Path
+
+import pytest
+from suite_helpers import MadeUp, comparison, labels, stress
+
+from vioframe.report.suite import tables_accuracy
+from vioframe.report.suite.results import Data, SuiteResults
+from vioframe.report.suite.statistics import groups
+from vioframe.report.suite.table import Column, Row, Table, number, text
+from vioframe.report.suite.tables import tables, write_tables
+
+AWKWARD = Table(
+    "awkward",
+    "A_b & c",
+    "50 % of #1 | ~x^2 {y} \\ <z>, ±1 $",
+    (Column("name", text=True), Column("value", "m_s"), Column("run it", text=True, code=True)),
+    (
+        Row((text("a|b_c"), number(1 / 3, ".2f"), text("go --x_y")), (("run", "tasks/k/run"),)),
+        Row((text(""), number(None, ".2f"), text(""))),
+    ),
+)
+
+
+@pytest.fixture(scope="module")
+def compared(tmp_path_factory: pytest.TempPathFactory) -> SuiteResults:
+    return comparison(tmp_path_factory.mktemp("suite") / "results").load()
+
+
+def column(table: Table, heading: str) -> list[object]:
+    k = [each.heading for each in table.columns].index(heading)
+    return [row.entries[k].value for row in table.rows]
+
+
+def named(results: SuiteResults) -> dict[str, Table]:
+    return {table.name: table for table in tables(results)}
+
+
+def test_csv_has_exact_values_and_the_folders():
+    rows = list(csv.reader(StringIO(AWKWARD.to_csv())))
+    assert rows == [
+        ["name", "value [m_s]", "run it", "runs"],
+        ["a|b_c", repr(1 / 3), "go --x_y", "tasks/k/run"],
+        ["", "", "", ""],
+    ]
+
+
+def test_markdown_is_escaped_and_links_lead_from_where_it_is_to_the_results():
+    assert AWKWARD.to_markdown("../..").splitlines() == [
+        "**A\\_b & c**",
+        "",
+        "| name | value [m\\_s] | run it | runs |",
+        "| --- | ---: | --- | --- |",
+        "| a\\|b\\_c | 0.33 | `go --x_y` | [run](../../tasks/k/run) |",
+        "| – | – | – |  |",
+        "",
+        "50 % of #1 \\| ~x^2 {y} \\\\ \\<z>, ±1 $",
+    ]
+
+
+def test_latex_is_a_booktabs_table_with_everything_escaped():
+    tex = AWKWARD.to_latex()
+    assert (
+        "A\\_b \\& c. 50 \\% of \\#1 \\textbar{} \\textasciitilde{}x\\textasciicircum{}2 \\{y\\} \\textbackslash{}"
+        in tex
+    )
+    assert "\\textless{}z\\textgreater{}, $\\pm$1 \\$" in tex
+    assert "a\\textbar{}b\\_c & 0.33 & \\texttt{go --x\\_y} \\\\" in tex
+    assert [line.strip() for line in tex.splitlines() if "rule" in line] == ["\\toprule", "\\midrule", "\\bottomrule"]
+    assert "\\begin{tabular}{lrl}" in tex
+
+
+def test_every_table_is_written_three_times_and_its_links_lead_somewhere(compared, tmp_path):
+    folder = compared.path / "report" / "tables"
+    written = write_tables(tables(compared), folder, "../..")
+    names = ("accuracy", "band", "timing", "nees_flights", "failures", "evo", "provenance")
+    assert [path.name for path in written] == [f"{name}.{ending}" for name in names for ending in ("csv", "md", "tex")]
+    links = {
+        link for path in folder.glob("*.md") for link in re.findall(r"\]\((.*?)\)", path.read_text(encoding="utf-8"))
+    }
+    assert len(links) == 8
+    assert all((folder / link).is_dir() for link in links)
+
+
+def test_beside_every_ate_stands_what_is_needed_to_read_it(compared):
+    table = named(compared)["accuracy"]
+    assert column(table, "seeds") == ["2", "1 of 2; 1 failed", "2", "1 of 2; 1 never initialised"]
+    (first, *_), group = table.rows, groups(compared)[0]
+    spread = group.spread("ate_m")
+    for heading, value in (
+        ("ATE, position + yaw [m]", spread.mean),
+        ("std [m]", spread.std),
+        ("median [m]", spread.median),
+        ("min [m]", spread.min),
+        ("max [m]", spread.max),
+        ("ATE, SE(3) [m]", group.mean("ate_se3_m")),
+        ("start offset [s]", "5 to 5.5"),
+        ("initialised after [s]", 0.25),
+        ("completion [%]", 100.0),
+        ("resets, all seeds", 0.0),
+    ):
+        assert column(table, heading)[0] == value, heading
+    assert column(table, "std [m]")[1] is None
+    assert "loop closure" not in [each.title for each in table.columns]
+    assert first.links == tuple(
+        (f"seed {k}", f"tasks/MH_05_difficult.clear_0.shi_tomasi.sliding_window.seed{k}/run") for k in range(2)
+    )
+    assert table.caption.endswith(
+        "8 flights; 2 without an error to show. Data (rendered): MH_05_difficult: made up for a test."
+    )
+
+
+@pytest.mark.parametrize("name", ["accuracy", "band", "nees_flights"])
+def test_captions_say_what_the_data_was(compared, name):
+    assert "Data (rendered): MH_05_difficult" in named(compared)[name].caption
+
+
+def test_many_recordings_are_listed_by_kind_in_captions(tmp_path):
+    made = MadeUp(tmp_path / "r", sequences=["a", "b", "c"])
+    for sequence, data in (("a", Data.REAL), ("b", Data.REAL), ("c", Data.SIMULATED)):
+        made.flight(labels(sequence), data=data)
+    caption = named(made.load())["accuracy"].caption
+    assert "Data (real): a, b: real images and IMU." in caption
+    assert "Data (simulated): c: a simulated stand-in flight" in caption
+
+
+def test_published_rows_keep_their_alignment_and_stand_apart(tmp_path):
+    published = [
+        {
+            "system": "VINS-Mono",
+            "alignment": "sim3",
+            "source": "a paper",
+            "ate_m": {"MH_05_difficult": 0.35, "V1_01_easy": 0.07},
+        },
+        {"system": "OpenVINS", "alignment": "se3", "source": "a benchmark", "ate_m": {"V1_01_easy": 0.06}},
+    ]
+    made = MadeUp(tmp_path / "r", published=published)
+    made.flight(labels(seed=0))
+    made.failed(labels(seed=1))
+    results = made.load()
+    table = named(results)["published"]
+    assert [each.heading for each in table.columns][3:] == ["MH_05_difficult (rendered) [m]", "V1_01_easy [m]"]
+    assert column(table, "system") == ["VINS-Mono", "OpenVINS", "shi_tomasi + msckf", "shi_tomasi + msckf"]
+    assert column(table, "alignment") == ["Sim(3)", "SE(3)", "position + yaw", "SE(3)"]
+    assert column(table, "source")[0] == "published: a paper"
+    (group,) = groups(results)
+    assert column(table, "MH_05_difficult (rendered) [m]") == [0.35, None, group.mean("ate_m"), group.mean("ate_se3_m")]
+    assert table.rows[2].entries[3].shown.endswith("(1 of 2)")
+    assert column(table, "V1_01_easy [m]") == [0.07, 0.06, None, None]
+
+
+def test_where_every_seed_failed_the_published_table_says_so(tmp_path):
+    made = MadeUp(tmp_path / "r", published=[{"system": "x", "alignment": "se3", "source": "y", "ate_m": {}}])
+    made.failed(labels())
+    assert named(made.load())["published"].rows[1].entries[3].shown == "0 of 1; 1 failed"
+
+
+def test_the_band_is_averaged_over_the_seeds_beside_the_worst_of_them(tmp_path):
+    made = MadeUp(tmp_path / "r")
+    for seed, (y, z) in enumerate(((80.0, 100.0), (60.0, 90.0))):
+        told = {f"inside_{axis}_percent": value for axis, value in (("x", 50.0), ("y", y), ("z", z), ("all", 40.0))}
+        made.flight(labels(seed=seed), metrics={"band": told})
+    table = tables_accuracy.band(groups(made.load()))
+    assert column(table, "|y| within 20 cm [% of time]") == [70.0]
+    assert column(table, "y, worst seed [% of time]") == [60.0]
+    assert column(table, "z, worst seed [% of time]") == [90.0]
+
+
+def test_what_never_flew_has_no_band(tmp_path):
+    made = MadeUp(tmp_path / "r")
+    made.failed(labels())
+    assert tables_accuracy.band(groups(made.load())) is None
+
+
+def test_stress_tables_count_the_failed(tmp_path):
+    found = named(stress(tmp_path / "r").load())
+    table = found["stress"]
+    worst = [
+        row.entries for row in table.rows if [entry.value for entry in row.entries][2:5] == ["fog", 1.0, "shi_tomasi"]
+    ]
+    assert [(e[6].value, e[7].value) for e in worst] == [("1 of 2; 1 failed", 50.0)]
+    duels = found["duels"]
+    assert column(duels, "won") == [2, 2, 2, 2, 2, 8]
+    assert column(duels, "condition")[-1] == "all degraded"
+    assert duels.title == "Against shi_tomasi"
+
+
+def test_detectors_quoted_and_measured_stand_apart_and_the_absent_say_why(tmp_path):
+    made = MadeUp(tmp_path / "r", kind="detector_speed")
+    made.detector_speed()
+    table = named(made.load())["detector_fps"]
+    rows = dict(
+        zip(
+            column(table, "detector"),
+            zip(*(column(table, h) for h in ("quoted [FPS]", "measured here [FPS]", "quartiles [FPS]")), strict=True),
+            strict=True,
+        )
+    )
+    assert rows["shi_tomasi"] == (160.0, 250.0, "225.0 to 275.0")
+    assert rows["fast"] == (None, 700.0, "630.0 to 770.0")
+    assert rows["superpoint"] == (67.0, None, "not measured: needs the option 'weights'")
+    assert rows["lf_net"] == (25.0, None, "not measured: no such detector is installed")
+    assert "a processor, 2 cores" in table.caption
+
+
+def test_timing_leaves_out_flights_that_never_initialised(compared):
+    table = named(compared)["timing"]
+    assert column(table, "flights") == [2, 1, 2, 1]
+    stages = [k for k, each in enumerate(table.columns) if each.unit == "ms"]
+    for row, whole in zip(table.rows, column(table, "all [ms a frame]"), strict=True):
+        assert sum(row.entries[k].value for k in stages) == pytest.approx(whole, abs=1e-3)
+    assert table.caption.endswith("Measured on a processor (2 cores).")
+
+
+def test_trials_are_judged_by_their_nees_and_failures_counted(tmp_path):
+    made = MadeUp(tmp_path / "r", kind="trials", backends=["msckf", "loose_ekf"], seeds=6)
+    for seed in range(6):
+        made.trial("msckf", seed, 1.0)
+        made.trial("loose_ekf", seed, 9.0, "diverged" if seed == 0 else None)
+    table = named(made.load())["nees"]
+    assert dict(zip(column(table, "back-end"), column(table, "pose, verdict"), strict=True)) == {
+        "msckf": "consistent",
+        "loose_ekf": "overconfident",
+    }
+    assert dict(zip(column(table, "back-end"), column(table, "failed"), strict=True)) == {
+        "msckf": "none",
+        "loose_ekf": "1 diverged",
+    }
+    assert dict(zip(column(table, "back-end"), column(table, "pose NEES, ideally 6"), strict=True))[
+        "msckf"
+    ] == pytest.approx(6.0, rel=0.1)
+
+
+def test_failures_are_listed_with_their_reasons(compared):
+    table = named(compared)["failures"]
+    assert dict(zip(column(table, "outcome"), column(table, "reason"), strict=True)) == {
+        "failed": "PluginError: it broke",
+        "never initialised": "never initialised; last: initialisation refused: not at rest",
+    }
+
+
+def test_a_suite_without_trouble_has_no_table_of_it(tmp_path):
+    made = MadeUp(tmp_path / "r")
+    made.flight(labels())
+    assert "failures" not in named(made.load())
+
+
+def test_evo_has_a_command_for_each_evaluated_flight(compared):
+    table = named(compared)["evo"]
+    assert len(table.rows) == 6
+    for row in table.rows:
+        assert Path(compared.path, str(row.entries[2].value).split()[2]).is_file()
+        assert Path(compared.path, str(row.entries[2].value).split()[3]).is_file()
+
+
+def test_provenance_tells_machines_apart(tmp_path):
+    made = MadeUp(tmp_path / "r")
+    made.flight(labels(seed=0))
+    other = made.flight(labels(seed=1)).parent / "task.json"
+    tree = json.loads(other.read_text())
+    tree["machine"]["cpu"] = "another processor"
+    other.write_text(json.dumps(tree))
+    table = named(made.load())["provenance"]
+    rows = [tuple(entry.value for entry in row.entries) for row in table.rows]
+    assert ("commit", "abc", 2) in rows
+    assert ("numpy", "2.0", 2) in rows
+    assert {row for row in rows if row[0] == "cpu"} == {("cpu", "a processor", 1), ("cpu", "another processor", 1)}
