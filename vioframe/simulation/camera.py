@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import os
 import signal
 from collections import deque
 from collections.abc import Iterable, Iterator
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
-from multiprocessing import get_context
+from multiprocessing import get_context, parent_process
+from threading import Thread
 
 import numpy as np
 
@@ -118,7 +120,16 @@ def _open_studio(studio: Studio) -> None:
     global _camera
     # Ctrl-C goes to the whole group of processes; the one that waits for these ends them.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    Thread(target=_end_with_parent, daemon=True).start()
     _camera = SimulatedCamera(studio)
+
+
+def _end_with_parent() -> None:
+    """Where the one that waits is killed, nobody else would end this process."""
+    parent = parent_process()
+    assert parent is not None
+    parent.join()
+    os._exit(1)
 
 
 def _take(shot: Shot) -> Image:

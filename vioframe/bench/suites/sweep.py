@@ -8,33 +8,21 @@ on. Not more tasks are handed out than there are workers, so that one that dies 
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
-from vioframe.bench.processes import usable_cores
 from vioframe.bench.suites import tasks
+from vioframe.bench.suites.cluster import connected
 from vioframe.bench.suites.plan import AnyJob, FlightJob, Plan, RecordingJob, SpeedJob
 from vioframe.bench.suites.store import Store
-from vioframe.errors import PluginError, RunError, VioframeError
+from vioframe.errors import VioframeError
 from vioframe.registry import describe
 
 if TYPE_CHECKING:
     from distributed import Client, Future
 
 ATTEMPTS = 2
-
-_SETTINGS = {
-    # A worker that dies is this module's business: it counts the attempts.
-    "distributed.scheduler.allowed-failures": 0,
-    # A worker that renders alone on a machine has helpers of its own, which daemons may not have.
-    "distributed.worker.daemon": False,
-    "distributed.scheduler.worker-saturation": 1.0,
-    # Compiled code that holds the interpreter for seconds is no reason for complaints.
-    "distributed.admin.tick.limit": "1h",
-    "distributed.logging": {"distributed": "critical"},
-}
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,7 +87,7 @@ def sweep(
             # Time is measured on the whole machine, with nothing beside.
             _report(outcome, on_event, job, _attempt_here(store, job))
     if flown:
-        with _client(workers, scheduler) as client:
+        with connected(workers, scheduler) as client:
             _Drive(client, store, flown, left, outcome, on_event, helpers=scheduler is None).run()
     return outcome
 
@@ -232,35 +220,3 @@ def _why(future: Future[Any]) -> str:
 
 def _one_line(error: BaseException) -> str:
     return " ".join(str(error).split()) if isinstance(error, VioframeError) else describe(error)
-
-
-@contextmanager
-def _client(workers: int | None, scheduler: str | None) -> Iterator[Client]:
-    try:
-        import dask
-        from distributed import Client, LocalCluster
-    except ImportError as error:
-        raise PluginError('sweeps need dask.distributed: pip install "vioframe[bench]"') from error
-    with dask.config.set(_SETTINGS):
-        if scheduler is not None:
-            try:
-                client = Client(scheduler, timeout="10s")
-            except (OSError, ValueError, TimeoutError) as error:
-                raise RunError(f"there is no dask scheduler at {scheduler}; start one by `dask scheduler`") from error
-            with client:
-                if not client.nthreads():
-                    raise RunError(f"the scheduler at {scheduler} has no workers; start some by `dask worker`")
-                yield client
-            return
-        count = usable_cores() if workers is None else workers
-        with (
-            LocalCluster(
-                n_workers=count,
-                threads_per_worker=1,
-                dashboard_address=None,
-                memory_limit=0,
-                silence_logs=50,
-            ) as cluster,
-            Client(cluster) as client,
-        ):
-            yield client

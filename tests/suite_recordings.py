@@ -1,0 +1,77 @@
+"""A tiny recording, and parts that do with it what a test needs: for sweeps, where it matters who dies and when."""
+
+from dataclasses import replace
+from pathlib import Path
+from shutil import rmtree
+
+import pytest
+from plugin_helpers import install
+
+from vioframe import registry
+from vioframe.calibration import packaged_calibration, write_calibration
+from vioframe.simulation.config import SimulationConfig, complete
+from vioframe.simulation.files import simulation_folder
+from vioframe.simulation.record import record
+from vioframe.simulation.recording import SimulatedRecording
+
+SIDE = 8
+"""How many times smaller the images are than EuRoC's."""
+
+PARTS = '''
+import os, signal
+from pathlib import Path
+
+import numpy as np
+from vioframe.types import Estimate, NavState, Status
+
+
+class Counting:
+    """Says it is where the number of its tracks puts it; may fail or die at its third frame, the first times."""
+
+    def __init__(self, calibration, *, fail: int = 0, die: int = 0, flag: str = "", step_m: float = 0.01):
+        self._left, self._flag, self._step_m, self._frames = max(fail, die), Path(flag), step_m, 0
+        self._dies = die > 0
+
+    def process(self, imu, tracks):
+        self._frames += 1
+        if self._frames == 3 and self._left:
+            before = len(list(self._flag.glob("*")))
+            if before < self._left:
+                (self._flag / str(before)).touch()
+                if self._dies:
+                    os.kill(os.getpid(), signal.SIGKILL)
+                raise ValueError("it fails as it was told to")
+        p_WB = self._step_m * np.array([self._frames, len(tracks.ids) % 7, self._frames**0.5])
+        zero = np.zeros(3)
+        return Estimate(Status.TRACKING, NavState(tracks.t_ns, np.eye(3), p_WB, zero, zero, zero))
+
+
+@hookimpl
+def vioframe_backends():
+    return {"counting": Counting}
+'''
+
+
+def record_toy(folder: Path, name: str = "TOY", **settings: object) -> Path:
+    """A bag of 3 s at 10 Hz with small images, its truth in it, that says nothing of having been simulated."""
+    calibration = packaged_calibration("euroc")
+    camera = calibration.camera
+    small = replace(
+        camera,
+        resolution=(camera.resolution[0] // SIDE, camera.resolution[1] // SIDE),
+        **{key: getattr(camera, key) / SIDE for key in ("fx", "fy", "cx", "cy")},
+    )
+    files = folder / "calibration"
+    write_calibration(replace(calibration, camera=small), files)
+    config = SimulationConfig(duration_s=3.0, frame_rate_hz=10.0, calibration=(files,), **settings)
+    installed = registry.load()
+    path = folder / f"{name}.bag"
+    record(SimulatedRecording(complete(config, installed), installed), [path])
+    rmtree(simulation_folder(path))
+    return path
+
+
+def install_parts(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Make the back-end ``counting`` known, to processes begun from here as well."""
+    install(folder, monkeypatch, distribution="toy-parts", module="toy_parts", code=PARTS)
+    monkeypatch.setenv("PYTHONPATH", str(folder))

@@ -1,0 +1,206 @@
+"""Suites as files, what a sequence is flown on, and the tasks that come of both."""
+
+from pathlib import Path
+from shutil import copytree, move
+
+import numpy as np
+import pytest
+from suite_recordings import record_toy
+
+from vioframe import registry
+from vioframe.bench.suites import sources
+from vioframe.bench.suites import suite as suites
+from vioframe.bench.suites.euroc import EUROC
+from vioframe.bench.suites.plan import plan
+from vioframe.bench.suites.suite import Suite
+from vioframe.convert import convert
+from vioframe.errors import ConfigError, DatasetError, VioframeError
+from vioframe.report.suite.results import Data
+from vioframe.simulation.config import SimulationConfig, complete
+from vioframe.simulation.record import record
+from vioframe.simulation.recording import SimulatedRecording
+
+INSTALLED = registry.load()
+TOY = "detectors: [fast]\nbackends: [msckf]\nsequences: [TOY]\ntitle: toy\n"
+
+
+@pytest.fixture(scope="module")
+def toy(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of TOY.bag."""
+    return record_toy(tmp_path_factory.mktemp("toy")).parent
+
+
+def read(folder: Path, text: str) -> Suite:
+    path = folder / "toy.yaml"
+    path.write_text(text)
+    return suites.read(path)
+
+
+class TestFiles:
+    def test_shipped_suites_are_whole(self):
+        assert set(suites.shipped()) == {"consistency", "detector_fps", "euroc", "mh05_comparison", "speed", "stress"}
+        for name, path in suites.shipped().items():
+            suite = suites.read(path)
+            assert suite.name == name
+            assert suite.description
+
+    def test_the_stress_suite_is_as_large_as_promised(self):
+        stress = suites.read(suites.find("stress"))
+        assert [len(levels) for levels in stress.conditions.values()] == [3, 3, 3, 3]
+        assert (len(stress.detectors), len(stress.backends), stress.seeds) == (3, 2, 2)
+
+    def test_a_suite_survives_being_written(self, tmp_path):
+        for path in suites.shipped().values():
+            suite = suites.read(path)
+            again = tmp_path / "again.yaml"
+            again.write_text(suites.render(suite))
+            assert suites.read(again) == suite
+
+    @pytest.mark.parametrize(
+        ("text", "complaint"),
+        [
+            (TOY + "seed: 3\n", "unknown key 'seed' (did you mean 'seeds'?)"),
+            (TOY + "conditions: {fgo: [0.5]}\n", "did you mean 'fog'"),
+            (TOY + "conditions: {fog: [0.0]}\n", "greater than 0"),
+            (TOY + "clear: false\n", "nothing to fly"),
+            (TOY.replace("[fast]", "[fast, fast]"), "'fast' is named twice"),
+            (TOY.replace("[fast]", "[]"), "flights need detectors, backends and sequences"),
+            (TOY + "rounds: 3\n", "rounds does nothing in a suite of kind flights"),
+            ("title: t\nkind: trials\nbackends: [msckf]\nsetup: {speed: 1}\n", "its keys are flight"),
+            ("title: t\nkind: trials\nbackends: [msckf]\nsetup: {duration_s: 1}\n", "at least 10 s"),
+        ],
+    )
+    def test_mistakes_are_said_in_a_line(self, tmp_path, text, complaint):
+        with pytest.raises(ConfigError) as raised:
+            read(tmp_path, text)
+        assert complaint in str(raised.value)
+        assert "\n" not in str(raised.value)
+
+    def test_an_unknown_name_is_met_with_the_nearest(self):
+        with pytest.raises(ConfigError, match="did you mean 'stress'"):
+            suites.find("stres")
+
+    def test_a_suite_can_be_narrowed(self):
+        whole = suites.read(suites.find("mh05_comparison"))
+        part = suites.narrowed(whole, detectors=["keypointnet"], backends=["msckf"], seeds=1)
+        assert [each.called for each in part.detectors] == ["keypointnet"]
+        assert [each.called for each in part.backends] == ["msckf"]
+        assert part.seeds == 1
+        with pytest.raises(ConfigError, match="it has shi_tomasi, keypointnet"):
+            suites.narrowed(whole, detectors=["orb"])
+
+
+class TestSources:
+    @pytest.fixture
+    def motion(self, shared_data):
+        return shared_data / "euroc_imu_gt"
+
+    def flown(self, name, folders, conditions=None, **changes):
+        source = sources.find_source(name, folders, INSTALLED)
+        given = {"start_s": None, "duration_s": None, "conditions": conditions or {}, "seed": 0} | changes
+        return sources.flown(source, installed=INSTALLED, **given)
+
+    def test_a_recording_is_found_and_taken_as_it_is(self, toy, tmp_path):
+        found = self.flown("TOY", [toy])
+        assert (found.data, found.recording, found.simulated) == (Data.REAL, toy / "TOY.bag", None)
+        # As EuRoC's site has it: a folder a place, a folder a sequence.
+        deep = tmp_path / "hall" / "TOY"
+        copytree(toy, deep)
+        assert self.flown("TOY", [tmp_path]).recording == deep / "TOY.bag"
+
+    def test_data_are_known_by_what_they_are_not_by_where(self, toy, tmp_path):
+        copytree(toy, tmp_path / "copy")
+        here, there = self.flown("TOY", [toy]), self.flown("TOY", [tmp_path / "copy"])
+        assert sources.fingerprint(here) == sources.fingerprint(there)
+        bag = tmp_path / "copy" / "TOY.bag"
+        content = bag.read_bytes()
+        bag.write_bytes(content[:-1] + bytes([content[-1] ^ 255]))
+        assert sources.fingerprint(here) != sources.fingerprint(self.flown("TOY", [tmp_path / "copy"]))
+
+    def test_what_the_simulator_wrote_is_never_called_real(self, tmp_path):
+        config = complete(SimulationConfig(duration_s=0.3), INSTALLED)
+        record(SimulatedRecording(config, INSTALLED), [tmp_path / "MH_01_easy.bag"])
+        assert self.flown("MH_01_easy", [tmp_path]).data is Data.SIMULATED
+        with pytest.raises(ConfigError, match="simulation already"):
+            self.flown("MH_01_easy", [tmp_path], {"fog": 0.5})
+
+    @pytest.mark.parametrize("name", EUROC)
+    def test_every_sequence_has_a_stand_in_that_can_be_flown(self, name):
+        found = self.flown(name, [])
+        assert (found.data, found.start_s) == (Data.SIMULATED, 0.0)
+        assert name in found.note
+        options = found.simulated.flight.options
+        INSTALLED.create_flight("tour", 5.0, np.eye(3), options)
+
+    def test_without_images_they_are_rendered_along_the_motion(self, motion):
+        found = self.flown("MH_05_difficult", [motion])
+        assert (found.data, found.start_s) == (Data.RENDERED, 5.0)
+        assert found.simulated.recorded == motion / "MH_05_difficult"
+
+    def test_conditions_are_rendered_even_where_there_are_images(self, shared_data, tmp_path):
+        clip = tmp_path / "MH_01_easy"
+        copytree(shared_data / "euroc" / "MH_01_easy_15s", clip)
+        assert self.flown("MH_01_easy", [tmp_path], start_s=0.0).data is Data.REAL
+        foggy = self.flown("MH_01_easy", [tmp_path], {"fog": 0.5}, start_s=0.0)
+        assert (foggy.data, foggy.simulated.conditions) == (Data.RENDERED, {"fog": 0.5})
+
+    def test_a_bag_takes_its_truth_from_the_folder_beside_it(self, shared_data, toy, tmp_path):
+        clip = shared_data / "euroc" / "MH_01_easy_15s"
+        dataset = INSTALLED.open_dataset(clip)
+        convert(dataset.measurements(), dataset.calibration, tmp_path / "MH_01_easy.bag")
+        with pytest.raises(DatasetError, match="comes without ground truth"):
+            self.flown("MH_01_easy", [tmp_path])
+        folder = tmp_path / "MH_01_easy" / "mav0"
+        copytree(clip / "mav0", folder)
+        move(folder / "cam0" / "data", tmp_path / "images")
+        found = self.flown("MH_01_easy", [tmp_path])
+        assert found.recording == tmp_path / "MH_01_easy.bag"
+        assert found.ground_truth == folder / "state_groundtruth_estimate0" / "data.csv"
+
+    def test_what_nothing_is_known_of_is_an_error(self, tmp_path):
+        with pytest.raises(DatasetError, match="did you mean 'MH_01_easy'"):
+            self.flown("MH_01_eazy", [tmp_path])
+        with pytest.raises(DatasetError, match="is no folder"):
+            self.flown("MH_01_easy", [tmp_path / "nowhere"])
+
+
+class TestPlan:
+    def test_a_task_for_each_place_in_the_grid(self, tmp_path):
+        text = TOY.replace("[TOY]", "[hover]").replace("[fast]", "[fast, orb]")
+        suite = read(tmp_path, text + "conditions: {fog: [0.5, 1.0]}\nseeds: 2\nseeds_vary: recording\n")
+        jobs = plan(suite, (), INSTALLED).jobs
+        assert len({job.key for job in jobs}) == len(jobs) == 2 * 3 * 2
+        recordings = {job.recording.name for job in jobs}
+        assert len(recordings) == 3 * 2
+        assert {job.config.start_s for job in jobs} == {0.0}
+
+    def test_seeds_that_vary_the_start_share_a_recording(self, tmp_path):
+        jobs = plan(read(tmp_path, TOY.replace("TOY", "hover") + "seeds: 3\n"), (), INSTALLED).jobs
+        assert len({job.recording.name for job in jobs}) == 1
+        assert [job.config.start_s for job in jobs] == [0.0, 0.5, 1.0]
+
+    def test_what_a_result_depends_on_is_in_its_fingerprint(self, tmp_path):
+        def fingerprint(text):
+            return plan(read(tmp_path, text.replace("TOY", "hover")), (), INSTALLED).jobs[0].fingerprint
+
+        first = fingerprint(TOY)
+        assert fingerprint(TOY) == first
+        for text, what in (
+            (TOY + "frontend: {max_points: 99}\n", "config"),
+            (TOY.replace("[fast]", "[{name: fast, options: {threshold: 9}}]"), "config"),
+            (TOY + "metrics: [ate]\n", "config"),
+            (TOY.replace("[TOY]", "[{name: hover, duration_s: 9}]"), "data"),
+        ):
+            changed = fingerprint(text)
+            assert changed[what] != first[what]
+            assert changed["code"] == first["code"]
+
+    def test_what_is_missing_is_said_before_anything_is_flown(self, tmp_path):
+        for text in (
+            TOY.replace("fast", "nothing"),
+            TOY.replace("msckf", "nothing"),
+            TOY + "metrics: [nothing]\n",
+            TOY.replace("[fast]", "[superpoint]"),
+        ):
+            with pytest.raises(VioframeError):
+                plan(read(tmp_path, text.replace("TOY", "hover")), (), INSTALLED)
