@@ -188,7 +188,10 @@ def test_trials_are_drawn_as_a_monte_carlo(tmp_path):
     made = MadeUp(tmp_path / "r", kind="trials", backends=["msckf"], seeds=3)
     for seed in range(3):
         made.trial("msckf", seed, 1.0)
-    assert [name for name, _ in figures(made.load())] == ["nees_figure_eight", "trials"]
+    found = dict(figures(made.load()))
+    assert list(found) == ["nees_figure_eight", "trials"]
+    for figure in found.values():
+        assert " ".join(figure.get_supxlabel().split()).endswith("Data (simulated): tracks and IMU, no images.")
 
 
 def test_detectors_that_were_not_measured_are_named(tmp_path):

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 from vioframe.report.style import RC
 from vioframe.report.suite import figures_cost, figures_flights, figures_spread, figures_stress, statistics
 from vioframe.report.suite.figures_flights import Course
+from vioframe.report.suite.look import explain
 from vioframe.report.suite.pooled import pool_relative
 from vioframe.report.suite.results import Kind, SuiteResults
 from vioframe.report.suite.statistics import CLEAR, Group
@@ -117,9 +118,14 @@ def _trials(results: SuiteResults) -> Iterator[tuple[str, Figure]]:
     for flight in dict.fromkeys(outcome.flight for outcome in found):
         judged = [outcome for outcome in found if outcome.flight == flight and outcome.nees("pose")]
         if judged:
-            yield _file_name(f"nees_{flight}"), plot_montecarlo.nees_over_time(judged)
+            yield _file_name(f"nees_{flight}"), _of_tracks(plot_montecarlo.nees_over_time(judged))
     if any(trial.figures for outcome in found for trial in outcome.trials):
-        yield "trials", plot_montecarlo.trials(found)
+        yield "trials", _of_tracks(plot_montecarlo.trials(found))
+
+
+def _of_tracks(figure: Figure) -> Figure:
+    explain(figure, f"{figure.get_supxlabel()} Data (simulated): tracks and IMU, no images.")
+    return figure
 
 
 def _file_name(text: str) -> str:

@@ -9,6 +9,7 @@ import numpy as np
 
 from vioframe.bench.detectors.quoted import TABLE_3_2
 from vioframe.report.style import PALETTE_SIZE, colour
+from vioframe.report.suite.captions import data_caption
 from vioframe.report.suite.look import explain, legend
 from vioframe.report.suite.results import TaskResult
 from vioframe.report.suite.statistics import Group
@@ -100,7 +101,11 @@ def timing(found: Sequence[Group]) -> Figure | None:
     ax.set_xlabel("mean time a frame [ms]")
     ax.grid(visible=False, axis="y")
     legend(figure, handles)
-    explain(figure, f"Mean over all flights that initialised; without reading and decoding images. {machines(found)}")
+    explain(
+        figure,
+        "Mean over all flights that initialised; without reading and decoding images. "
+        f"{machines(found)} {data_caption(found)}",
+    )
     return figure
 
 

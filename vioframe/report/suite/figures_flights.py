@@ -89,7 +89,7 @@ class Course:
 
 def trajectories_3d(course: Course) -> Figure:
     """Paths in perspective."""
-    figure = _figure(course, 5.0)
+    figure = _figure(course, 4.7)
     low, high = course.bounds()
     columns = list(course.columns())
     for k, (backend, drawn) in enumerate(columns):
@@ -242,7 +242,7 @@ def _projection(course: Course, across: int, up: int, name: str, *, side_by_side
     count = len(course.look.backends)
     if side_by_side:
         size, shape = (
-            (max(_NARROWEST_INCH, _COLUMN_INCH * count), min(_COLUMN_INCH * height / width, 9.0) + 1.9),
+            (max(_NARROWEST_INCH, _COLUMN_INCH * count), min(_COLUMN_INCH * height / width, 9.0) + 1.3),
             (1, count),
         )
     else:

@@ -89,6 +89,7 @@ def ate_by_sequence(found: Sequence[Group]) -> Figure:
     for k in range(1, len(recordings)):
         ax.axvline(k - 0.5, color="#dddddd", lw=0.8)
     log_scale(ax)
+    ax.margins(y=0.1)
     ax.set_xlim(-0.5, len(recordings) - 0.5)
     ax.set_xticks(range(len(recordings)), [f"{name}\n{data}" for name, data in recordings], fontsize=10.5)
     ax.tick_params(axis="x", length=0)

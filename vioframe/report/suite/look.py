@@ -56,7 +56,7 @@ class Look:
 def legend(figure: Figure, handles: Sequence[Any]) -> None:
     """One legend for all panels, above them, in as few lines as fit."""
     names = [handle.get_label() for handle in handles]
-    columns = int(figure.get_figwidth() / (0.75 + max(map(len, names)) / 11.0))
+    columns = int(figure.get_figwidth() / (0.75 + max(map(len, names)) / 12.5))
     figure.legend(handles, names, loc="outside upper left", ncols=min(max(columns, 1), len(names)), borderaxespad=0.2)
 
 
