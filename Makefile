@@ -14,18 +14,19 @@ FLIGHT_BAG := $(DEMO)/$(FLIGHT).bag
 DETECTORS := shi_tomasi fast orb sift keypointnet
 RUNS := $(DETECTORS:%=$(DEMO)/%) $(DEMO)/sliding_window
 
-# What Open3D's wheel needs from the system.
+# What Open3D's wheel needs from the system, and the browser that the tests open a report's page in.
 SYSTEM_LIBRARIES := libusb-1.0-0 libgl1 libgomp1 libx11-6 libegl1
+BROWSER := chromium chromium-driver
 
 export OMP_NUM_THREADS := 1
 export OPENBLAS_NUM_THREADS := 1
 
-.PHONY: demo test test-all test-fast lint install system-libraries clean
+.PHONY: demo test test-all test-fast lint install system-libraries browser clean
 
-test: lint
+test: lint browser
 	$(BIN)/pytest -n 2 -m "not very_slow"
 
-test-all: lint
+test-all: lint browser
 	$(BIN)/pytest -n 2
 
 test-fast: lint
@@ -59,13 +60,22 @@ $(INSTALLED): pyproject.toml constraints.txt
 
 # Only the 3-D views need these, so what cannot be installed is said and not fatal.
 system-libraries:
-	@command -v dpkg >/dev/null || exit 0; \
-	missing=""; for library in $(SYSTEM_LIBRARIES); do \
-		dpkg -s $$library >/dev/null 2>&1 || missing="$$missing $$library"; done; \
+	@$(call debian_packages,$(SYSTEM_LIBRARIES),Open3D's 3-D views need system libraries)
+
+# Without it the tests of a report's page are skipped.
+browser:
+	@$(call debian_packages,$(BROWSER),the tests of the report's page need a browser)
+
+# Installs those of the packages $(1) that are missing; where it cannot, says what for, $(2), and the command.
+define debian_packages
+	command -v dpkg >/dev/null || exit 0; \
+	missing=""; for package in $(1); do \
+		dpkg -s $$package >/dev/null 2>&1 || missing="$$missing $$package"; done; \
 	test -z "$$missing" && exit 0; \
 	command="apt-get update && apt-get install -y --no-install-recommends$$missing"; \
 	if [ "$$(id -u)" = 0 ] && sh -c "$$command" >/dev/null 2>&1; then echo "installed:$$missing"; \
-	else echo "Open3D's 3-D views need system libraries: sudo sh -c '$$command'"; fi
+	else echo "$(2): sudo sh -c '$$command'"; fi
+endef
 
 clean:
 	rm -rf build .mypy_cache .pytest_cache .ruff_cache

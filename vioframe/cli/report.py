@@ -20,10 +20,15 @@ def command(results: Path, out: Path | None, no_page: bool) -> None:
     One page that needs no network (index.html), the same figures as PNG and SVG, and the tables as CSV, Markdown and
     LaTeX. Nothing is estimated again; a sweep that is still under way can be reported on too.
     """
+    write_and_say(results, out, page=not no_page)
+
+
+def write_and_say(results: Path, out: Path | None = None, *, page: bool = True) -> None:
+    """Write the report, and say what was written."""
     from vioframe.report.suite.report import write_report
     from vioframe.report.suite.results import load_results
 
-    written = write_report(load_results(results), out, page=not no_page)
+    written = write_report(load_results(results), out, page=page)
     counts = Counter((path.parent.as_posix(), path.suffix[1:]) for path in written.files if path.parent != Path())
     for (folder, ending), count in counts.items():
         click.echo(f"{written.folder / folder}: {count} {ending}")
