@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -33,6 +34,8 @@ def write_page(results: SuiteResults, out: Path) -> Path:
     environment = Environment(
         loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
+    # Where a browser may fold what is one word to it: names with options, paths.
+    environment.filters["foldable"] = lambda text: Markup("<wbr>").join(re.split(r"(?<=[,:/=])", text))
     look = look_of(results)
     to_results = Path(os.path.relpath(results.path.absolute(), out.absolute())).as_posix()
     made = sections(results, look, quote(to_results))

@@ -80,7 +80,7 @@ def _robustness(results: SuiteResults, found: Sequence[Group]) -> Iterator[str]:
 
 
 def _over_sequences(means: Sequence[Average]) -> Iterator[str]:
-    for data in dict.fromkeys(average.data for average in means):
+    for data in dict.fromkeys(a.data for a in sorted(means, key=lambda a: -len(a.sequences))):
         own = sorted((a for a in means if a.data is data), key=lambda a: a.spreads["ate_m"].mean)
         best = own[0]
         number = len(best.sequences)
@@ -110,7 +110,7 @@ def _consistency(found: Sequence[Trials]) -> Iterator[str]:
     for outcome in found:
         if nees := outcome.nees("pose"):
             yield (
-                f"{_plain(outcome.backend).capitalize()} on {_plain(outcome.flight)}: pose NEES {nees.per_axis:.1f} "
+                f"{_sentence(_plain(outcome.backend))} on {_plain(outcome.flight)}: pose NEES {nees.per_axis:.1f} "
                 f"times the ideal over {len(outcome.trials)} trials, {nees.verdict}"
             )
 
@@ -159,6 +159,10 @@ def _title(detector: str) -> str:
     name, colon, options = detector.partition(":")
     title = TABLE_3_2[name].title if name in TABLE_3_2 else name
     return f"{title}{colon}{options}"
+
+
+def _sentence(text: str) -> str:
+    return text[:1].upper() + text[1:]
 
 
 def _plain(backend: str) -> str:

@@ -123,4 +123,4 @@ def _section(id_: str, title: str, lead: str, blocks: Iterable[Block | None]) ->
 
 
 def _trial_notes(results: SuiteResults) -> dict[str, str]:
-    return {task.labels.sequence: task.data_note for task in results.of(Kind.TRIAL) if task.labels}
+    return {task.labels.sequence: task.data_note.rstrip(".") + "." for task in results.of(Kind.TRIAL) if task.labels}

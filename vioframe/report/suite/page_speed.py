@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from vioframe.bench.consistency import PARTS
 from vioframe.bench.consistency import Outcome as Trials
 from vioframe.report.suite.page_blocks import Case, Plot
@@ -64,7 +66,7 @@ def frames_a_second(task: TaskResult) -> Plot:
         ),
     ]
     layout = {
-        "xaxis": {"title": {"text": "frames a second, logarithmic"}, "type": "log", "dtick": "D2"},
+        "xaxis": {"title": {"text": "frames a second, logarithmic"}, "type": "log", "dtick": "D2", "tickformat": "~g"},
         "yaxis": {
             "type": "category",
             "categoryorder": "array",
@@ -144,7 +146,7 @@ def _stages(spent: Mapping[tuple[str, str], Mapping[str, float]], look: Look) ->
         # A name that does not fit is left to the legend.
         "uniformtext": {"minsize": 11, "mode": "hide"},
         "xaxis": {"title": {"text": "time a frame [ms]"}, "rangemode": "tozero"},
-        "yaxis": {"autorange": "reversed", "ticks": ""},
+        "yaxis": {"autorange": "reversed", "ticks": "", "ticksuffix": "  "},
     }
     return Case([picture(bars, layout)])
 
@@ -185,7 +187,13 @@ def _nees(outcomes: Sequence[Trials], look: Look) -> tuple[list[BaseTraceType], 
             )
         highest = max(float(average.values.max()) for average in averages.values())
         if highest > _LOGARITHMIC_FROM * widest.mean_band[1]:
-            layout[f"yaxis{'' if k == 0 else k + 1}"] |= {"type": "log", "dtick": 1}
+            layout[f"yaxis{'' if k == 0 else k + 1}"] |= {
+                "type": "log",
+                "dtick": 1,
+                "tickformat": "~g",
+                # The first pose is the gauge, where the error is nothing.
+                "range": [np.log10(0.1 * widest.dof), np.log10(1.5 * highest)],
+            }
         else:
             layout[f"yaxis{'' if k == 0 else k + 1}"] |= {"rangemode": "tozero"}
     return traces, layout

@@ -6,11 +6,16 @@
   const DARK = JSON.parse(document.getElementById("colours").textContent);
   const dark = matchMedia("(prefers-color-scheme: dark)");
   const VIEWS = {
-    perspective: { eye: { x: -0.95, y: -1.2, z: 0.75 }, center: { x: 0, y: 0, z: -0.1 }, up: { x: 0, y: 0, z: 1 }, projection: { type: "perspective" } },
+    perspective: { eye: { x: -1.05, y: -1.3, z: 0.8 }, center: { x: 0, y: 0, z: -0.06 }, up: { x: 0, y: 0, z: 1 }, projection: { type: "perspective" } },
     top: { eye: { x: 0, y: 0, z: 1.7 }, up: { x: 0, y: 1, z: 0 }, projection: { type: "orthographic" } },
     side: { eye: { x: 0, y: -1.7, z: 0 }, up: { x: 0, y: 0, z: 1 }, projection: { type: "orthographic" } },
   };
   const CONFIG = { responsive: true, displaylogo: false, plotlyServerURL: "" };
+  // From so many times as far away, as a narrow picture needs.
+  const seenFrom = (view, times) => {
+    const { eye, ...camera } = VIEWS[view];
+    return { ...camera, eye: { x: times * eye.x, y: times * eye.y, z: times * eye.z } };
+  };
   // Named one by one: Plotly would add one that sends the plot to its maker.
   const BUTTONS = [["toImage"], ["zoom2d", "pan2d", "resetScale2d"]];
   const BUTTONS_3D = [["toImage"], ["zoom3d", "pan3d", "orbitRotation", "resetCameraDefault3d"]];
@@ -89,7 +94,11 @@
     const solid = trace.type === "bar" || trace.type === "box" || (trace.fill && trace.fill !== "none");
     const dash = { dash: "5 3", dot: "2 3", dashdot: "6 2 2 2" }[line.dash] || "none";
     const faint = trace.opacity ?? 1;
-    const shape = solid
+    const mark = !solid && trace.mode === "markers";
+    const hollow = String(trace.marker?.symbol).endsWith("-open");
+    const shape = mark
+      ? `<path d="${hollow ? "M12 1L17 6L12 11L7 6Z" : "M7 6a5 5 0 1 0 10 0a5 5 0 1 0 -10 0Z"}" fill="${hollow ? "none" : colour}" stroke="${colour}" stroke-width="${hollow ? 2 : 0}"/>`
+      : solid
       ? `<rect x="5" y="1" width="13" height="10" rx="2" fill="${shade(trace.fillcolor || colour)}" fill-opacity="${faint}" stroke="${colour}" stroke-opacity="${Math.max(faint, 0.4)}"/>`
       : `<line x1="0" x2="24" y1="6" y2="6" stroke="${colour}" stroke-width="${Math.min(line.width || 2.4, 6)}" stroke-opacity="${faint}" stroke-dasharray="${dash}"/>`;
     return `<svg width="24" height="12" aria-hidden="true">${shape}</svg>`;
@@ -133,8 +142,8 @@
       const traces = data.map((trace) => ({ ...shaded(onlyPassing(trace)), visible: passes(trace.meta) && !hidden.has(trace.meta.series) }));
       const shown = { ...layout, template: theme(), autosize: true };
       if (shown.shapes) shown.shapes = shown.shapes.map(shaded);
-      if (plot.views) shown.scene = { ...shown.scene, camera: VIEWS[view], uirevision: `${select?.selectedIndex} ${view}`, dragmode: view === "perspective" ? "turntable" : "pan" };
       const narrow = canvas.clientWidth < 560;
+      if (plot.views) shown.scene = { ...shown.scene, camera: seenFrom(view, narrow ? 1.9 : 1), uirevision: `${select?.selectedIndex} ${view}`, dragmode: view === "perspective" ? "turntable" : "pan" };
       canvas.style.height = `${(narrow && plot.narrow_height) || plot.height}px`;
       return Plotly.react(canvas, traces, shown, { ...CONFIG, modeBarButtons: plot.views ? BUTTONS_3D : BUTTONS, displayModeBar: !narrow && !printing });
     }
