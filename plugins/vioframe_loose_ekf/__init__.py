@@ -14,7 +14,7 @@ from vioframe_loose_ekf.options import LooseEkfOptions
 
 
 def loose_ekf(calibration: Calibration, options: LooseEkfOptions) -> Backend:
-    """Loosely coupled: visual odometry up to scale, fused with the IMU by an extended Kalman filter that finds the scale."""
+    """Loosely coupled: a visual odometry's poses up to scale, fused with the IMU by an extended Kalman filter."""
     from vioframe_loose_ekf.backend import LooseEkf
     from vioframe_loose_ekf.warm_up import warm_up
 

@@ -47,7 +47,7 @@ def adjust(scene: VisionMap, sigma: float, held: int, iterations: int) -> None:
 def _adjust(
     R: Float, p: Float, points: Float, xy: Float, sigma: float, held: int, iterations: int
 ) -> tuple[Float, Float, Float, Float]:
-    """Rotations (K, 3, 3), positions (K, 3), points (L, 3) that fit ``xy`` (K, L, 2) best; mean errors (L,) in sigma."""
+    """Rotations (K, 3, 3), positions (K, 3) and points (L, 3) that fit ``xy`` (K, L, 2); mean errors (L,) in sigma."""
     damping = 1e-4
     cost = _cost(R, p, points, xy, sigma)
     for _ in range(iterations):

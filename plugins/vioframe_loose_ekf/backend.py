@@ -17,16 +17,16 @@ from vioframe.recovery import DivergedError, check_plausible, noise_over
 from vioframe.standstill import StandstillDetector
 from vioframe.stopwatch import Stopwatch
 from vioframe.types import Calibration, Estimate, Float, FrameTracks, ImuSegment, NavState, Status
+from vioframe_loose_ekf.drifts import Drifts
 from vioframe_loose_ekf.fusion import Fusion
 from vioframe_loose_ekf.odometry import Event, Sighting, VisualOdometry
 from vioframe_loose_ekf.options import LooseEkfOptions
 
 # Poses that do not fit for this long say that the vision frame is wrong, not they.
 _CONTRADICTED_S = 0.12
-_TRIAL_S = 1.0
+# A vision frame tied anew must fit for this long, and its scale may have changed by this much, relative.
+_TRIAL_S = 0.5
 _JUMPED_SCALE = 0.1
-LOOK_BACK_S = 0.5
-MEDIAN_DEPTH = 5.0
 
 
 class LooseEkf:
@@ -47,6 +47,7 @@ class LooseEkf:
         self._noise = replace(
             noise, gyro_density=factor * noise.gyro_density, accel_density=factor * noise.accel_density
         )
+        self._drifts = Drifts(self._options, calibration.camera.focal_px)
         self._gate = float(chi2.ppf(self._options.gate_quantile, 6))
         self._standstill = StandstillDetector(self._options.standstill_disparity_px)
         self._fusion: Fusion | None = None
@@ -83,12 +84,12 @@ class LooseEkf:
         still = self._standstill.sees_standstill(tracks) and self._options.zero_velocity_update
         if still and fusion.hold_still(imu, self._noise):
             self._seeing_ns = self._fitting_ns = tracks.t_ns
-            if self._odometry.map is None:
+            if self._odometry.map is None or sighting.event is Event.BEGUN:
                 # There is no parallax to wait for: the way to the next frame that moves begins here.
                 self._odometry.restart(tracks)
                 fusion.place_vision_frame()
             else:
-                fusion.move_anchor(fusion.state.p_VA, self._creep(imu))
+                fusion.move_anchor(fusion.state.p_VA, self._drifts.at_rest(imu.duration_s))
             watch.lap("standstill")
             return Estimate(Status.TRACKING, fusion.nav_state(tracks.t_ns), stage_seconds=watch.seconds)
         watch.lap("standstill")
@@ -97,58 +98,51 @@ class LooseEkf:
         watch.lap("propagate")
         events = self._fuse(fusion, sighting, tracks)
         watch.lap("update")
-        known = sighting.ids is not None and sighting.p_VF is not None and not events
+        ids, p_WF = np.empty(0, np.int64), np.empty((0, 3))
+        if sighting.placement is not None and not events:
+            ids, p_WF = sighting.placement.ids, fusion.state.in_world(sighting.placement.p_VF)
         return Estimate(
             Status.TRACKING,
             fusion.nav_state(tracks.t_ns),
-            *((sighting.ids, fusion.state.in_world(sighting.p_VF)) if known else ()),
+            ids,
+            p_WF,
             is_keyframe=sighting.event in (Event.KEYFRAME, Event.BEGUN),
             events=events,
             stage_seconds=watch.seconds,
         )
 
     def _fuse(self, fusion: Fusion, sighting: Sighting, tracks: FrameTracks) -> tuple[str, ...]:
-        """Bring what the odometry says into the filter; events worth telling."""
+        """Bring what the odometry says into the filter; returns events worth telling."""
         if sighting.event is Event.REFERENCE:
             fusion.place_vision_frame()
-        if sighting.pose is None:
+        if sighting.placement is None:
             return ()
-        assert sighting.cov is not None
-        if sighting.event is Event.BEGUN and not fusion.begin_scale(sighting.pose.p_VC):
-            return self._new_vision_frame(fusion, tracks, "its first way is not that of the readings")
+        pose = sighting.placement.pose
         if sighting.event is Event.BEGUN:
+            if not fusion.begin_scale(pose.p_VC):
+                return self._new_vision_frame(fusion, tracks, "the first way it saw is not that of the readings")
             self._fitting_ns = tracks.t_ns
-        noise = self._options.vision_noise_factor**2 * sighting.cov
-        if fusion.update_pose(sighting.pose, noise, self._gate):
+            fusion.move_anchor(fusion.state.p_VA, self._drifts.at_birth(pose))
+        elif sighting.event is Event.KEYFRAME:
+            fusion.move_anchor(pose.p_VC, self._drifts.since(fusion.state.p_VA, pose))
+
+        noise = self._options.vision_noise_factor**2 * sighting.placement.cov
+        if fusion.update_pose(pose, noise, self._gate):
             self._seeing_ns = self._fitting_ns = tracks.t_ns
-        elif (tracks.t_ns - self._fitting_ns) * 1e-9 > _CONTRADICTED_S:
-            if (tracks.t_ns - self._tied_ns) * 1e-9 < _TRIAL_S:
-                return self._new_vision_frame(fusion, tracks, "its poses contradict the readings")
-            fusion.tie_anew(sighting.pose, noise, _JUMPED_SCALE)
-            self._tied_ns = self._fitting_ns = tracks.t_ns
-            return ("vision frame tied anew: it jumped",)
-        if sighting.event in (Event.KEYFRAME, Event.BEGUN):
-            fusion.move_anchor(sighting.pose.p_VC, self._drift(fusion, sighting))
-        return ()
+            return ()
+        if (tracks.t_ns - self._fitting_ns) * 1e-9 < _CONTRADICTED_S:
+            return ()
+        # Once it may have jumped, as an odometry does that takes some points for others; twice at once it is lost.
+        if (tracks.t_ns - self._tied_ns) * 1e-9 < _TRIAL_S:
+            return self._new_vision_frame(fusion, tracks, "its poses contradict the readings")
+        fusion.tie_anew(pose, noise, _JUMPED_SCALE)
+        self._tied_ns = self._fitting_ns = tracks.t_ns
+        return ("vision frame tied anew: its poses jumped",)
 
     def _new_vision_frame(self, fusion: Fusion, tracks: FrameTracks, why: str) -> tuple[str, ...]:
         self._odometry.restart(tracks)
         fusion.place_vision_frame()
         return (f"new vision frame: {why}",)
-
-    def _drift(self, fusion: Fusion, sighting: Sighting) -> Float:
-        """(7,) standard deviations by which V has come to differ from what it was at the last keyframe."""
-        assert sighting.pose is not None
-        options = self._options
-        way = float(np.linalg.norm(sighting.pose.p_VC - fusion.state.p_VA))
-        rotation = np.deg2rad(options.drift_rotation_deg)
-        return np.repeat([options.drift_scale, rotation, options.drift_position * way], [1, 3, 3])
-
-    def _creep(self, imu: ImuSegment) -> Float:
-        """(7,) standard deviations by which a picture that passes for still may have moved without being followed."""
-        noticed = self._options.standstill_disparity_px / self._starter.calibration.camera.focal_px
-        creep = noticed * np.sqrt(imu.duration_s / LOOK_BACK_S)
-        return np.repeat([0.0, creep, creep * MEDIAN_DEPTH], [1, 3, 3])
 
     def _turn(self, fusion: Fusion, imu: ImuSegment) -> Float:
         """R_CbC (3, 3), how the camera turned since the frame before, as the gyroscope says."""
@@ -163,15 +157,16 @@ class LooseEkf:
         self._standstill.sees_standstill(tracks)
         estimate = self._starter.begin(imu, tracks)
         if estimate.state is not None:
-            self._begin(estimate.state)
+            fusion = self._begin(estimate.state)
             self._odometry.restart(tracks)
-            self._fusion.place_vision_frame()
+            fusion.place_vision_frame()
         return estimate
 
-    def _begin(self, nav: NavState) -> None:
+    def _begin(self, nav: NavState) -> Fusion:
         self._fusion = Fusion(nav, self._starter.calibration)
         self._odometry = VisualOdometry(self._starter.calibration, self._options)
         self._seeing_ns = nav.t_ns
+        return self._fusion
 
     def _check_sight(self, t_ns: int) -> None:
         blind_s = (t_ns - self._seeing_ns) * 1e-9

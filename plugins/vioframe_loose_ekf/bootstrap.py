@@ -27,7 +27,7 @@ _LEAST_EXPLAINED, _LEAST_INLIERS = 0.5, 0.7
 _LARGEST_TURN_ERROR_RAD = 0.05
 # Frames between reference and newest that serve as keyframes.
 _BETWEEN = 3
-_MEDIAN_DEPTH = 5.0
+MEDIAN_DEPTH = 5.0
 """What the unit of V is made such that it is; :func:`~vioframe.geometry.triangulation.triangulate` trusts 0.1 to 60."""
 _ADJUSTMENTS = 10
 
@@ -60,7 +60,7 @@ class Bootstrap:
         xy_1, xy_2 = reference.xy_normalised[i], newest.xy_normalised[j]
         if len(i) < _MIN_COMMON or median_parallax(xy_1, xy_2, self._R_RC[-1]) < self._parallax:
             return None
-        pose = relative_pose(xy_1, xy_2, self._sigma, _MEDIAN_DEPTH * self._parallax)
+        pose = relative_pose(xy_1, xy_2, self._sigma, MEDIAN_DEPTH * self._parallax)
         if pose is None or np.linalg.norm(so3.log(pose.R_VC.T @ self._R_RC[-1])) > _LARGEST_TURN_ERROR_RAD:
             return None
         scene = VisionMap([Keyframe.of(VisionPose(np.eye(3), np.zeros(3)), reference), Keyframe.of(pose, newest)])
@@ -117,9 +117,9 @@ def relative_pose(xy_1: Float, xy_2: Float, sigma: float, baseline: float) -> Vi
 
 
 def _set_unit(scene: VisionMap) -> None:
-    """Stretch the map so that the median depth in the newest keyframe is ``_MEDIAN_DEPTH``."""
+    """Stretch the map so that the median depth in the newest keyframe is ``MEDIAN_DEPTH``."""
     newest = scene.keyframes[-1].pose
     depth = (scene.p_VF - newest.p_VC) @ newest.R_VC[:, 2]
-    stretch = _MEDIAN_DEPTH / float(np.median(depth))
+    stretch = MEDIAN_DEPTH / float(np.median(depth))
     scene.p_VF = stretch * scene.p_VF
     scene.keyframes = [replace(k, pose=VisionPose(k.pose.R_VC, stretch * k.pose.p_VC)) for k in scene.keyframes]

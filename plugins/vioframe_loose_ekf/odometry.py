@@ -7,7 +7,7 @@ how far the camera turned between two frames, where the search for the pose star
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import Enum, auto
 
 import numpy as np
@@ -17,7 +17,7 @@ from vioframe_loose_ekf.adjustment import adjust
 from vioframe_loose_ekf.bootstrap import Bootstrap, median_parallax
 from vioframe_loose_ekf.measurement import VisionPose
 from vioframe_loose_ekf.options import LooseEkfOptions
-from vioframe_loose_ekf.resection import Resection, resect
+from vioframe_loose_ekf.resection import resect
 from vioframe_loose_ekf.vision_map import Keyframe, VisionMap
 
 # Known points that must be in sight, and that must agree on where the camera is; and what part of those in sight.
@@ -25,6 +25,8 @@ _MIN_POINTS, _LEAST_INLIERS = 10, 0.3
 # Part of the known points of the last keyframe below which a new one is due.
 _FEW_LEFT = 0.6
 _GIVE_UP_S = 0.5
+# Keyframes that bundle adjustment must leave alone: fewer do not hold the scale.
+_LEAST_HELD = 2
 
 
 class Event(Enum):
@@ -41,17 +43,24 @@ class Event(Enum):
 
 
 @dataclass(frozen=True, slots=True)
-class Sighting:
-    """What the odometry says after a frame; ``pose`` and its covariance (6, 6) only where there is one.
+class Placement:
+    """A frame placed against the map: its ``pose`` with covariance (6, 6) given the points, and the points that agree.
 
-    ``ids`` (M,) and ``p_VF`` (M, 3) are the points by which the camera was placed.
+    The covariance is that of [rotation in the camera, position in V]. ``ids`` (M,), ``p_VF`` (M, 3).
     """
 
+    pose: VisionPose
+    cov: Float
+    ids: Int
+    p_VF: Float
+
+
+@dataclass(frozen=True, slots=True)
+class Sighting:
+    """What the odometry says after a frame; ``placement`` is None where it cannot say where the camera is."""
+
     event: Event
-    pose: VisionPose | None = None
-    cov: Float | None = None
-    ids: Int | None = None
-    p_VF: Float | None = None
+    placement: Placement | None = None
 
 
 class VisualOdometry:
@@ -64,8 +73,7 @@ class VisualOdometry:
         self._parallax = options.keyframe_parallax_px / focal_px
         self._bootstrap = Bootstrap(self._sigma, options.bootstrap_parallax_px / focal_px)
         self._map: VisionMap | None = None
-        self._last: VisionPose | None = None
-        self._velocity_V = np.zeros(3)  # units a frame
+        self._motion = _Motion(VisionPose(np.eye(3), np.zeros(3)), 0)
         self._placed_ns = 0
         self._known_at_keyframe = 0
 
@@ -84,65 +92,83 @@ class VisualOdometry:
         """Take in a frame, turned by ``R_CbC`` (3, 3) from the one before as far as anybody knows."""
         if self._map is None:
             return self._begin(tracks, R_CbC)
-        return self._place(self._map, tracks, R_CbC)
+        return self._follow(self._map, tracks, R_CbC)
 
     def _begin(self, tracks: FrameTracks, R_CbC: Float) -> Sighting:
         if not self._bootstrap.add(tracks, R_CbC):
             return Sighting(Event.REFERENCE)
-        self._map = self._bootstrap.attempt()
-        if self._map is None:
+        scene = self._bootstrap.attempt()
+        if scene is None:
             return Sighting(Event.WAITING)
-        ids, p_VF, xy = self._map.seen_in(tracks)
-        self._last = self._map.keyframes[-1].pose
-        found = resect(self._last, p_VF, xy, self._sigma)
-        if found is None:
-            return self.restart(tracks)
-        self._velocity_V = np.zeros(3)
+        first = self._place(scene, tracks, scene.keyframes[-1].pose)
+        if first is None:
+            return Sighting(Event.WAITING)
+        self._map = scene
+        self._motion = _Motion(first.pose, tracks.t_ns)
         self._placed_ns = tracks.t_ns
-        self._known_at_keyframe = len(ids)
-        return self._sighting(Event.BEGUN, found, ids, p_VF)
+        self._known_at_keyframe = len(first.ids)
+        return Sighting(Event.BEGUN, first)
 
-    def _place(self, scene: VisionMap, tracks: FrameTracks, R_CbC: Float) -> Sighting:
-        assert self._last is not None
-        ids, p_VF, xy = scene.seen_in(tracks)
-        if len(ids) < _MIN_POINTS:
-            return self.restart(tracks)
-        guess = VisionPose(self._last.R_VC @ R_CbC, self._last.p_VC + self._velocity_V)
-        found = resect(guess, p_VF, xy, self._sigma)
-        if found is None or found.inliers.sum() < max(_MIN_POINTS, _LEAST_INLIERS * len(ids)):
+    def _follow(self, scene: VisionMap, tracks: FrameTracks, R_CbC: Float) -> Sighting:
+        if np.isin(scene.ids, tracks.ids).sum() < _MIN_POINTS:
+            return self.restart(tracks)  # tracks that ended never come back
+        guess = self._motion.predicted(tracks.t_ns, R_CbC)
+        placement = self._place(scene, tracks, guess)
+        if placement is None:
             if (tracks.t_ns - self._placed_ns) * 1e-9 > _GIVE_UP_S:
                 return self.restart(tracks)
-            self._last = guess
+            self._motion = self._motion.through(guess, tracks.t_ns)
             return Sighting(Event.WAITING)
-        self._velocity_V = found.pose.p_VC - self._last.p_VC
-        self._placed_ns = tracks.t_ns
         event = Event.TRACKED
-        if self._keyframe_is_due(scene, tracks, found):
+        if self._keyframe_is_due(scene, tracks, placement):
             event = Event.KEYFRAME
-            scene.keep(~np.isin(scene.ids, ids[~found.inliers]))
-            found, ids, p_VF = self._extend(scene, tracks, found)
-        self._last = found.pose
-        return self._sighting(event, found, ids, p_VF)
+            placement = self._extend(scene, tracks, placement)
+        self._motion = self._motion.through(placement.pose, tracks.t_ns)
+        self._placed_ns = tracks.t_ns
+        return Sighting(event, placement)
 
-    def _keyframe_is_due(self, scene: VisionMap, tracks: FrameTracks, found: Resection) -> bool:
+    def _place(self, scene: VisionMap, tracks: FrameTracks, guess: VisionPose) -> Placement | None:
+        ids, p_VF, xy = scene.seen_in(tracks)
+        found = resect(guess, p_VF, xy, self._sigma)
+        if found is None or found.inliers.sum() < max(_MIN_POINTS, _LEAST_INLIERS * len(ids)):
+            return None
+        return Placement(found.pose, found.cov, ids[found.inliers], p_VF[found.inliers])
+
+    def _keyframe_is_due(self, scene: VisionMap, tracks: FrameTracks, placement: Placement) -> bool:
         last = scene.keyframes[-1]
-        if found.inliers.sum() < _FEW_LEFT * self._known_at_keyframe:
+        if len(placement.ids) < _FEW_LEFT * self._known_at_keyframe:
             return True
         _, i, j = np.intersect1d(last.ids, tracks.ids, assume_unique=True, return_indices=True)
-        moved = median_parallax(last.xy[i], tracks.xy_normalised[j], last.pose.R_VC.T @ found.pose.R_VC)
+        moved = median_parallax(last.xy[i], tracks.xy_normalised[j], last.pose.R_VC.T @ placement.pose.R_VC)
         return moved > self._parallax
 
-    def _extend(self, scene: VisionMap, tracks: FrameTracks, found: Resection) -> tuple[Resection, Int, Float]:
-        """Make a keyframe of the frame, triangulate what it shows anew, adjust; the frame's pose after that."""
+    def _extend(self, scene: VisionMap, tracks: FrameTracks, placement: Placement) -> Placement:
+        """Make a keyframe of the frame, triangulate what it shows anew, adjust; where the frame is after that."""
         options = self._options
-        scene.add_keyframe(Keyframe.of(found.pose, tracks), options.keyframes)
+        outliers = np.setdiff1d(tracks.ids, placement.ids)
+        scene.keep(~np.isin(scene.ids, outliers))
+        scene.add_keyframe(Keyframe.of(placement.pose, tracks), options.keyframes)
         scene.triangulate(self._sigma)
-        adjust(scene, self._sigma, options.held_keyframes, options.adjustments)
-        ids, p_VF, xy = scene.seen_in(tracks)
-        self._known_at_keyframe = len(ids)
-        after = resect(scene.keyframes[-1].pose, p_VF, xy, self._sigma)
-        return after or found, ids, p_VF
+        held = max(len(scene.keyframes) - options.adjusted_keyframes, _LEAST_HELD)
+        adjust(scene, self._sigma, held, options.adjustments)
+        placement = self._place(scene, tracks, scene.keyframes[-1].pose) or placement
+        self._known_at_keyframe = len(placement.ids)
+        return placement
 
-    def _sighting(self, event: Event, found: Resection, ids: Int, p_VF: Float) -> Sighting:
-        good = found.inliers if len(found.inliers) == len(ids) else np.ones(len(ids), bool)
-        return Sighting(event, found.pose, found.cov, ids[good], p_VF[good])
+
+@dataclass(frozen=True, slots=True)
+class _Motion:
+    """Where the camera was last, and how fast it went (units of V a second)."""
+
+    pose: VisionPose
+    t_ns: int
+    velocity_V: Float = field(default_factory=lambda: np.zeros(3))
+
+    def predicted(self, t_ns: int, R_CbC: Float) -> VisionPose:
+        """Gone on like that, and turned by ``R_CbC`` (3, 3)."""
+        dt = (t_ns - self.t_ns) * 1e-9
+        return VisionPose(self.pose.R_VC @ R_CbC, self.pose.p_VC + dt * self.velocity_V)
+
+    def through(self, pose: VisionPose, t_ns: int) -> _Motion:
+        dt = (t_ns - self.t_ns) * 1e-9
+        return _Motion(pose, t_ns, (pose.p_VC - self.pose.p_VC) / dt)

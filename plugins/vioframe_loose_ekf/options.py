@@ -15,15 +15,15 @@ class LooseEkfOptions:
     """Median motion of the tracks since the last keyframe, rotation taken out, that makes a frame a keyframe."""
     keyframes: int = 10
     """Keyframes that the visual odometry remembers."""
-    held_keyframes: int = 3
-    """The oldest of them, which local bundle adjustment leaves where they are."""
+    adjusted_keyframes: int = 5
+    """The newest of them, which local bundle adjustment moves; the others, two at least, it leaves where they are."""
     adjustments: int = 4
     """Steps of the local bundle adjustment at a keyframe, at most; 0 leaves the map as it was triangulated."""
     vision_noise_factor: float = 2.0
     """Factor on the standard deviations of the visual odometry's poses, which count its points as exact."""
-    drift_scale: float = 0.005
+    drift_scale: float = 0.003
     """Drift of the visual scale from one keyframe to the next, standard deviation, relative."""
-    drift_rotation_deg: float = 0.05
+    drift_rotation_deg: float = 0.03
     """Drift of the vision frame's orientation from one keyframe to the next, standard deviation."""
     drift_position: float = 0.01
     """Drift of the vision frame's position from one keyframe to the next, part of the distance between them."""
@@ -41,8 +41,8 @@ class LooseEkfOptions:
     """Seconds without an accepted pose after which the filter calls itself lost and starts again."""
 
     def __post_init__(self) -> None:
-        if self.keyframes < 3 or not 2 <= self.held_keyframes < self.keyframes or self.adjustments < 0:
-            raise ValueError("needs keyframes >= 3, 2 <= held_keyframes < keyframes and adjustments >= 0")
+        if self.keyframes < 3 or self.adjusted_keyframes < 1 or self.adjustments < 0:
+            raise ValueError("needs keyframes >= 3, adjusted_keyframes >= 1 and adjustments >= 0")
         for name in (
             "pixel_sigma",
             "bootstrap_parallax_px",

@@ -15,8 +15,8 @@ _LEAST_DEPTH = 1e-3
 def reproject(R_VC: Float, p_VC: Float, p_VF: Float, xy: Float, sigma: float, e: Float, J: Float) -> bool:
     """Residual ``e`` (2,) on the z = 1 plane and its Jacobian ``J`` (2, 6) by the pose [dtheta dp], in sigma.
 
-    Both are written in place; the Jacobian by the point is ``-J[:, 3:]``. False, and nothing written, where the point is
-    behind the camera.
+    Both are written in place; the Jacobian by the point is ``-J[:, 3:]``. False, and nothing written, where the point
+    is behind the camera.
     """
     d0, d1, d2 = p_VF[0] - p_VC[0], p_VF[1] - p_VC[1], p_VF[2] - p_VC[2]
     q0 = R_VC[0, 0] * d0 + R_VC[1, 0] * d1 + R_VC[2, 0] * d2

@@ -1,4 +1,4 @@
-"""The camera's pose from known points: robust least squares from a guess, or from nothing where the guess is no good."""
+"""The camera's pose from known points: robust least squares from a guess, or from nothing where the guess is bad."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def resect(guess: VisionPose, p_VF: Float, xy: Float, sigma: float) -> Resection
 def _refined(guess: VisionPose, p_VF: Float, xy: Float, sigma: float) -> Resection | None:
     if len(xy) < _MIN_POINTS:
         return None
-    R, p, N, squared = _refine(guess.R_VC, guess.p_VC, p_VF, xy, sigma)
+    R, p, N, squared = _refine(np.ascontiguousarray(guess.R_VC), guess.p_VC, p_VF, xy, sigma)
     inliers = squared < OUTLIER_SIGMAS**2
     if not np.isfinite(p).all() or inliers.sum() < _MIN_POINTS:
         return None
@@ -95,7 +95,7 @@ def _refine(R: Float, p: Float, p_VF: Float, xy: Float, sigma: float) -> tuple[F
         damped = N.copy()
         for k in range(6):
             damped[k, k] += damping * N[k, k] + 1e-9
-        step = np.linalg.solve(damped, g)
+        step: Float = np.asarray(np.linalg.solve(damped, g), np.float64)
         R_trial, p_trial = R @ exp(-step[:3]), p - step[3:]
         trial_cost, trial_N, trial_g, trial_squared = _normal_equations(R_trial, p_trial, p_VF, xy, sigma)
         if trial_cost < cost:

@@ -39,7 +39,7 @@ class VisionMap:
         self.p_VF: Float = np.empty((0, 3))
 
     def seen_in(self, tracks: FrameTracks) -> tuple[Int, Float, Float]:
-        """The known points among ``tracks``: ids (M,), p_VF (M, 3), and where they are seen, (M, 2) on the z = 1 plane."""
+        """The known points among ``tracks``: ids (M,), p_VF (M, 3), and where they are seen, (M, 2) normalised."""
         ids, known, seen = np.intersect1d(self.ids, tracks.ids, assume_unique=True, return_indices=True)
         return ids, self.p_VF[known], tracks.xy_normalised[seen]
 
