@@ -171,6 +171,15 @@ def test_the_band_is_averaged_over_the_seeds_beside_the_worst_of_them(tmp_path):
     assert column(table, "z, worst seed [% of time]") == [90.0]
 
 
+def test_metrics_have_a_column_a_figure_and_a_mean_over_the_seeds(tmp_path):
+    made = MadeUp(tmp_path / "r")
+    made.flight(labels(seed=0), metrics={"ate": {"ate_m": 1.0, "scale": 2.0}})
+    made.flight(labels(seed=1), metrics={"ate": {"ate_m": 3.0}})
+    table = named(made.load())["metrics"]
+    assert column(table, "ate.ate_m") == [2.0]
+    assert column(table, "ate.scale") == [2.0]
+
+
 def test_what_never_flew_has_no_band(tmp_path):
     made = MadeUp(tmp_path / "r")
     made.failed(labels())
@@ -214,7 +223,7 @@ def test_timing_leaves_out_flights_that_never_initialised(compared):
     stages = [k for k, each in enumerate(table.columns) if each.unit == "ms"]
     for row, whole in zip(table.rows, column(table, "all [ms a frame]"), strict=True):
         assert sum(row.entries[k].value for k in stages) == pytest.approx(whole, abs=1e-3)
-    assert table.caption.endswith("Measured on a processor (2 cores).")
+    assert "Measured on a processor (2 cores). Data (rendered)" in table.caption
 
 
 def test_trials_are_judged_by_their_nees_and_failures_counted(tmp_path):
@@ -269,4 +278,5 @@ def test_provenance_tells_machines_apart(tmp_path):
     rows = [tuple(entry.value for entry in row.entries) for row in table.rows]
     assert ("commit", "abc", 2) in rows
     assert ("numpy", "2.0", 2) in rows
+    assert ("digest of the code", "1", 2) in rows
     assert {row for row in rows if row[0] == "cpu"} == {("cpu", "a processor", 1), ("cpu", "another processor", 1)}

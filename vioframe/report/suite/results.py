@@ -62,6 +62,8 @@ class Labels:
 class TaskResult:
     """What came of a task. ``error`` is one line where ``ok`` is not so; ``result`` are its figures.
 
+    ``fingerprint`` tells the ``code``, ``config`` and ``data`` that it depends on from others.
+
     Of a flight: ``summary`` (as in ``summary.json``), ``evaluation`` and ``evaluation_loop``
     (:meth:`TrajectoryErrors.to_dict`, None where there is nothing to evaluate), ``metrics`` by name, ``stage_ms`` and
     ``real_time_factor`` (seconds of flight by seconds of computing).
@@ -73,6 +75,7 @@ class TaskResult:
     labels: Labels | None
     data: Data | None
     data_note: str
+    fingerprint: Mapping[str, str]
     ok: bool
     error: str
     attempts: int
@@ -92,6 +95,7 @@ class TaskResult:
                 None if tree["labels"] is None else Labels(**tree["labels"]),
                 None if tree["data"] is None else Data(tree["data"]),
                 tree["data_note"],
+                tree["fingerprint"],
                 tree["status"] == "ok",
                 tree["error"] or "",
                 tree["attempts"],

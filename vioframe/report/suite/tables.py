@@ -44,8 +44,11 @@ def _every(results: SuiteResults) -> Iterator[Table | None]:
         if averages := statistics.averages(groups):
             yield tables_accuracy.averaged(averages)
         if published := results.suite.get("published"):
-            yield tables_accuracy.beside_published(groups, published)
+            yield tables_accuracy.beside_published(
+                [g for g in groups if g.cell.condition == statistics.CLEAR], published
+            )
         yield tables_accuracy.band(groups)
+        yield tables_accuracy.metrics(groups)
         yield tables_cost.timing(groups)
         yield tables_about.flights_nees(groups)
     if trials := outcomes(results):

@@ -141,7 +141,7 @@ def provenance(results: SuiteResults) -> Table:
     """Machine, versions and revision; a row for each value where the tasks differ."""
     seen: dict[str, Counter[str]] = defaultdict(Counter)
     for task in results.tasks:
-        for fact, value in _facts(task.machine):
+        for fact, value in (*_facts(task.machine), ("digest of the code", task.fingerprint["code"])):
             seen[fact][value] += 1
     rows = [
         Row((text(fact), text(value), number(count, "d")))

@@ -154,6 +154,21 @@ def band(found: Sequence[Group]) -> Table | None:
     return Table("band", f"Within ±{_CM} cm", caption, columns, tuple(rows))
 
 
+def metrics(found: Sequence[Group]) -> Table | None:
+    """What the metrics that the suite asked for say, a column a figure; None where it asked for none."""
+    names = list(dict.fromkeys(name for group in found for name in group.means("metrics.")))
+    if not names:
+        return None
+    rows = []
+    for group in found:
+        means = group.means("metrics.")
+        entries = (*labels(group), text(group.seeds_text), *(number(means.get(name), ".4g") for name in names))
+        rows.append(Row(entries, links(group.flights)))
+    columns = (*LABELS, Column("seeds", text=True), *(Column(name) for name in names))
+    caption = f"Mean over the seeds of what the suite's metrics say of each flight. {data_caption(found)}"
+    return Table("metrics", "Metrics", caption, columns, tuple(rows))
+
+
 def labels(group: Group) -> tuple[Entry, ...]:
     """The entries of :data:`LABELS`."""
     cell = group.cell

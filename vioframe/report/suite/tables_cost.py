@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from vioframe.bench.detectors.quoted import TABLE_3_2
-from vioframe.report.suite.captions import run_path
+from vioframe.report.suite.captions import data_caption, run_path
 from vioframe.report.suite.flights import Flight
 from vioframe.report.suite.results import Data, TaskResult
 from vioframe.report.suite.statistics import Group, Spread
@@ -102,7 +102,8 @@ def timing(found: Sequence[Group]) -> Table | None:
         rows.append(Row(entries, tuple((flight.task.key, run_path(flight)) for flight in own)))
     caption = (
         "Mean over all flights of a contender that initialised; stages add up to the whole, without reading and "
-        f"decoding images. Real-time factor: seconds of flight by seconds of computing, the flights' own processes. {machines(found)}"
+        "decoding images. Real-time factor: seconds of flight by seconds of computing, in each flight's own process. "
+        f"{machines(found)} {data_caption(found)}"
     )
     return Table("timing", "Time a frame", caption, columns, tuple(rows))
 
