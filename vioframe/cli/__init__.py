@@ -20,7 +20,7 @@ _COMMANDS = {
     "config": "Print a complete configuration, or check a file.",
     "simulate": "Render a flight and write it as a recording with exact truth.",
     "montecarlo": "Fly many simulated flights: accuracy and consistency of back-ends.",
-    "bench": "Compare parts: detectors, or a suite of all that is to be compared.",
+    "bench": "Compare parts: detectors, or a suite of whatever you like.",
     "report": "Tables, figures and a page of what `vioframe bench SUITE` found.",
     "train": "Train what a learned part needs, such as keypointnet.",
     "convert": "Convert a recording: ASL folder, ROS 1 bag, ROS 2 bag, MCAP.",
