@@ -19,7 +19,7 @@ from vioframe.simulation.tracks import TrackOptions, TrackSimulator
 from vioframe.trajectory import evaluate
 from vioframe.types import NS_PER_S, FrameTracks, ImuSegment, Status
 
-BACKENDS = ("msckf", "sliding_window")
+BACKENDS = ("msckf", "sliding_window", "loose_ekf")
 FAILS_S, DURATION_S = 9.0, 20.0
 OTHERS = 1_000_000
 """Added to ids after a failure: what is tracked then was never seen before."""

@@ -1,0 +1,297 @@
+"""The loosely coupled back-end: its visual odometry by itself, the scale it finds, and what it does when misled."""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from msckf_helpers import after, drawn_start, pose_nees
+from threadpoolctl import threadpool_limits
+
+from vioframe import registry
+from vioframe.bench import BackendRun, run_backend
+from vioframe.geometry import so3
+from vioframe.simulation import TrackSequence, simulated_sequence
+from vioframe.testing import check_backend
+from vioframe.trajectory import Trajectory, evaluate
+from vioframe.types import NS_PER_S, Float, Status
+from vioframe_loose_ekf import vioframe_backends
+from vioframe_loose_ekf.adjustment import adjust
+from vioframe_loose_ekf.backend import LooseEkf
+from vioframe_loose_ekf.measurement import VisionPose, predicted_pose
+from vioframe_loose_ekf.odometry import Event, VisualOdometry
+from vioframe_loose_ekf.options import LooseEkfOptions
+from vioframe_loose_ekf.resection import resect
+from vioframe_loose_ekf.vision_map import Keyframe, VisionMap
+
+SIGMA = 1.0 / 458.0
+
+
+@pytest.fixture(autouse=True)
+def _one_thread():
+    with threadpool_limits(1):
+        yield
+
+
+@cache
+def flight(duration_s: float = 20.0) -> TrackSequence:
+    return simulated_sequence("figure_eight", duration_s=duration_s, seed=1)
+
+
+def camera_path(sequence: TrackSequence) -> tuple[Float, Float]:
+    """R_WC (N, 3, 3) and p_WC (N, 3) at every frame."""
+    truth, calibration = sequence.ground_truth, sequence.calibration
+    return truth.R_WB @ calibration.R_BC, truth.p_WB + truth.R_WB @ calibration.p_BC
+
+
+def scene(seed: int, points: int = 80) -> tuple[VisionMap, Float]:
+    """Six keyframes along a line, points before them, exact; and the points' positions (L, 3)."""
+    rng = np.random.default_rng(seed)
+    p_VF = rng.uniform([-2.0, -1.5, 3.0], [2.0, 1.5, 8.0], (points, 3))
+    keyframes = []
+    for k in range(6):
+        pose = VisionPose(so3.exp(0.02 * rng.normal(size=3)), np.array([0.15 * k, 0.0, 0.05 * k]))
+        q = (p_VF - pose.p_VC) @ pose.R_VC
+        keyframes.append(Keyframe(pose, np.arange(points), q[:, :2] / q[:, 2:]))
+    made = VisionMap(keyframes)
+    made.ids, made.p_VF = np.arange(points), p_VF.copy()
+    return made, p_VF
+
+
+@pytest.mark.parametrize("far", [False, True], ids=["near", "far"])
+def test_a_camera_is_placed_among_outliers(far):
+    exact, p_VF = scene(0)
+    rng = np.random.default_rng(1)
+    true, xy = exact.keyframes[3].pose, exact.keyframes[3].xy + SIGMA * rng.normal(size=(80, 2))
+    wrong = rng.permutation(80)[:24]
+    xy[wrong] += rng.choice([-1.0, 1.0], (24, 2)) * rng.uniform(10.0, 100.0, (24, 2)) * SIGMA
+    off = VisionPose(true.R_VC @ so3.exp([0.8, -0.6, 0.4]), true.p_VC + 2.0) if far else exact.keyframes[2].pose
+    found = resect(off, p_VF, xy, SIGMA)
+    assert found is not None
+    assert not found.inliers[wrong].any()
+    assert found.inliers.sum() > 50
+    error = np.concatenate([so3.log(true.R_VC.T @ found.pose.R_VC), found.pose.p_VC - true.p_VC])
+    assert error @ np.linalg.solve(found.cov, error) < 20.0
+    assert np.abs(error[3:]).max() < 0.02
+
+
+def test_points_anywhere_place_no_camera():
+    exact, p_VF = scene(0, points=20)
+    rng = np.random.default_rng(2)
+    found = resect(exact.keyframes[0].pose, p_VF, rng.uniform(-0.5, 0.5, (20, 2)), SIGMA)
+    assert found is None or found.inliers.sum() < 10
+    assert resect(exact.keyframes[0].pose, p_VF[:5], exact.keyframes[0].xy[:5], SIGMA) is None
+
+
+def test_adjustment_puts_the_free_keyframes_back_and_leaves_the_held_ones():
+    disturbed, p_VF = scene(3)
+    true = [k.pose for k in disturbed.keyframes]
+    rng = np.random.default_rng(4)
+    for k in range(2, 6):
+        pose = VisionPose(true[k].R_VC @ so3.exp(0.01 * rng.normal(size=3)), true[k].p_VC + 0.03 * rng.normal(size=3))
+        disturbed.keyframes[k] = replace(disturbed.keyframes[k], pose=pose)
+    disturbed.p_VF = p_VF + 0.05 * rng.normal(size=p_VF.shape)
+    disturbed.keyframes[4].xy[7] += 0.2  # one wrong sighting: its point goes, and nothing else
+    adjust(disturbed, SIGMA, held=2, iterations=15)
+    assert disturbed.ids.tolist() == [i for i in range(80) if i != 7]
+    np.testing.assert_allclose(disturbed.p_VF, np.delete(p_VF, 7, axis=0), atol=1e-3)
+    for k, keyframe in enumerate(disturbed.keyframes):
+        np.testing.assert_allclose(keyframe.pose.R_VC, true[k].R_VC, atol=1e-4 if k > 1 else 0.0)
+        np.testing.assert_allclose(keyframe.pose.p_VC, true[k].p_VC, atol=1e-4 if k > 1 else 0.0)
+
+
+def test_the_odometry_alone_draws_the_path_up_to_scale():
+    sequence = flight()
+    R_WC, p_WC = camera_path(sequence)
+    odometry = VisualOdometry(sequence.calibration, LooseEkfOptions())
+    odometry.restart(sequence.packets[0][1])
+    events, stamps, R_VC, p_VC = [], [], [], []
+    for k, (_, tracks) in enumerate(sequence.packets[1:], start=1):
+        sighting = odometry.track(tracks, np.eye(3))  # it does without the gyroscope
+        events.append(sighting.event)
+        if sighting.placement is not None:
+            stamps.append(k)
+            R_VC.append(sighting.placement.pose.R_VC)
+            p_VC.append(sighting.placement.pose.p_VC)
+    assert events.count(Event.BEGUN) == 1
+    assert events.count(Event.REFERENCE) == 0
+    assert len(stamps) > 380
+    t_ns = sequence.ground_truth.t_ns[stamps]
+    drawn = Trajectory(t_ns, np.array(R_VC), np.array(p_VC))
+    true = Trajectory(t_ns, R_WC[stamps], p_WC[stamps])
+    errors = evaluate(drawn, true, alignment="sim3")
+    assert errors.ate_m.rmse < 0.005 * true.path_length_m
+    assert errors.orientation_deg.rmse < 1.0
+
+
+def test_turning_on_the_spot_makes_no_map():
+    sequence = simulated_sequence("pure_rotation", duration_s=6.0)
+    R_WC, _ = camera_path(sequence)
+    odometry = VisualOdometry(sequence.calibration, LooseEkfOptions())
+    odometry.restart(sequence.packets[0][1])
+    for k in range(1, len(sequence.packets)):
+        assert odometry.track(sequence.packets[k][1], R_WC[k - 1].T @ R_WC[k]).placement is None
+
+
+@cache
+def flown() -> tuple[TrackSequence, BackendRun]:
+    return flight(), run_backend(flight(), LooseEkf(flight().calibration))
+
+
+def test_the_flight_has_its_true_length():
+    sequence, run = flown()
+    errors = evaluate(run.trajectory, sequence.ground_truth)
+    assert run.completion == 1.0
+    assert run.resets == 0
+    assert errors.scale == pytest.approx(1.0, abs=0.01)
+    assert errors.ate_m.rmse < 0.002 * errors.truth.path_length_m
+
+
+def test_landmarks_are_where_they_are():
+    sequence, run = flown()
+    depths = [e.p_WF for e in run.estimates[100:] if len(e.landmark_ids)]
+    assert len(depths) > 0.9 * len(run.estimates[100:])
+    state, estimate = run.states[-1], run.estimates[-1]
+    tracks, calibration = sequence.packets[-1][1], sequence.calibration
+    p_B = (estimate.p_WF - state.p_WB) @ state.R_WB
+    xy = calibration.camera.project((p_B - calibration.p_BC) @ calibration.R_BC)
+    seen = tracks.xy[[tracks.ids.tolist().index(i) for i in estimate.landmark_ids]]
+    assert np.median(np.linalg.norm(xy - seen, axis=1)) < 2.0
+    assert sum(e.is_keyframe for e in run.estimates) > 20
+
+
+@pytest.mark.parametrize("factor", [0.7, 1.3])
+def test_the_scale_comes_back_from_thirty_per_cent_off(factor):
+    sequence = flight()
+    backend = LooseEkf(sequence.calibration)
+    speeds = []
+    for k, (imu, tracks) in enumerate(sequence.packets):
+        estimate = backend.process(imu, tracks)
+        fusion = backend.fusion
+        if k == 200:
+            assert fusion is not None
+            here = predicted_pose(fusion.state, sequence.calibration)
+            fusion.tie_anew(here, 1e-6 * np.eye(6), 0.3)
+            right = fusion.state.log_scale
+            fusion.state = replace(fusion.state, log_scale=right + np.log(factor))
+        if k > 320:
+            speeds.append(np.linalg.norm(estimate.state.v_WB) / np.linalg.norm(sequence.true_states[k].v_WB))
+    assert abs(fusion.state.log_scale - right) < 0.05
+    assert np.median(speeds) == pytest.approx(1.0, abs=0.01)
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_the_covariance_is_of_the_size_of_the_errors(seed):
+    """Poses of one odometry hang together, which the filter does not know: the bounds are wide, and on both sides."""
+    sequence = simulated_sequence("figure_eight", duration_s=15.0, seed=seed)
+    start = drawn_start(sequence, 0, seed)
+    options = LooseEkfOptions(imu_noise_factor=1.0)
+    run = run_backend(after(sequence, 0), LooseEkf(sequence.calibration, options, initial_state=start))
+    truth = {state.t_ns: state for state in sequence.true_states}
+    orientation, position = pose_nees(run.states, truth)
+    assert 0.2 < orientation < 12.0
+    assert 0.2 < position < 12.0
+
+
+@pytest.fixture(scope="module")
+def blinded():
+    """A flight on which the camera sees nothing for six seconds."""
+    sequence = flight()
+    packets = tuple(
+        (imu, tracks.only(np.zeros(len(tracks.ids), bool)) if 160 <= k < 280 else tracks)
+        for k, (imu, tracks) in enumerate(sequence.packets)
+    )
+    renamed = tuple((i, replace(t, ids=t.ids + 1_000_000) if k >= 280 else t) for k, (i, t) in enumerate(packets))
+    return sequence, run_backend(replace(sequence, packets=renamed), LooseEkf(sequence.calibration))
+
+
+def test_it_says_that_it_is_lost_and_goes_on_from_there(blinded):
+    sequence, run = blinded
+    events = [(k, event) for k, estimate in enumerate(run.estimates) for event in estimate.events]
+    lost = [k for k, event in events if event.startswith("lost: nothing usable was seen for")]
+    begun = [k for k, event in events if event == "initialised (dynamic)"]
+    assert len(lost) == 1
+    assert 160 + 80 <= lost[0] <= 160 + 84  # max_blind_s is 4 s
+    assert run.estimates[lost[0]].status is Status.LOST
+    assert len(begun) == 2
+    assert 280 < begun[1] < 350
+    before, again = run.estimates[lost[0] - 1].state, run.estimates[begun[1]].state
+    np.testing.assert_array_equal(again.p_WB, before.p_WB)
+    last = run.stretches[-1]
+    assert evaluate(last, sequence.ground_truth).ate_m.rmse < 0.1
+
+
+def test_all_new_tracks_are_a_new_vision_frame_and_no_loss():
+    """What was seen is gone from one frame to the next: readings bridge the time to the next map."""
+    sequence = flight()
+    packets = tuple(
+        (imu, replace(tracks, ids=tracks.ids + 1_000_000) if k >= 200 else tracks)
+        for k, (imu, tracks) in enumerate(sequence.packets)
+    )
+    backend = LooseEkf(sequence.calibration)
+    run = run_backend(replace(sequence, packets=packets), backend)
+    assert run.resets == 0
+    assert evaluate(run.trajectory, sequence.ground_truth).ate_m.rmse < 0.1
+    seen = [bool(len(estimate.landmark_ids)) for estimate in run.estimates]
+    assert not any(seen[200:202])
+    assert all(seen[260:])
+
+
+def test_a_wrong_pose_here_and_there_changes_nothing(monkeypatch):
+    sequence, undisturbed = flown()
+    placed = VisualOdometry.track
+    wrong = set(range(100, 400, 10))
+    count = iter(range(len(sequence.packets)))
+
+    def sometimes_wrong(self, tracks, R_CbC):
+        sighting = placed(self, tracks, R_CbC)
+        if next(count) not in wrong or sighting.event is not Event.TRACKED:
+            return sighting
+        pose = sighting.placement.pose
+        return replace(sighting, placement=replace(sighting.placement, pose=replace(pose, p_VC=pose.p_VC + 1.0)))
+
+    monkeypatch.setattr(VisualOdometry, "track", sometimes_wrong)
+    run = run_backend(sequence, LooseEkf(sequence.calibration))
+    assert not any(event.startswith(("lost", "vision", "new")) for e in run.estimates for event in e.events)
+    apart = [np.linalg.norm(a.p_WB - b.p_WB) for a, b in zip(run.states, undisturbed.states, strict=True)]
+    assert 0.0 < max(apart) < 0.05
+
+
+def test_it_keeps_every_promise_of_a_backend():
+    check_backend(vioframe_backends()["loose_ekf"])
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"keyframes": 2},
+        {"adjusted_keyframes": 0},
+        {"adjustments": -1},
+        {"pixel_sigma": 0.0},
+        {"bootstrap_parallax_px": float("nan")},
+        {"drift_scale": -0.1},
+        {"gate_quantile": 1.0},
+    ],
+    ids=lambda wrong: next(iter(wrong)),
+)
+def test_options_that_make_no_sense_are_refused(wrong):
+    with pytest.raises(ValueError, match="needs"):
+        LooseEkfOptions(**wrong)
+
+
+def test_an_unknown_camera_rotation_and_a_known_start_exclude_each_other():
+    sequence = flight()
+    start = drawn_start(sequence, 0, 0)
+    with pytest.raises(ValueError, match="initial_state"):
+        LooseEkf(sequence.calibration, LooseEkfOptions(unknown_camera_rotation=True), initial_state=start)
+
+
+def test_it_is_found_by_name_with_its_options():
+    sequence = flight()
+    backend = registry.load().create_backend("loose_ekf", sequence.calibration, {"max_blind_s": 1.0})
+    blind = tuple(
+        (i, t.only(np.zeros(len(t.ids), bool)) if k > 100 else t) for k, (i, t) in enumerate(sequence.packets)
+    )
+    run = run_backend(replace(sequence, packets=blind[:130]), backend)
+    lost_ns = next(t for t, e in zip(run.t_ns, run.estimates, strict=False) if e.status is Status.LOST)
+    assert (lost_ns - run.t_ns[100]) / NS_PER_S == pytest.approx(1.05, abs=0.01)
