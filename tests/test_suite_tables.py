@@ -232,6 +232,10 @@ def test_trials_are_judged_by_their_nees_and_failures_counted(tmp_path):
         made.trial("msckf", seed, 1.0)
         made.trial("loose_ekf", seed, 9.0, "diverged" if seed == 0 else None)
     table = named(made.load())["nees"]
+    assert column(table, "back-end") == ["msckf", "loose_ekf"]
+    assert table.rows[0].links == tuple(
+        (f"seed {k}", f"tasks/figure_eight.clear_0.simulated_tracks.msckf.seed{k}") for k in range(6)
+    )
     assert dict(zip(column(table, "back-end"), column(table, "pose, verdict"), strict=True)) == {
         "msckf": "consistent",
         "loose_ekf": "overconfident",

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 
 from vioframe.report.suite.flights import Flight
-from vioframe.report.suite.results import Data
+from vioframe.report.suite.results import RUN_FOLDER, TASKS_FOLDER, Data, TaskResult
 from vioframe.report.suite.statistics import Group
 
 WHAT = {
@@ -48,9 +48,13 @@ def links(flights: Iterable[Flight]) -> tuple[tuple[str, str], ...]:
 
 
 def run_path(flight: Flight) -> str:
-    folder = flight.task.folder
-    tail = f"{folder.parent.name}/{folder.name}"
-    return f"{tail}/run" if (folder / "run").is_dir() else tail
+    """The run folder of a flight, relative to the results; that of its task where it never began."""
+    path = task_path(flight.task)
+    return f"{path}/{RUN_FOLDER}" if (flight.task.folder / RUN_FOLDER).is_dir() else path
+
+
+def task_path(task: TaskResult) -> str:
+    return f"{TASKS_FOLDER}/{task.folder.name}"
 
 
 def condition_text(condition: str, level: float) -> str:

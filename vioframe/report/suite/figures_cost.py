@@ -45,8 +45,8 @@ def detector_speed(task: TaskResult) -> Figure:
         _label(panels[1], end, k, f"{value:.3g}  ({row['measured']['on']})")
     for place in range(len(rows), len(rows) + len(unmeasured)):
         _label(panels[1], 0.0, place, "not measured here")
-    # A variant of a detector is not what was quoted of it.
-    quoted = {place: TABLE_3_2[name] for place, name in enumerate([*names, *unmeasured]) if name in TABLE_3_2}
+    quoted = {place: TABLE_3_2[name] for place, name in enumerate(unmeasured, start=len(rows))}
+    quoted |= {k: TABLE_3_2[row["detector"].partition(":")[0]] for k, row in enumerate(rows) if row["quoted"]}
     panels[0].barh(list(quoted), [each.fps for each in quoted.values()], color=_QUOTED, height=0.62)
     for place, each in quoted.items():
         _label(panels[0], each.fps, place, f"{each.fps:g}{'*' if 'another paper' in each.source else ''}")

@@ -244,7 +244,7 @@ def _suite_order(suite: Mapping[str, Any], cells: Sequence[Cell]) -> Callable[[G
     """A sorting key: as the suite lists things, and what it does not list after that, in alphabetical order."""
 
     def places(key: str, own: Iterable[str]) -> dict[str, int]:
-        listed = [_name(each) for each in suite.get(key) or []]
+        listed = listed_names(suite, key)
         return {name: place for place, name in enumerate(dict.fromkeys([*listed, *sorted(own)]))}
 
     data = list(Data)
@@ -268,9 +268,10 @@ def _suite_order(suite: Mapping[str, Any], cells: Sequence[Cell]) -> Callable[[G
     return key
 
 
-def _name(entry: object) -> str:
-    """What the labels call an entry of the suite's lists."""
-    return str(entry.get("label") or entry["name"]) if isinstance(entry, Mapping) else str(entry)
+def listed_names(suite: Mapping[str, Any], key: str) -> list[str]:
+    """What the labels call the entries of one of the suite's lists."""
+    entries = suite.get(key) or ()
+    return [str(each.get("label") or each["name"]) if isinstance(each, Mapping) else str(each) for each in entries]
 
 
 def _by(found: Iterable[Group], key: Callable[[Group], _Key]) -> list[tuple[_Key, list[Group]]]:

@@ -8,7 +8,7 @@ from pathlib import Path
 from vioframe.report.suite import statistics, stress, tables_about, tables_accuracy, tables_cost, tables_stress
 from vioframe.report.suite.results import Kind, SuiteResults
 from vioframe.report.suite.table import Table
-from vioframe.report.suite.trials import outcomes
+from vioframe.report.suite.trials import campaigns
 
 __all__ = ["Table", "tables", "write_tables"]
 
@@ -51,7 +51,7 @@ def _every(results: SuiteResults) -> Iterator[Table | None]:
         yield tables_accuracy.metrics(groups)
         yield tables_cost.timing(groups)
         yield tables_about.flights_nees(groups)
-    if trials := outcomes(results):
+    if trials := campaigns(results):
         yield tables_about.trials_nees(trials)
     yield tables_about.failures(flights, [task for task in results.tasks if task.kind is not Kind.FLIGHT])
     yield tables_about.evo_commands(flights)

@@ -9,13 +9,13 @@ from shlex import quote
 from typing import Any
 
 from vioframe.bench.consistency import PARTS
-from vioframe.bench.consistency import Outcome as Trials
-from vioframe.report.suite.captions import data_caption, links, run_path
+from vioframe.report.suite.captions import data_caption, links, run_path, task_path
 from vioframe.report.suite.flights import Flight
 from vioframe.report.suite.results import MATCHED_TRUTH, SuiteResults, TaskResult
 from vioframe.report.suite.statistics import Group
 from vioframe.report.suite.table import Column, Row, Table, number, text
 from vioframe.report.suite.tables_accuracy import LABELS, labels
+from vioframe.report.suite.trials import Campaign
 
 _FACTS = ("vioframe", "commit", "python", "platform", "cpu", "cpu_count", "memory_gib", "threads")
 
@@ -37,7 +37,7 @@ def flights_nees(found: Sequence[Group]) -> Table | None:
     return Table("nees_flights", "Consistency (NEES) of the flights", caption, columns, tuple(rows)) if rows else None
 
 
-def trials_nees(found: Sequence[Trials]) -> Table:
+def trials_nees(found: Sequence[Campaign]) -> Table:
     """The same of simulated trials, with the bounds within which an honest filter's mean lies, and failures."""
     columns = (
         Column("flight", text=True),
@@ -60,7 +60,8 @@ def trials_nees(found: Sequence[Trials]) -> Table:
         Column("resets, all trials"),
     )
     rows = []
-    for outcome in found:
+    for campaign in found:
+        outcome = campaign.outcome
         failures = [f"{count} {kind}" for kind, count in outcome.failures.items() if count]
         entries = [
             text(outcome.flight),
@@ -85,7 +86,7 @@ def trials_nees(found: Sequence[Trials]) -> Table:
             number(None if completion is None else 100.0 * completion, ".1f"),
             number(outcome.total("resets"), "d"),
         ]
-        rows.append(Row(tuple(entries)))
+        rows.append(Row(tuple(entries), campaign.links))
     caption = (
         "Simulated tracks and IMU with EuRoC's noise, true calibration, the back-end's own initialisation. NEES: mean "
         "over time, then over the trials, beside the 95 % bounds for the mean of that many independent samples. Trials "
@@ -103,7 +104,7 @@ def failures(found: Iterable[Flight], others: Iterable[TaskResult]) -> Table | N
         Column("attempts"),
     )
     troubled = [(each.task, each.outcome.value, each.reason, run_path(each)) for each in found if each.reason]
-    troubled += [(task, "failed", task.error, f"tasks/{task.folder.name}") for task in others if not task.ok]
+    troubled += [(task, "failed", task.error, task_path(task)) for task in others if not task.ok]
     rows = [
         Row((text(task.key), text(outcome), text(reason), number(task.attempts, "d")), (("folder", path),))
         for task, outcome, reason, path in troubled

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from vioframe.bench.detectors.quoted import TABLE_3_2
-from vioframe.report.suite.captions import data_caption, run_path
+from vioframe.report.suite.captions import data_caption, run_path, task_path
 from vioframe.report.suite.flights import Flight
 from vioframe.report.suite.results import Data, TaskResult
 from vioframe.report.suite.statistics import Group, Spread
@@ -29,7 +29,7 @@ def detector_speed(task: TaskResult) -> Table:
         Column("on", text=True),
     )
     rows = []
-    link = (("task", f"{task.folder.parent.name}/{task.folder.name}"),)
+    link = (("task", task_path(task)),)
     for row in task.result["rows"]:
         measured, quoted = row["measured"], row.get("quoted") or {}
         low, high = measured["fps_quartiles"]
