@@ -106,7 +106,7 @@ def paths(found: Sequence[Course], look: Look) -> Plot:
         "Trajectories",
         {course.label: _paths(course, look) for course in found},
         f"Each estimate is aligned with the ground truth by {_how(found)} over the whole flight, "
-        "never scaled. Drag to turn, scroll with a pinch or the buttons of the toolbar to zoom.",
+        "never scaled. Drag to turn; the toolbar has zoom and pan.",
         height=560,
         narrow_height=400,
         views=True,
@@ -178,7 +178,9 @@ def _errors(
 ) -> Case:
     import plotly.graph_objects as go
 
-    layout: dict[str, Any] = panels([f"{name} [{unit}]" for name in names], _TIME)
+    # The band's edges are in sight, however small the errors are.
+    least: dict[str, Any] = {} if band is None else {"autorangeoptions": {"include": [-1.2 * band, 1.2 * band]}}
+    layout: dict[str, Any] = panels([f"{name} [{unit}]" for name in names], _TIME, **least)
     if band is not None:
         layout["shapes"] = [_band(k, band) for k in range(len(names))]
     traces = []

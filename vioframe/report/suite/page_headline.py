@@ -166,5 +166,6 @@ def _sentence(text: str) -> str:
 
 
 def _plain(backend: str) -> str:
-    name = backend.replace("_", " ")
-    return {"msckf": "MSCKF", "sliding window": "the sliding window"}.get(name, name)
+    """As one would say it: "the sliding window and loops" of ``sliding_window+loops``."""
+    words = backend.replace("_", " ").replace("+", " and ")
+    return words.replace("sliding window", "the sliding window").replace("msckf", "MSCKF")

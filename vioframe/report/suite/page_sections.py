@@ -44,7 +44,7 @@ def sections(results: SuiteResults, look: Look, to_results: str) -> list[Section
             "accuracy",
             "Accuracy",
             "Every figure is a mean over the seeds; the last column leads to the runs behind it.",
-            [table.pop(name, None) for name in ("averages", "accuracy", "published")],
+            [table.pop(name, None) for name in ("averages", "accuracy", "published", "metrics")],
         ),
         _section(
             "trajectories",

@@ -6,11 +6,11 @@
   const DARK = JSON.parse(document.getElementById("colours").textContent);
   const dark = matchMedia("(prefers-color-scheme: dark)");
   const VIEWS = {
-    perspective: { eye: { x: -1.05, y: -1.3, z: 0.8 }, center: { x: 0, y: 0, z: -0.06 }, up: { x: 0, y: 0, z: 1 }, projection: { type: "perspective" } },
-    top: { eye: { x: 0, y: 0, z: 1.7 }, up: { x: 0, y: 1, z: 0 }, projection: { type: "orthographic" } },
-    side: { eye: { x: 0, y: -1.7, z: 0 }, up: { x: 0, y: 0, z: 1 }, projection: { type: "orthographic" } },
+    perspective: { eye: { x: -1.26, y: -1.53, z: 0.94 }, center: { x: 0, y: 0, z: -0.17 }, up: { x: 0, y: 0, z: 1 }, projection: { type: "perspective" } },
+    top: { eye: { x: 0, y: 0, z: 1.9 }, up: { x: 0, y: 1, z: 0 }, projection: { type: "orthographic" } },
+    side: { eye: { x: 0, y: -1.3, z: 0 }, up: { x: 0, y: 0, z: 1 }, projection: { type: "orthographic" } },
   };
-  const CONFIG = { responsive: true, displaylogo: false, plotlyServerURL: "" };
+  const CONFIG = { responsive: true, displaylogo: false, scrollZoom: false, plotlyServerURL: "" };
   // From so many times as far away, as a narrow picture needs.
   const seenFrom = (view, times) => {
     const { eye, ...camera } = VIEWS[view];
@@ -55,7 +55,7 @@
       gridcolor: grid, zerolinecolor: rule, zerolinewidth: 1, linecolor: muted, tickcolor: grid, ticks: "outside", ticklen: 4,
       automargin: true, title: { font: { size: 13, color: muted }, standoff: 10 }, tickfont: { size: 12, color: muted },
     };
-    const axis3d = { ...axis, showbackground: false, showspikes: false, automargin: undefined, ticks: "" };
+    const axis3d = { ...axis, showbackground: false, showspikes: false, automargin: undefined, ticks: "", tickangle: 0 };
     return {
       layout: {
         font: { family: token("--text"), size: 13, color: ink }, paper_bgcolor: "rgba(0,0,0,0)", plot_bgcolor: "rgba(0,0,0,0)",
@@ -143,6 +143,8 @@
       const shown = { ...layout, template: theme(), autosize: true };
       if (shown.shapes) shown.shapes = shown.shapes.map(shaded);
       const narrow = canvas.clientWidth < 560;
+      const hiddenAxis = { top: "zaxis", side: "yaxis" }[view];
+      if (hiddenAxis) shown.scene = { ...shown.scene, [hiddenAxis]: { visible: false } };
       if (plot.views) shown.scene = { ...shown.scene, camera: seenFrom(view, narrow ? 1.9 : 1), uirevision: `${select?.selectedIndex} ${view}`, dragmode: view === "perspective" ? "turntable" : "pan" };
       canvas.style.height = `${(narrow && plot.narrow_height) || plot.height}px`;
       return Plotly.react(canvas, traces, shown, { ...CONFIG, modeBarButtons: plot.views ? BUTTONS_3D : BUTTONS, displayModeBar: !narrow && !printing });
