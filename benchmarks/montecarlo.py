@@ -36,7 +36,9 @@ def main(
     against: str,
 ) -> None:
     """Error against covariance over many simulated flights."""
-    contenders = parse_contenders([backend, f"{backend}:{against}"], assignments, registry.load())
+    # The simulated IMU is as noisy as its data sheet says, and no more.
+    told = ["imu_noise_factor=1", *assignments]
+    contenders = parse_contenders([backend, f"{backend}:{against}"], told, registry.load())
     setups = [Setup(flight, duration) for flight in flights]
     outcomes = run_montecarlo(setups, contenders, seeds, workers=usable_cores())
     Console(width=200).print(to_rich(outcomes))

@@ -8,7 +8,7 @@ moves IMU stamps there (``t_imu = t_cam + time_offset``), so that nothing downst
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -234,6 +234,10 @@ class ImuNoise:
     accel_walk: float
     """Diffusion of the accelerometer's bias, m/s^3/sqrt(Hz)."""
     rate_hz: float = 200.0
+
+    def in_flight(self, factor: float) -> ImuNoise:
+        """With ``factor`` times the white noise: in flight, vibration adds to the sensor's own."""
+        return replace(self, gyro_density=factor * self.gyro_density, accel_density=factor * self.accel_density)
 
 
 @dataclass(frozen=True, slots=True)

@@ -31,11 +31,12 @@ class Msckf:
     def __init__(
         self, calibration: Calibration, options: MsckfOptions | None = None, initial_state: NavState | None = None
     ) -> None:
-        self._calibration = calibration
         self._options = options or MsckfOptions()
         if self._options.unknown_camera_rotation and initial_state is not None:
             raise ValueError("unknown_camera_rotation is found while initialising; leave out initial_state")
         self._starter = Starter(calibration, unknown_camera_rotation=self._options.unknown_camera_rotation)
+        self._noise_at_rest = calibration.imu
+        self._noise = calibration.imu.in_flight(self._options.imu_noise_factor)
         dof = np.arange(1, 2 * self._options.max_clones + 3)
         self._gate = np.concatenate([[0.0], chi2.ppf(self._options.gate_quantile, dof)])
         self._state: FilterState | None = None
@@ -73,7 +74,7 @@ class Msckf:
             return Estimate(Status.TRACKING, state.nav_state(tracks.t_ns), stage_seconds=watch.seconds)
         watch.lap("standstill")
 
-        state.propagate(imu, noise_over(imu, self._calibration.imu), options.first_estimate_jacobians)
+        state.propagate(imu, noise_over(imu, self._noise), options.first_estimate_jacobians)
         state.augment_clone(imu.gyro_B[-1] - state.bias_gyro_B)
         observations.add_frame(tracks.only(~np.isin(tracks.ids, state.landmark_ids)))
         watch.lap("propagate")
@@ -108,7 +109,7 @@ class Msckf:
         options = self._options
         if not (options.zero_velocity_update and self._standstill.sees_standstill(tracks)):
             return False
-        return hold_still(state, imu, self._calibration.imu, options.first_estimate_jacobians)
+        return hold_still(state, imu, self._noise_at_rest, options.first_estimate_jacobians)
 
     def _initialise(self, imu: ImuSegment, tracks: FrameTracks) -> Estimate:
         self._standstill.sees_standstill(tracks)

@@ -44,10 +44,7 @@ class SlidingWindow:
         if self._options.unknown_camera_rotation and initial_state is not None:
             raise ValueError("unknown_camera_rotation is found while initialising; leave out initial_state")
         self._starter = Starter(calibration, unknown_camera_rotation=self._options.unknown_camera_rotation)
-        noise, factor = calibration.imu, self._options.imu_noise_factor
-        self._noise = replace(
-            noise, gyro_density=factor * noise.gyro_density, accel_density=factor * noise.accel_density
-        )
+        self._noise = calibration.imu.in_flight(self._options.imu_noise_factor)
         self._standstill = StandstillDetector(self._options.standstill_disparity_px)
         self._window: Window | None = None
         self._before: FrameTracks | None = None

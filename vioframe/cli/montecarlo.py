@@ -22,7 +22,7 @@ _WIDE = 1000
     "backends",
     metavar="NAME[:KEY=VALUE,...]",
     multiple=True,
-    default=("msckf",),
+    default=("msckf:imu_noise_factor=1",),
     show_default=True,
     help="Estimator, with options of its own; repeat to compare.",
 )
