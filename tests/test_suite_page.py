@@ -4,6 +4,7 @@ import json
 import re
 import shutil
 import sys
+from base64 import b64decode
 from collections.abc import Iterator
 from html.parser import HTMLParser
 from pathlib import Path
@@ -234,6 +235,8 @@ def browser() -> Iterator[Any]:
     options.add_argument("--enable-unsafe-swiftshader")
     options.set_capability("goog:loggingPrefs", {"browser": "ALL", "performance": "ALL"})
     opened = webdriver.Chrome(options, webdriver.ChromeService(driver))
+    # Software that draws WebGL takes its time on a busy machine.
+    opened.set_script_timeout(120)
     yield opened
     opened.quit()
 
@@ -301,9 +304,12 @@ def test_paths_are_drawn_in_3d_and_hidden_with_the_legend(browser: Any, page: Pa
 
     def coloured() -> int:
         """Pixels of the picture that are not grey: lines of estimates, not of the truth or the axes."""
-        settle(browser)
-        png = browser.find_element("css selector", "#paths .canvas").screenshot_as_png
-        image = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR).astype(int)
+        size = "{width: 400, height: 300}"
+        url = browser.execute_async_script(
+            f"Plotly.toImage(document.querySelector('#paths .canvas'), {size}).then(arguments[0])"
+        )
+        png = np.frombuffer(b64decode(url.partition(",")[2]), np.uint8)
+        image = cv2.imdecode(png, cv2.IMREAD_COLOR).astype(int)
         return int((image.max(axis=2) - image.min(axis=2) > 80).sum())
 
     assert browser.find_elements("css selector", "#paths .gl-container canvas")

@@ -14,7 +14,8 @@ class Picture:
     """Plotly's traces and layout.
 
     A trace's ``meta`` says whose it is: ``series``, its entry in the legend, and ``detector`` and ``backend``, by which
-    the page's filters hide it; or ``owners``, one of those a point, where the points of a trace have several.
+    the page's filters hide it; or ``owners``, one of those a point, where the points of a trace have several. Its
+    ``x_back`` is how many traces before it the one is that has its x, which is then not stored again.
     """
 
     data: Sequence[Mapping[str, Any]]

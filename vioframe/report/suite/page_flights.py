@@ -190,12 +190,12 @@ def _errors(
         for k in range(len(names)):
             traces.append(
                 go.Scatter(
-                    x=time_s,
+                    x=None if k else time_s,
                     y=values[:, k],
                     mode="lines",
                     line=look.line(*cell.contender),
                     hovertemplate=f"%{{y:.3f}} {unit} at %{{x:.1f}} s<extra>{look.name(*cell.contender)}</extra>",
-                    meta=look.meta(*cell.contender),
+                    meta={**look.meta(*cell.contender), "x_back": k},
                     **axes(k),
                 )
             )

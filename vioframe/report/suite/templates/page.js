@@ -1,6 +1,7 @@
 "use strict";
 // Plots, filters and tables of the page. A trace's `meta` says whose it is: `series` is its entry in the legend,
-// `detector` and `backend` what the filters know it by; `owners` says so for each of its points instead.
+// `detector` and `backend` what the filters know it by; `owners` says so for each of its points instead, and `x_back` how
+// many traces before it the one is that has its x.
 (() => {
   const plots = JSON.parse(document.getElementById("plots").textContent);
   const DARK = JSON.parse(document.getElementById("colours").textContent);
@@ -139,7 +140,7 @@
     }
 
     function drawPicture({ data, layout }, canvas) {
-      const traces = data.map((trace) => ({ ...shaded(onlyPassing(trace)), visible: passes(trace.meta) && !hidden.has(trace.meta.series) }));
+      const traces = data.map((trace, i) => ({ ...shaded(onlyPassing(trace)), x: onlyPassing(data[i - (trace.meta.x_back || 0)]).x, visible: passes(trace.meta) && !hidden.has(trace.meta.series) }));
       const shown = { ...layout, template: theme(), autosize: true };
       if (shown.shapes) shown.shapes = shown.shapes.map(shaded);
       const narrow = canvas.clientWidth < 560;
