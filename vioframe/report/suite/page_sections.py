@@ -100,7 +100,8 @@ def sections(results: SuiteResults, look: Look, to_results: str) -> list[Section
 def look_of(results: SuiteResults) -> Look:
     """Contenders in the order of the suite."""
     flown = [group.cell.contender for group in groups(results)]
-    tried = [(task.labels.detector, task.labels.backend) for task in results.of(Kind.TRIAL) if task.labels]
+    tracks = {task.labels.detector for task in results.of(Kind.TRIAL) if task.labels}
+    tried = [(detector, outcome.backend) for detector in sorted(tracks) for outcome in outcomes(results)]
     detectors, backends = zip(*(flown or tried), strict=True) if flown or tried else ((), ())
     return Look(tuple(dict.fromkeys(detectors)), tuple(dict.fromkeys(backends)))
 

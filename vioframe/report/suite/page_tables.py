@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 from vioframe.report.suite.captions import condition_text
 from vioframe.report.suite.flights import Flight
 from vioframe.report.suite.page_blocks import Cell, Command, Commands, Line, TableBlock
-from vioframe.report.suite.results import Kind, SuiteResults, TaskResult
+from vioframe.report.suite.results import SuiteResults, TaskResult
 from vioframe.report.suite.table import Row, Table
 from vioframe.report.suite.tables_about import evo_command
 
@@ -23,7 +23,7 @@ def blocks(every: Iterable[Table], results: SuiteResults, to_results: str) -> di
         for task in results.tasks
         if task.labels
     }
-    return {table.name: _block(table, tasks, contenders, results, to_results) for table in every}
+    return {table.name: _block(table, tasks, contenders, to_results) for table in every}
 
 
 def commands(flights: Iterable[Flight]) -> Commands:
@@ -45,7 +45,6 @@ def _block(
     table: Table,
     tasks: Mapping[str, TaskResult],
     contenders: Mapping[str, tuple[str, str]],
-    results: SuiteResults,
     to_results: str,
 ) -> TableBlock:
     titles = [column.title for column in table.columns]
@@ -54,8 +53,7 @@ def _block(
     for row in table.rows:
         cells = [Cell(entry.shown, _number(entry.value)) for entry in row.entries]
         detector, backend = _owner(dict(zip(titles, (cell.shown for cell in cells), strict=True)), tasks, contenders)
-        links = row.links or tuple(_trials(table, row, results))
-        runs = [(label, f"{to_results}/{path}/") for label, path in links]
+        runs = [(label, f"{to_results}/{path}/") for label, path in row.links]
         lines.append(Line([cells[k] for k in shown], runs, detector, backend, table.name == "failures"))
     return TableBlock(table, shown, lines)
 
@@ -77,14 +75,3 @@ def _owner(
     if texts.get("system") in contenders:
         return contenders[texts["system"]]
     return texts.get("detector"), texts.get("back-end")
-
-
-def _trials(table: Table, row: Row, results: SuiteResults) -> Iterator[tuple[str, str]]:
-    """The tasks behind a row of the Monte Carlo, which knows its trials by flight and back-end alone."""
-    if table.name != "nees":
-        return
-    flight, backend = (entry.shown for entry in row.entries[:2])
-    for task in results.of(Kind.TRIAL):
-        labels = task.labels
-        if labels and (labels.sequence, labels.backend) == (flight.partition(",")[0], backend):
-            yield f"seed {labels.seed}", f"{task.folder.parent.name}/{task.folder.name}"
