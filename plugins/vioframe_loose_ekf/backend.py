@@ -47,6 +47,7 @@ class LooseEkf:
         self._noise = replace(
             noise, gyro_density=factor * noise.gyro_density, accel_density=factor * noise.accel_density
         )
+        self._noise_at_rest = noise
         self._drifts = Drifts(self._options, calibration.camera.focal_px)
         self._gate = float(chi2.ppf(self._options.gate_quantile, 6))
         self._standstill = StandstillDetector(self._options.standstill_disparity_px)
@@ -82,7 +83,7 @@ class LooseEkf:
         sighting = self._odometry.track(tracks, self._turn(fusion, imu))
         watch.lap("odometry")
         still = self._standstill.sees_standstill(tracks) and self._options.zero_velocity_update
-        if still and fusion.hold_still(imu, self._noise):
+        if still and fusion.hold_still(imu, self._noise_at_rest):
             self._seeing_ns = self._fitting_ns = tracks.t_ns
             if self._odometry.map is None or sighting.event is Event.BEGUN:
                 # There is no parallax to wait for: the way to the next frame that moves begins here.

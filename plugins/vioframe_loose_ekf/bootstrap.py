@@ -20,8 +20,9 @@ from vioframe_loose_ekf.measurement import VisionPose
 from vioframe_loose_ekf.resection import resect
 from vioframe_loose_ekf.vision_map import Keyframe, VisionMap
 
-# Tracks that the reference and the newest frame must share, and points that must come of them.
-_MIN_COMMON, _MIN_POINTS = 40, 30
+# Tracks that the reference and the newest frame must share, and what part of the reference's; points that must come of
+# them.
+_MIN_COMMON, _LEAST_COMMON, _MIN_POINTS = 15, 0.3, 12
 # Part of the tracks that must have become points, and of these that every frame must agree with.
 _LEAST_EXPLAINED, _LEAST_INLIERS = 0.5, 0.7
 _LARGEST_TURN_ERROR_RAD = 0.05
@@ -46,7 +47,7 @@ class Bootstrap:
 
     def add(self, tracks: FrameTracks, R_CbC: Float) -> bool:
         """Take in a frame, turned by ``R_CbC`` (3, 3) from the one before; False where it has become the reference."""
-        if self._frames and len(np.intersect1d(self._frames[0].ids, tracks.ids, assume_unique=True)) >= _MIN_COMMON:
+        if self._frames and _enough_in_common(self._frames[0], tracks):
             self._frames.append(tracks)
             self._R_RC.append(self._R_RC[-1] @ R_CbC)
             return True
@@ -58,7 +59,7 @@ class Bootstrap:
         reference, newest = self._frames[0], self._frames[-1]
         _, i, j = np.intersect1d(reference.ids, newest.ids, assume_unique=True, return_indices=True)
         xy_1, xy_2 = reference.xy_normalised[i], newest.xy_normalised[j]
-        if len(i) < _MIN_COMMON or median_parallax(xy_1, xy_2, self._R_RC[-1]) < self._parallax:
+        if median_parallax(xy_1, xy_2, self._R_RC[-1]) < self._parallax:
             return None
         pose = relative_pose(xy_1, xy_2, self._sigma, MEDIAN_DEPTH * self._parallax)
         if pose is None or np.linalg.norm(so3.log(pose.R_VC.T @ self._R_RC[-1])) > _LARGEST_TURN_ERROR_RAD:
@@ -90,6 +91,11 @@ class Bootstrap:
             filled.append(Keyframe.of(found.pose, self._frames[k]))
         scene.keyframes = [*filled, scene.keyframes[-1]]
         return True
+
+
+def _enough_in_common(reference: FrameTracks, tracks: FrameTracks) -> bool:
+    common = np.isin(reference.ids, tracks.ids).sum()
+    return bool(common >= max(_MIN_COMMON, _LEAST_COMMON * len(reference.ids)))
 
 
 def median_parallax(xy_1: Float, xy_2: Float, R_C1C2: Float) -> float:
