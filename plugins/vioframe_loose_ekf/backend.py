@@ -6,8 +6,6 @@ a frame. After Weiss et al. (ICRA 2012) and Lynen et al. (IROS 2013); what diffe
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 from scipy.stats import chi2
 
@@ -43,11 +41,8 @@ class LooseEkf:
         if self._options.unknown_camera_rotation and initial_state is not None:
             raise ValueError("unknown_camera_rotation is found while initialising; leave out initial_state")
         self._starter = Starter(calibration, unknown_camera_rotation=self._options.unknown_camera_rotation)
-        noise, factor = calibration.imu, self._options.imu_noise_factor
-        self._noise = replace(
-            noise, gyro_density=factor * noise.gyro_density, accel_density=factor * noise.accel_density
-        )
-        self._noise_at_rest = noise
+        self._noise_at_rest = calibration.imu
+        self._noise = calibration.imu.in_flight(self._options.imu_noise_factor)
         self._drifts = Drifts(self._options, calibration.camera.focal_px)
         self._gate = float(chi2.ppf(self._options.gate_quantile, 6))
         self._standstill = StandstillDetector(self._options.standstill_disparity_px)
