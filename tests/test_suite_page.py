@@ -183,8 +183,8 @@ def test_headline_of_one_flight_is_the_time_inside_the_band(tmp_path: Path) -> N
     assert inside["y"] < 60.0  # The bias shows, so that the two figures cannot be mixed up.
     said = headline(results)
     assert said.answer == (
-        f"KeypointNet with the sliding window: y inside ±20 cm for {inside['y']:.0f} % of the flight, "
-        f"altitude for {inside['z']:.0f} %."
+        f"KeypointNet with the sliding window: y inside ±20 cm for {inside['y']:.0f} % of the estimated "
+        f"time, altitude for {inside['z']:.0f} %."
     )
     assert "the lowest here is that of Shi-Tomasi with MSCKF" in said.more[0]
 
@@ -201,6 +201,26 @@ def test_headline_of_hard_conditions_is_who_succeeds(tmp_path: Path) -> None:
         r"Flights that succeed under hard conditions: KeypointNet \d+ %, Shi-Tomasi \d+ %\.", said.answer
     )
     assert said.more[0].startswith("KeypointNet with MSCKF against Shi-Tomasi, flight by flight: ")
+
+
+def test_headline_compares_nobody_across_recordings(tmp_path: Path) -> None:
+    made = MadeUp(tmp_path / "results")
+    made.flight(labels("a", detector="keypointnet", backend="sliding_window"), data=Data.REAL, sigma_m=0.2)
+    made.flight(labels("a", detector="orb", backend="msckf"), data=Data.REAL, sigma_m=0.001, completion=0.2)
+    made.flight(labels("b", detector="fast", backend="msckf"), data=Data.SIMULATED, sigma_m=0.001)
+    said = headline(made.load())
+    assert said.answer.startswith("KeypointNet with the sliding window on a (real): y inside")
+    assert "fast" not in said.more[0]
+    assert "ORB" not in said.more[0]
+
+
+def test_headline_never_mixes_kinds_of_data(tmp_path: Path) -> None:
+    made = MadeUp(tmp_path / "results")
+    made.flight(labels("a", "fog", 1.0), data=Data.RENDERED, sigma_m=0.001)
+    made.failed(labels("b", "fog", 1.0), data=Data.SIMULATED)
+    said = headline(made.load())
+    assert said.answer == "Flights that succeed under hard conditions (rendered): Shi-Tomasi 100 %."
+    assert said.more == ["Flights that succeed under hard conditions (simulated): Shi-Tomasi 0 %."]
 
 
 def test_headline_of_speed_and_trials(tried: Path) -> None:

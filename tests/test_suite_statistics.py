@@ -215,7 +215,7 @@ def test_duels_pair_flights_and_a_failure_loses(stressed):
 
     results = stressed
     found = groups(results)
-    assert baseline_of(results.suite, found) == "shi_tomasi"
+    assert baseline_of(found) == "shi_tomasi"
     rows = duels(found, "shi_tomasi")
     assert [(r.condition, r.level, r.won, r.lost, r.tied, r.both) for r in rows] == [
         ("clear", 0.0, 2, 0, 0, 2),
@@ -242,7 +242,7 @@ def test_a_lone_detector_has_no_baseline(tmp_path):
     made = MadeUp(tmp_path / "r")
     made.flight(labels())
     results = made.load()
-    assert baseline_of(results.suite, groups(results)) is None
+    assert baseline_of(groups(results)) is None
 
 
 def test_how_many_tasks_a_finished_sweep_has(compared, stressed):

@@ -14,6 +14,7 @@ from vioframe.report.suite.results import Data, SuiteResults
 from vioframe.report.suite.statistics import groups
 from vioframe.report.suite.table import Column, Row, Table, number, text
 from vioframe.report.suite.tables import tables, write_tables
+from vioframe.trajectory import evaluate
 
 AWKWARD = Table(
     "awkward",
@@ -145,13 +146,17 @@ def test_published_rows_keep_their_alignment_and_stand_apart(tmp_path):
     results = made.load()
     table = named(results)["published"]
     assert [each.heading for each in table.columns][3:] == ["MH_05_difficult (rendered) [m]", "V1_01_easy [m]"]
-    assert column(table, "system") == ["VINS-Mono", "OpenVINS", "shi_tomasi + msckf", "shi_tomasi + msckf"]
-    assert column(table, "alignment") == ["Sim(3)", "SE(3)", "position + yaw", "SE(3)"]
+    assert column(table, "system") == ["VINS-Mono", "OpenVINS", *["shi_tomasi + msckf"] * 3]
+    assert column(table, "alignment") == ["Sim(3)", "SE(3)", "position + yaw", "SE(3)", "Sim(3)"]
     assert column(table, "source")[0] == "published: a paper"
     (group,) = groups(results)
-    assert column(table, "MH_05_difficult (rendered) [m]") == [0.35, None, group.mean("ate_m"), group.mean("ate_se3_m")]
+    run = group.flights[0].task.run
+    by_sim3 = evaluate(run.trajectory(), run.ground_truth(), alignment="sim3").ate_m.rmse
+    measured = [group.mean("ate_m"), group.mean("ate_se3_m"), pytest.approx(by_sim3, rel=1e-9)]
+    assert column(table, "MH_05_difficult (rendered) [m]") == [0.35, None, *measured]
+    assert by_sim3 < group.mean("ate_se3_m")
     assert table.rows[2].entries[3].shown.endswith("(1 of 2)")
-    assert column(table, "V1_01_easy [m]") == [0.07, 0.06, None, None]
+    assert column(table, "V1_01_easy [m]") == [0.07, 0.06, None, None, None]
 
 
 def test_where_every_seed_failed_the_published_table_says_so(tmp_path):
@@ -178,6 +183,35 @@ def test_metrics_have_a_column_a_figure_and_a_mean_over_the_seeds(tmp_path):
     table = named(made.load())["metrics"]
     assert column(table, "ate.ate_m") == [2.0]
     assert column(table, "ate.scale") == [2.0]
+
+
+def test_a_mean_is_shown_with_its_spread(compared):
+    table = named(compared)["accuracy"]
+    shown = {c.heading: e.shown for c, e in zip(table.columns, table.rows[0].entries, strict=True)}
+    spread = groups(compared)[0].spread("orientation_deg")
+    assert shown["orientation [deg]"] == f"{spread.mean:.2f} ± {spread.std:.2f}"
+    lone = {c.heading: e.shown for c, e in zip(table.columns, table.rows[1].entries, strict=True)}
+    assert "±" not in lone["orientation [deg]"]
+
+
+def test_an_average_leads_to_the_runs_behind_it(tmp_path):
+    made = MadeUp(tmp_path / "r", sequences=["a", "b", "c"])
+    for sequence in "ab":
+        made.flight(labels(sequence))
+    made.failed(labels("c"))
+    (row,) = named(made.load())["averages"].rows
+    assert row.links == tuple((f"{s}, seed 0", f"tasks/{s}.clear_0.shi_tomasi.msckf.seed0/run") for s in "ab")
+
+
+def test_what_could_not_be_evaluated_is_told_with_the_reason(tmp_path):
+    made = MadeUp(tmp_path / "r")
+    run = made.flight(labels())
+    tree = json.loads((run.parent / "task.json").read_text())
+    tree["result"] |= {"evaluation": None, "not_evaluated": "2 poses are too few to align"}
+    (run.parent / "task.json").write_text(json.dumps(tree))
+    table = named(made.load())["failures"]
+    assert column(table, "outcome") == ["not evaluated"]
+    assert column(table, "reason") == ["2 poses are too few to align"]
 
 
 def test_what_never_flew_has_no_band(tmp_path):

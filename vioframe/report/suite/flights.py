@@ -23,7 +23,8 @@ class Outcome(StrEnum):
     COMPLETE = "complete"
     INCOMPLETE = "not complete"
     """Estimated, but lost for more than a twentieth of the frames, or cut short."""
-    NO_TRUTH = "no ground truth"
+    NOT_EVALUATED = "not evaluated"
+    """Estimated, but there is no error to show: of too few poses, or without a ground truth."""
     NEVER_INITIALISED = "never initialised"
     FAILED = "failed"
     """Ended with an error, which the task keeps."""
@@ -68,6 +69,8 @@ class Flight:
             case Outcome.NEVER_INITIALISED:
                 events = self.task.result.get("summary", {}).get("events", [])
                 return f"never initialised; last: {events[-1]['event']}" if events else "never initialised"
+            case Outcome.NOT_EVALUATED:
+                return str(self.task.result.get("not_evaluated") or "there is no ground truth to compare with")
             case Outcome.INCOMPLETE if self.task.result["summary"].get("finished") is False:
                 return "cut short"
             case Outcome.INCOMPLETE:
@@ -116,6 +119,6 @@ def _outcome(task: TaskResult, figures: Mapping[str, float]) -> Outcome:
     if "initialised_after_s" not in figures:
         return Outcome.NEVER_INITIALISED
     if "ate_m" not in figures:
-        return Outcome.NO_TRUTH
+        return Outcome.NOT_EVALUATED
     done = summary.get("finished", True) and figures.get("completion", 0.0) >= COMPLETE_FROM
     return Outcome.COMPLETE if done else Outcome.INCOMPLETE

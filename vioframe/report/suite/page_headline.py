@@ -27,7 +27,7 @@ def headline(results: SuiteResults) -> Headline:
 def _answers(results: SuiteResults) -> Iterator[str]:
     found = groups(results)
     if is_stress(found):
-        yield from _robustness(results, found)
+        yield from _robustness(found)
     elif means := [average for average in averages(found) if "ate_m" in average.spreads]:
         yield from _over_sequences(means)
     else:
@@ -40,41 +40,52 @@ def _one_flight(found: Sequence[Group]) -> Iterator[str]:
     having = [group for group in found if group.evaluated]
     if not having:
         return
-    best = min(having, key=_ate_m)
-    ours = next((group for group in having if _is_ours(group)), best)
-    inside = [percent for flight in ours.flights if (percent := inside_band(flight))]
-    y, z = (Spread(tuple(percent[axis] for percent in inside)).mean for axis in "yz")
-    yield (
-        f"{_named(*ours.cell.contender)}: y inside ±{100 * BAND_M:g} cm for {y:.0f} % of the flight, "
-        f"altitude for {z:.0f} %"
-    )
-    others = [group for group in having if group is not ours]
+    ours = next((group for group in having if _is_ours(group)), min(having, key=_ate_m))
+    several = len({group.cell.course for group in found}) > 1
+    where = f" on {ours.cell.sequence} ({ours.cell.data})" if several else ""
+    # Neither a contender on another recording is its rival, nor one that got out of a part of the flight.
+    rivals = [g for g in having if g.cell.course == ours.cell.course and g.all_complete and g is not ours]
+    if inside := [percent for flight in ours.flights if (percent := inside_band(flight))]:
+        y, z = (Spread(tuple(percent[axis] for percent in inside)).mean for axis in "yz")
+        yield (
+            f"{_named(*ours.cell.contender)}{where}: y inside ±{100 * BAND_M:g} cm for {y:.0f} % of the estimated "
+            f"time, altitude for {z:.0f} %"
+        )
     spread = ours.spread("ate_m")
     assert spread is not None
-    more = f"Its ATE is {_with_spread(spread)}"
-    if others:
-        rival = min(others, key=_ate_m)
-        verb = "the lowest here; next is" if ours is best else "the lowest here is that of"
+    of_ours = "Its" if inside else f"{_named(*ours.cell.contender)}{where}: its"
+    more = f"{of_ours} ATE is {_with_spread(spread)}"
+    if not ours.all_complete:
+        more += f" ({ours.seeds_text})"
+    if rivals:
+        rival = min(rivals, key=_ate_m)
+        if _ate_m(rival) < _ate_m(ours):
+            verb = "the lowest here is that of"
+        else:
+            verb = "the lowest here; next is" if ours.all_complete else "the lowest of a whole flight is that of"
         more += f", {verb} {_named(*rival.cell.contender)}, {_ate_m(rival):.3f} m"
     yield more
 
 
-def _robustness(results: SuiteResults, found: Sequence[Group]) -> Iterator[str]:
+def _robustness(found: Sequence[Group]) -> Iterator[str]:
     degraded = [group for group in found if group.cell.level > 0.0]
-    rates = {
-        detector: (sum(g.succeeded for g in own), sum(g.count for g in own))
-        for detector in dict.fromkeys(group.cell.detector for group in degraded)
-        if (own := [group for group in degraded if group.cell.detector == detector])
-    }
-    shares = [f"{_title(name)} {100 * done / flown:.0f} %" for name, (done, flown) in _by_share(rates)]
-    yield f"Flights that succeed under hard conditions: {', '.join(shares)}"
-    if (baseline := baseline_of(results.suite, found)) is None:
+    kinds = dict.fromkeys(group.cell.data for group in degraded)
+    of_kind = {data: f" ({data})" if len(kinds) > 1 else "" for data in kinds}
+    for data in kinds:
+        rates = {
+            detector: (sum(g.succeeded for g in own), sum(g.count for g in own))
+            for detector in dict.fromkeys(group.cell.detector for group in degraded)
+            if (own := [g for g in degraded if (g.cell.detector, g.cell.data) == (detector, data)])
+        }
+        shares = [f"{_title(name)} {100 * done / flown:.0f} %" for name, (done, flown) in _by_share(rates)]
+        yield f"Flights that succeed under hard conditions{of_kind[data]}: {', '.join(shares)}"
+    if (baseline := baseline_of(found)) is None:
         return
     for duel in duels(found, baseline):
         if duel.condition is None and duel.ratio is not None:
             yield (
-                f"{_title(duel.detector)} with {_plain(duel.backend)} against {_title(baseline)}, flight by flight: "
-                f"{duel.won} won, {duel.lost} lost, {duel.tied} tied; where both have an error, "
+                f"{_title(duel.detector)} with {_plain(duel.backend)} against {_title(baseline)}, flight by flight"
+                f"{of_kind[duel.data]}: {duel.won} won, {duel.lost} lost, {duel.tied} tied; where both have an error, "
                 f"{duel.ratio:.2f} times its ATE"
             )
 
@@ -97,7 +108,7 @@ def _speed(results: SuiteResults) -> Iterator[str]:
             continue
         name = _OURS[0] if _OURS[0] in rows else max(rows, key=lambda each: float(rows[each]["measured"]["fps"]))
         measured, quoted = rows[name]["measured"], rows[name].get("quoted")
-        against = f", where the thesis quotes {quoted['fps']:.0f} on its own" if quoted else ""
+        against = f"; quoted: {quoted['fps']:.0f} ({quoted['source']})" if quoted else ""
         place = sorted((float(row["measured"]["fps"]) for row in rows.values()), reverse=True)
         yield f"{_title(name)} runs at {measured['fps']:.0f} frames a second on this machine{against}"
         yield (
@@ -122,8 +133,10 @@ def _facts(results: SuiteResults) -> dict[str, str]:
         facts["Flights complete"] = f"{complete} of {len(flown)}"
     failed = sum(not task.ok for task in results.tasks)
     facts["Tasks failed"] = f"{failed} of {len(results.tasks)}"
-    if kinds := dict.fromkeys(task.data for task in results.tasks if task.data):
-        facts["Data"] = "; ".join(WHAT[data] for data in kinds)
+    # A trial has no images; its note says so.
+    notes = [t.data_note if t.kind is Kind.TRIAL else WHAT[t.data] for t in results.tasks if t.data]
+    if notes:
+        facts["Data"] = "; ".join(dict.fromkeys(notes))
     machines = dict.fromkeys(
         f"{t.machine.get('cpu', '?')}, {t.machine.get('cpu_count', '?')} cores" for t in results.tasks
     )

@@ -1,4 +1,4 @@
-"""What needs a flight's errors over time: the +-20 cm band, and relative errors pooled over the seeds."""
+"""What needs a flight's errors over time: the +-20 cm band, the ATE by Sim(3), and relative errors over the seeds."""
 
 from __future__ import annotations
 
@@ -10,6 +10,8 @@ import numpy as np
 from vioframe.report.suite.flights import Flight
 from vioframe.report.suite.statistics import Group
 from vioframe.trajectory import RelativeErrors, TrajectoryErrors
+from vioframe.trajectory.alignment import align_sim3
+from vioframe.trajectory.metrics import position_error_W
 from vioframe.types import Float
 
 BAND_M = 0.2
@@ -66,6 +68,16 @@ def inside(errors: TrajectoryErrors) -> dict[str, float]:
     within = np.abs(errors.position_m) <= BAND_M
     percent = dict(zip("xyz", (100.0 * within.mean(axis=0)).tolist(), strict=True))
     return {**percent, "all": 100.0 * float(within.all(axis=1).mean())}
+
+
+def ate_sim3_m(flight: Flight) -> float | None:
+    """RMSE of the position after alignment by Sim(3), as many published figures have it; None where it is open."""
+    errors = flight.task.errors
+    if errors is None or errors.scale is None:
+        return None
+    # Whatever the estimate was aligned by before, the best of all similarities leaves the same.
+    scaled = align_sim3(errors.estimate, errors.truth).apply(errors.estimate)
+    return float(np.sqrt(np.mean(np.sum(position_error_W(scaled, errors.truth) ** 2, axis=1))))
 
 
 def _pool(same_length: Sequence[RelativeErrors]) -> Stretches:

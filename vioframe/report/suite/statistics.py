@@ -150,7 +150,7 @@ class Average:
     """A contender's figures over sequences of one data kind; ``spreads`` are over the sequences' means.
 
     ``sequences`` are those on which every contender's every flight was complete, ``of`` counts all of them: an average
-    over other sequences for each contender would compare their luck.
+    over other sequences for each contender would compare their luck. ``groups`` are the contender's own of those.
     """
 
     data: Data
@@ -160,6 +160,7 @@ class Average:
     backend: str
     sequences: tuple[str, ...]
     of: int
+    groups: tuple[Group, ...]
     spreads: Mapping[str, Spread]
 
 
@@ -194,10 +195,10 @@ def averages(
         if len(by_sequence) < 2:
             continue
         for detector, backend in contenders:
-            own = [g for g in course if g.cell.contender == (detector, backend) and g.cell.sequence in common]
+            own = tuple(g for g in course if g.cell.contender == (detector, backend) and g.cell.sequence in common)
             means = {figure: [m for g in own if (m := g.mean(figure)) is not None] for figure in figures}
             spreads = {figure: Spread(tuple(values)) for figure, values in means.items() if values}
-            out.append(Average(*shared, detector, backend, tuple(common), len(by_sequence), spreads))
+            out.append(Average(*shared, detector, backend, tuple(common), len(by_sequence), own, spreads))
     return out
 
 

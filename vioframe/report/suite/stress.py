@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from math import comb
 from typing import Any
@@ -108,13 +108,12 @@ def wilson(successes: int, n: int) -> Interval:
     return Interval(max(0.0, float(middle - half)), min(1.0, float(middle + half)))
 
 
-def baseline_of(suite: Mapping[str, Any], found: Sequence[Group]) -> str | None:
-    """The detector to compare with: the suite's ``baseline``, else shi_tomasi, else its first; None without others."""
+def baseline_of(found: Sequence[Group]) -> str | None:
+    """The detector to compare with: shi_tomasi, which is the thesis' own, else the first; None without others."""
     names = list(dict.fromkeys(group.cell.detector for group in found))
     if len(names) < 2:
         return None
-    wanted = (suite.get("baseline"), "shi_tomasi", names[0])
-    return next(name for name in wanted if name in names)
+    return "shi_tomasi" if "shi_tomasi" in names else names[0]
 
 
 def duels(found: Sequence[Group], baseline: str) -> list[Duel]:

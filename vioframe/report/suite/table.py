@@ -6,6 +6,10 @@ import csv
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from io import StringIO
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from vioframe.report.suite.statistics import Spread
 
 UNKNOWN = "–"
 
@@ -116,6 +120,13 @@ def text(value: str) -> Entry:
 def number(value: float | None, spec: str, suffix: str = "") -> Entry:
     """Rounded by ``spec``; what is unknown is shown as a dash."""
     return Entry(UNKNOWN, None) if value is None else Entry(f"{value:{spec}}{suffix}", value)
+
+
+def mean(spread: Spread | None, spec: str) -> Entry:
+    """The mean, shown with the standard deviation where there is one."""
+    if spread is None:
+        return number(None, spec)
+    return number(spread.mean, spec, "" if spread.std is None else f" ± {spread.std:{spec}}")
 
 
 def without_empty(columns: Sequence[Column], rows: Sequence[Row]) -> tuple[tuple[Column, ...], tuple[Row, ...]]:

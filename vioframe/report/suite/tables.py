@@ -38,7 +38,7 @@ def _every(results: SuiteResults) -> Iterator[Table | None]:
     if groups:
         if stress.is_stress(groups):
             yield tables_stress.levels(stress.curves(groups), groups)
-            if (baseline := stress.baseline_of(results.suite, groups)) is not None:
+            if (baseline := stress.baseline_of(groups)) is not None:
                 yield tables_stress.against_baseline(stress.duels(groups, baseline), baseline, groups)
         yield tables_accuracy.accuracy(groups)
         if averages := statistics.averages(groups):

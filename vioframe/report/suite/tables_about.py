@@ -13,7 +13,7 @@ from vioframe.report.suite.captions import data_caption, links, run_path, task_p
 from vioframe.report.suite.flights import Flight
 from vioframe.report.suite.results import MATCHED_TRUTH, SuiteResults, TaskResult
 from vioframe.report.suite.statistics import Group
-from vioframe.report.suite.table import Column, Row, Table, number, text
+from vioframe.report.suite.table import Column, Row, Table, mean, number, text
 from vioframe.report.suite.tables_accuracy import LABELS, labels
 from vioframe.report.suite.trials import Campaign
 
@@ -25,9 +25,9 @@ def flights_nees(found: Sequence[Group]) -> Table | None:
     columns = (*LABELS, Column("seeds", text=True), *(Column(f"{part}, ideally {dof}") for part, dof in PARTS.items()))
     rows = []
     for group in found:
-        means = [group.mean(f"nees.{part}") for part in PARTS]
-        if any(mean is not None for mean in means):
-            entries = (*labels(group), text(group.seeds_text), *(number(mean, ".2f") for mean in means))
+        spreads = [group.spread(f"nees.{part}") for part in PARTS]
+        if any(spreads):
+            entries = (*labels(group), text(group.seeds_text), *(mean(spread, ".2f") for spread in spreads))
             rows.append(Row(entries, links(group.flights)))
     caption = (
         "Normalised estimation error squared, position and yaw fixed at the first pose: mean over time, then over the "
@@ -109,7 +109,10 @@ def failures(found: Iterable[Flight], others: Iterable[TaskResult]) -> Table | N
         Row((text(task.key), text(outcome), text(reason), number(task.attempts, "d")), (("folder", path),))
         for task, outcome, reason, path in troubled
     ]
-    caption = "Every task that failed, never initialised or is not complete; all are counted in the other tables."
+    caption = (
+        "Every task that failed, never initialised, could not be evaluated or is not complete; all are counted in the "
+        "other tables."
+    )
     return Table("failures", "What went wrong", caption, columns, tuple(rows)) if rows else None
 
 

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from vioframe.report.rows import ALIGNED_BY
 from vioframe.report.suite.captions import condition_text, data_caption, links, runs_caption
-from vioframe.report.suite.pooled import BAND_M, inside_band
+from vioframe.report.suite.flights import Flight
+from vioframe.report.suite.pooled import BAND_M, ate_sim3_m, inside_band
 from vioframe.report.suite.results import Data
 from vioframe.report.suite.statistics import Average, Group, Spread
-from vioframe.report.suite.table import Column, Entry, Row, Table, number, text, without_empty
+from vioframe.report.suite.table import Column, Entry, Row, Table, mean, number, text, without_empty
 
 LABELS = (
     Column("sequence", text=True),
@@ -45,7 +46,7 @@ def accuracy(found: Sequence[Group]) -> Table:
     )
     rows = [Row((*labels(group), *_accuracy(group)), links(group.flights)) for group in found]
     caption = (
-        "Mean over the seeds of each flight's RMSE, with the sample standard deviation and the range; aligned as the "
+        "Mean over the seeds of each flight's RMSE, ± the sample standard deviation, and the range; aligned as the "
         "column says, over the whole path. Failed flights are counted under seeds and have no error. "
         f"{runs_caption(found)} {data_caption(found)}"
     )
@@ -74,17 +75,18 @@ def averaged(found: Sequence[Average]) -> Table:
             text(average.detector),
             text(average.backend),
             text(f"{len(average.sequences)} of {average.of}"),
-            _mean(ate, ".3f"),
+            number(ate.mean if ate else None, ".3f"),
             number(ate.std if ate else None, ".3f"),
-            _mean(se3, ".3f"),
-            _mean(turn, ".2f"),
+            mean(se3, ".3f"),
+            mean(turn, ".2f"),
         )
-        rows.append(Row(entries))
+        rows.append(Row(entries, tuple(link for group in average.groups for link in _named_links(group))))
     kinds = dict.fromkeys((average.data, average.sequences) for average in found)
     which = " ".join(f"{data}: {', '.join(names) or 'none'}." for data, names in kinds)
     caption = (
         "Means over the sequences on which every flight of every contender was complete; real, rendered and simulated "
-        f"recordings are never averaged together. Averaged over: {which}"
+        f"recordings are never averaged together. Start offsets and resets are in the table of accuracy. Averaged "
+        f"over: {which}"
     )
     return Table("averages", "Averages over sequences", caption, columns, tuple(rows))
 
@@ -108,25 +110,29 @@ def beside_published(found: Sequence[Group], published: Sequence[Mapping[str, An
             text(f"published: {system['source']}"),
         )
         rows.append(Row((*about, *(number(value, ".3f") for value in values))))
+    figures = {"posyaw": _figure("ate_m"), "se3": _figure("ate_se3_m")}
+    if any(system["alignment"] == "sim3" for system in published):
+        figures["sim3"] = ate_sim3_m
     for detector, backend in dict.fromkeys(group.cell.contender for group in found):
         own: dict[tuple[str, Data | None], Group] = {
             (g.cell.sequence, g.cell.data): g for g in found if g.cell.contender == (detector, backend)
         }
         every = tuple(link for group in own.values() for link in _named_links(group))
-        for alignment, figure in ((ALIGNED_BY["posyaw"], "ate_m"), (ALIGNED_BY["se3"], "ate_se3_m")):
-            about = (text(f"{detector} + {backend}"), text(alignment), text("measured here"))
+        for alignment, figure in figures.items():
+            about = (text(f"{detector} + {backend}"), text(ALIGNED_BY[alignment]), text("measured here"))
             rows.append(Row((*about, *(_over_seeds(own.get(name), figure) for name in names)), every))
     caption = (
         "Published ATE beside what was measured here, never averaged together. Alignments differ by row: compare only "
         "rows of the same one. Published rows are of the real recordings; in a column marked rendered or simulated the "
         "measured rows are of that stand-in, which is another recording. Measured: mean over the seeds, and of how "
-        f"many where some have no error. {data_caption(found)}"
+        "many where some have no error; start offsets, completion and resets are in the table of accuracy. "
+        f"{data_caption(found)}"
     )
     return Table("published", "ATE beside published systems", caption, columns, tuple(rows))
 
 
 def band(found: Sequence[Group]) -> Table | None:
-    """Percent of the time inside +-20 cm, and the worst of the seeds."""
+    """Percent of the time inside +-20 cm, with the spread over the seeds and the worst of them."""
     columns = (
         *LABELS,
         Column("seeds", text=True),
@@ -141,7 +147,7 @@ def band(found: Sequence[Group]) -> Table | None:
         if not every:
             continue
         by_axis = {axis: Spread(tuple(inside[axis] for inside in every)) for axis in ("x", "y", "z", "all")}
-        shares = [number(spread.mean, ".1f") for spread in by_axis.values()]
+        shares = [mean(spread, ".1f") for spread in by_axis.values()]
         worst = [number(by_axis[axis].min, ".1f") for axis in ("y", "z")]
         rows.append(Row((*labels(group), text(group.seeds_text), *shares, *worst), links(group.flights)))
     if not rows:
@@ -161,8 +167,8 @@ def metrics(found: Sequence[Group]) -> Table | None:
         return None
     rows = []
     for group in found:
-        means = group.means("metrics.")
-        entries = (*labels(group), text(group.seeds_text), *(number(means.get(name), ".4g") for name in names))
+        figures = (mean(group.spread(f"metrics.{name}"), ".4g") for name in names)
+        entries = (*labels(group), text(group.seeds_text), *figures)
         rows.append(Row(entries, links(group.flights)))
     columns = (*LABELS, Column("seeds", text=True), *(Column(name) for name in names))
     caption = f"Mean over the seeds of what the suite's metrics say of each flight. {data_caption(found)}"
@@ -182,37 +188,41 @@ def _accuracy(group: Group) -> tuple[Entry, ...]:
     completion = group.mean("completion")
     return (
         text(group.seeds_text),
-        _mean(ate, ".3f"),
+        number(ate.mean if ate else None, ".3f"),
         number(ate.std if ate else None, ".3f"),
         number(ate.median if ate else None, ".3f"),
         number(ate.min if ate else None, ".3f"),
         number(ate.max if ate else None, ".3f"),
-        number(group.mean("ate_percent"), ".2f"),
-        number(group.mean("ate_se3_m"), ".3f"),
-        number(group.mean("orientation_deg"), ".2f"),
-        number(group.mean("yaw_deg"), ".2f"),
-        number(group.mean("scale"), ".3f"),
-        text("" if start is None else _range(start)),
-        number(group.mean("initialised_after_s"), ".2f"),
+        mean(group.spread("ate_percent"), ".2f"),
+        mean(group.spread("ate_se3_m"), ".3f"),
+        mean(group.spread("orientation_deg"), ".2f"),
+        mean(group.spread("yaw_deg"), ".2f"),
+        mean(group.spread("scale"), ".3f"),
+        text("" if start is None else span(start)),
+        mean(group.spread("initialised_after_s"), ".2f"),
         number(None if completion is None else 100.0 * completion, ".1f"),
         number(None if resets is None else sum(resets.values), ".0f"),
         text(("yes" if all(closed) else "some") if any(closed) else ""),
     )
 
 
-def _mean(spread: Spread | None, spec: str) -> Entry:
-    return number(None if spread is None else spread.mean, spec)
-
-
-def _range(spread: Spread) -> str:
+def span(spread: Spread) -> str:
     return f"{spread.min:g}" if spread.min == spread.max else f"{spread.min:g} to {spread.max:g}"
 
 
-def _over_seeds(group: Group | None, figure: str) -> Entry:
-    spread = group.spread(figure) if group else None
-    if group is None or spread is None:
-        return text(group.seeds_text) if group else number(None, "")
-    return number(spread.mean, ".3f", "" if spread.n == group.count else f" ({spread.n} of {group.count})")
+def _figure(name: str) -> Callable[[Flight], float | None]:
+    return lambda flight: flight.figures.get(name)
+
+
+def _over_seeds(group: Group | None, figure: Callable[[Flight], float | None]) -> Entry:
+    if group is None:
+        return number(None, "")
+    values = tuple(value for flight in group.flights if (value := figure(flight)) is not None)
+    if not values:
+        return text(group.seeds_text)
+    spread = Spread(values)
+    of = "" if spread.n == group.count else f" ({spread.n} of {group.count})"
+    return number(spread.mean, ".3f", of if spread.std is None else f" ± {spread.std:.3f}{of}")
 
 
 def _named_links(group: Group) -> list[tuple[str, str]]:

@@ -10,7 +10,7 @@ from vioframe.report.suite.captions import data_caption, run_path, task_path
 from vioframe.report.suite.flights import Flight
 from vioframe.report.suite.results import Data, TaskResult
 from vioframe.report.suite.statistics import Group, Spread
-from vioframe.report.suite.table import Column, Row, Table, number, text
+from vioframe.report.suite.table import Column, Row, Table, mean, number, text
 
 _NOT_THERE = "no such detector is installed"
 
@@ -93,7 +93,7 @@ def timing(found: Sequence[Group]) -> Table | None:
             text(detector),
             text(backend),
             number(frame.n, "d"),
-            number(factor.mean, ".2f"),
+            mean(factor, ".2f"),
             number(factor.min, ".2f"),
             number(frame.mean, ".1f"),
             number(frame.std, ".1f"),

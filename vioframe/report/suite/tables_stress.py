@@ -8,7 +8,8 @@ from vioframe.report.suite.captions import condition_text, data_caption, links, 
 from vioframe.report.suite.flights import SUCCESS_PERCENT
 from vioframe.report.suite.statistics import Group
 from vioframe.report.suite.stress import Curve, Duel, Interval
-from vioframe.report.suite.table import Column, Entry, Row, Table, number, text, without_empty
+from vioframe.report.suite.table import Column, Entry, Row, Table, mean, number, text, without_empty
+from vioframe.report.suite.tables_accuracy import span
 
 
 def levels(curves: Sequence[Curve], found: Sequence[Group]) -> Table:
@@ -29,6 +30,8 @@ def levels(curves: Sequence[Curve], found: Sequence[Group]) -> Table:
         Column("to", "m"),
         Column("ATE, mean", "m"),
         Column("std", "m"),
+        Column("start offset", "s", text=True),
+        Column("initialised after", "s"),
         Column("completion", "%"),
         Column("resets, all seeds"),
     )
@@ -36,7 +39,7 @@ def levels(curves: Sequence[Curve], found: Sequence[Group]) -> Table:
     for curve in curves:
         for point in curve.points:
             group = point.group
-            ate, resets, completion = (group.spread(key) for key in ("ate_m", "resets", "completion"))
+            ate, resets, completion, start = (group.spread(key) for key in ("ate_m", "resets", "completion", "start_s"))
             entries = (
                 text(curve.sequence),
                 text(curve.data.value),
@@ -51,6 +54,8 @@ def levels(curves: Sequence[Curve], found: Sequence[Group]) -> Table:
                 *_ends(point.band, 1.0, ".3f"),
                 number(ate.mean if ate else None, ".3f"),
                 number(ate.std if ate else None, ".3f"),
+                text("" if start is None else span(start)),
+                mean(group.spread("initialised_after_s"), ".2f"),
                 number(100.0 * completion.mean if completion else None, ".1f"),
                 number(sum(resets.values) if resets else None, ".0f"),
             )
