@@ -238,6 +238,16 @@ def test_two_failures_and_two_equal_flights_are_ties(tmp_path):
     assert (row.won, row.lost, row.tied, row.both, row.p_value) == (0, 0, 2, 1, 1.0)
 
 
+def test_a_flight_that_was_lost_early_wins_no_duel_by_the_little_that_it_estimated(tmp_path):
+    made = MadeUp(tmp_path / "r")
+    made.flight(labels(detector="shi_tomasi", seed=0), sigma_m=0.1)
+    made.flight(labels(detector="orb", seed=0), sigma_m=0.001, completion=0.3)
+    made.failed(labels(detector="shi_tomasi", seed=1))
+    made.flight(labels(detector="orb", seed=1), sigma_m=0.001, completion=0.3)
+    (row,) = duels(groups(made.load()), "shi_tomasi")
+    assert (row.won, row.lost, row.tied, row.both) == (1, 1, 0, 1)
+
+
 def test_a_lone_detector_has_no_baseline(tmp_path):
     made = MadeUp(tmp_path / "r")
     made.flight(labels())

@@ -231,6 +231,10 @@ def test_stress_tables_count_the_failed(tmp_path):
     assert column(duels, "won") == [2, 2, 2, 2, 2, 8]
     assert column(duels, "condition")[-1] == "all degraded"
     assert duels.title == "Against shi_tomasi"
+    assert "better than shi_tomasi." in duels.caption
+    assert [label for label, _ in duels.rows[0].links] == ["seed 0", "seed 0, baseline", "seed 1", "seed 1, baseline"]
+    assert [path.split(".")[2] for _, path in duels.rows[0].links] == ["keypointnet", "shi_tomasi"] * 2
+    assert duels.rows[-1].links == ()
 
 
 def test_detectors_quoted_and_measured_stand_apart_and_the_absent_say_why(tmp_path):

@@ -58,9 +58,11 @@ class Curve:
 class Duel:
     """A detector against the baseline, flight by flight: same recording, condition, level, back-end and seed.
 
-    A flight is won by the smaller ATE, or by having one where the other has none; equal ones are ``tied``. ``ratio``
-    is the geometric mean of the ATE over the baseline's, of the ``both`` pairs in which both have one. ``p_value`` is
-    that of the two-sided sign test. ``condition`` and ``level`` are None where the row is over all of them.
+    A complete flight wins against one that is not, an ATE against none, and otherwise the smaller one: whoever is lost
+    early has little time to be wrong in. Equal ones are ``tied``. ``ratio`` is the geometric mean of the ATE over the
+    baseline's, of the ``both`` pairs in which both have one. ``p_value`` is that of the two-sided sign test.
+    ``condition`` and ``level`` are None where the row is over all of them. ``pairs`` are the flights, the baseline's
+    second.
     """
 
     data: Data
@@ -73,6 +75,7 @@ class Duel:
     tied: int
     both: int
     ratio: float | None
+    pairs: tuple[tuple[Flight, Flight], ...]
 
     @property
     def p_value(self) -> float:
@@ -159,12 +162,18 @@ def _points(own: Sequence[Group]) -> tuple[Point, ...]:
 
 
 def _duel(key: tuple[Any, ...], pairs: Sequence[tuple[Flight, Flight]]) -> Duel:
-    ates = [[flight.figures.get("ate_m", np.inf) for flight in pair] for pair in pairs]
-    # Two that both failed are as equal as two of the same error.
-    tied = sum(own == other or abs(own - other) < _SAME for own, other in ates)
-    won = sum(own < other - _SAME for own, other in ates)
-    ratios = [own / other for own, other in ates if np.isfinite(own) and np.isfinite(other)]
+    won = sum(_beats(own, other) for own, other in pairs)
+    lost = sum(_beats(other, own) for own, other in pairs)
+    both = [(own, other) for own, other in pairs if own.evaluated and other.evaluated]
+    ratios = [own.figures["ate_m"] / other.figures["ate_m"] for own, other in both]
     ratio = float(np.exp(np.mean(np.log(ratios)))) if ratios else None
     data, condition, level, detector, backend = key
-    lost = len(pairs) - won - tied
-    return Duel(data, condition, level, detector, backend, won, lost, tied, len(ratios), ratio)
+    tied = len(pairs) - won - lost
+    return Duel(data, condition, level, detector, backend, won, lost, tied, len(ratios), ratio, tuple(pairs))
+
+
+def _beats(one: Flight, other: Flight) -> bool:
+    standing = [(not flight.complete, not flight.evaluated) for flight in (one, other)]
+    if standing[0] != standing[1]:
+        return standing[0] < standing[1]
+    return one.evaluated and one.figures["ate_m"] < other.figures["ate_m"] - _SAME

@@ -98,19 +98,29 @@ def against_baseline(found: Sequence[Duel], baseline: str, own: Sequence[Group])
                 number(duel.ratio, ".2f"),
                 number(duel.both, "d"),
                 number(duel.p_value, ".3f"),
-            )
+            ),
+            _runs(duel),
         )
         for duel in found
     ]
     conditions = {condition_text(group.cell.condition, group.cell.level) for group in own}
     caption = (
         f"Flight by flight against {baseline}: same recording, condition, level, back-end and seed, {len(conditions)} "
-        "conditions and levels. Won: the smaller ATE, or an ATE where the other has none; tied: equal, or neither has "
-        f"one. The ratio is of the pairs in which both have an ATE; below 1 is better than {baseline}. The two-sided "
-        "sign test takes the pairs for independent, which flights of one recording are not quite. "
+        "conditions and levels. A complete flight wins against one that is not, an ATE against none, else the smaller "
+        "one; tied: equal, or neither has one. The ratio is of the pairs in which both have an ATE; below 1 is better "
+        f"than {baseline}. The two-sided sign test takes the pairs for independent, which flights of one recording are "
+        "not quite. All degraded: the rows above together, but for the clear ones. "
         f"{data_caption(own)}"
     )
     return Table("duels", f"Against {baseline}", caption, columns, tuple(rows))
+
+
+def _runs(duel: Duel) -> tuple[tuple[str, str], ...]:
+    """None for a row that is over others, which have them."""
+    if duel.condition is None:
+        return ()
+    every = links(flight for pair in duel.pairs for flight in pair)
+    return tuple((f"{label}{', baseline' if k % 2 else ''}", path) for k, (label, path) in enumerate(every))
 
 
 def _ends(interval: Interval | None, factor: float, spec: str) -> tuple[Entry, Entry]:
