@@ -185,6 +185,15 @@ def test_metrics_have_a_column_a_figure_and_a_mean_over_the_seeds(tmp_path):
     assert column(table, "ate.scale") == [2.0]
 
 
+def test_a_metric_that_cannot_tell_says_why(tmp_path):
+    made = MadeUp(tmp_path / "r")
+    run = made.flight(labels())
+    tree = json.loads((run.parent / "task.json").read_text())
+    tree["result"]["metrics_left_out"] = {"nees": "there is no covariance"}
+    (run.parent / "task.json").write_text(json.dumps(tree))
+    assert "No nees (1 of the flights): there is no covariance." in named(made.load())["metrics"].caption
+
+
 def test_a_mean_is_shown_with_its_spread(compared):
     table = named(compared)["accuracy"]
     shown = {c.heading: e.shown for c, e in zip(table.columns, table.rows[0].entries, strict=True)}

@@ -221,7 +221,8 @@ def _cell(task: TaskResult, data_of: Mapping[tuple[str, str], Data]) -> Cell | N
 
 def expected_tasks(suite: Mapping[str, Any]) -> int | None:
     """How many tasks a finished sweep has, or None where the suite does not say."""
-    seeds, backends = suite.get("seeds", 1), len(suite.get("backends") or ())
+    seeds = suite.get("seeds", 1)
+    detectors, backends, sequences = (len(suite.get(key) or ()) for key in ("detectors", "backends", "sequences"))
     match suite.get("kind"):
         case "detector_speed":
             return 1
@@ -231,7 +232,7 @@ def expected_tasks(suite: Mapping[str, Any]) -> int | None:
             levels = sum(len(each) for each in (suite.get("conditions") or {}).values()) + bool(
                 suite.get("clear", True)
             )
-            return int(seeds * backends * len(suite["detectors"]) * len(suite["sequences"]) * levels)
+            return int(seeds * backends * detectors * sequences * levels)
     return None
 
 

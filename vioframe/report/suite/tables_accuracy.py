@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -163,7 +164,8 @@ def band(found: Sequence[Group]) -> Table | None:
 def metrics(found: Sequence[Group]) -> Table | None:
     """What the metrics that the suite asked for say, a column a figure; None where it asked for none."""
     names = list(dict.fromkeys(name for group in found for name in group.means("metrics.")))
-    if not names:
+    left_out = _left_out(found)
+    if not (names or left_out):
         return None
     rows = []
     for group in found:
@@ -171,8 +173,22 @@ def metrics(found: Sequence[Group]) -> Table | None:
         entries = (*labels(group), text(group.seeds_text), *figures)
         rows.append(Row(entries, links(group.flights)))
     columns = (*LABELS, Column("seeds", text=True), *(Column(name) for name in names))
-    caption = f"Mean over the seeds of what the suite's metrics say of each flight. {data_caption(found)}"
+    caption = (
+        "Mean over the seeds that have one, ± the standard deviation, of what the suite's metrics say of each flight. "
+        f"{left_out}{data_caption(found)}"
+    )
     return Table("metrics", "Metrics", caption, columns, tuple(rows))
+
+
+def _left_out(found: Sequence[Group]) -> str:
+    """Which metrics could not tell, of how many flights and why, in sentences; empty where all could."""
+    reasons = Counter(
+        reason
+        for group in found
+        for flight in group.flights
+        for reason in flight.task.result.get("metrics_left_out", {}).items()
+    )
+    return "".join(f"No {name} ({count} of the flights): {why}. " for (name, why), count in reasons.items())
 
 
 def labels(group: Group) -> tuple[Entry, ...]:
