@@ -126,6 +126,19 @@ def test_a_back_end_that_is_far_worse_has_a_scale_of_its_own(tmp_path):
     assert axes[2, 1].get_ylim() == axes[2, 0].get_ylim()
 
 
+def test_whoever_began_later_is_drawn_later(tmp_path):
+    from trajectory_helpers import disturbed, flight
+
+    made = MadeUp(tmp_path / "r")
+    truth = flight(160, seed=3)
+    made.flight(labels(detector="shi_tomasi"))
+    made.flight(labels(detector="orb"), estimate=disturbed(truth, 0.02, 0.01).select(np.arange(160) >= 40))
+    course = figures_flights.Course.of(groups(made.load()))
+    begins = [line.get_xdata()[0] for line in figures_flights.comparison(course).axes[0].lines]
+    late_s = (truth.t_ns[40] - truth.t_ns[0]) * 1e-9
+    assert sorted(begins) == pytest.approx([0.0, late_s])
+
+
 def test_no_line_is_drawn_across_a_gap(tmp_path):
     from trajectory_helpers import disturbed, flight
 

@@ -16,7 +16,7 @@ from vioframe.report.suite.pooled import BAND_M, inside
 from vioframe.report.suite.statistics import Group
 from vioframe.trajectory import TrajectoryErrors
 from vioframe.trajectory.metrics import rotation_error_deg
-from vioframe.types import NS_PER_S, Float
+from vioframe.types import NS_PER_S, Float, Int
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -43,11 +43,6 @@ class Drawn:
         """``values`` (N, ...) by pose, with NaN wherever a line must not be drawn."""
         return np.insert(values, self.breaks, np.nan, axis=0)
 
-    @property
-    def time_s(self) -> Float:
-        """Since the truth begins that the estimate was compared with."""
-        return np.asarray((self.errors.estimate.t_ns - self.errors.truth.t_ns[0]) / NS_PER_S)
-
 
 @dataclass(frozen=True)
 class Course:
@@ -70,6 +65,15 @@ class Course:
     def truth(self) -> Float:
         """(N, 3) of the longest stretch that was compared."""
         return max((each.errors.truth.p_WB for each in self.drawn), key=len)
+
+    def time_s(self, t_ns: Int) -> Float:
+        """Of stamps, since the first estimate of any: whoever began later stays behind."""
+        begin_ns = min(int(each.errors.estimate.t_ns[0]) for each in self.drawn)
+        return np.asarray((t_ns - begin_ns) / NS_PER_S)
+
+    def times(self, of: Drawn) -> Float:
+        """That of the poses ``of`` a flight, broken as its values are."""
+        return of.broken(self.time_s(of.errors.estimate.t_ns))
 
     def bounds(self) -> tuple[Float, Float]:
         """Corners (3,) of a box around the truth, and around the estimates as far as they stay near it."""
@@ -133,7 +137,13 @@ def translation_error(course: Course) -> Figure:
             for each, share in zip(drawn, shares, strict=True):
                 label = f"{share[axis]:.1f} % inside"
                 values = each.broken(each.errors.position_m[:, k])
-                ax.plot(each.broken(each.time_s), values, color=_colour(course, each), lw=1.5, label=label)
+                ax.plot(
+                    course.times(each),
+                    values,
+                    color=_colour(course, each),
+                    lw=1.5,
+                    label=label,
+                )
             ax.legend(loc="lower right", bbox_to_anchor=(1.0, 0.98), ncols=len(drawn), fontsize=10.5, borderpad=0.1)
         column[0].set_title(backend, pad=24)
     _finish(figure, panels, names)
@@ -154,7 +164,7 @@ def rotation_error(course: Course) -> Figure:
             ax.axhline(0.0, color="black", lw=0.8)
             for each in drawn:
                 values = each.broken(each.errors.rotation_rpy_deg[:, k])
-                ax.plot(each.broken(each.time_s), values, color=_colour(course, each), lw=1.5)
+                ax.plot(course.times(each), values, color=_colour(course, each), lw=1.5)
         column[0].set_title(backend)
     _finish(figure, panels, names)
     _scale(panels, [[each.errors.rotation_rpy_deg for each in drawn] for _, drawn in course.columns()], symmetric=True)
@@ -173,7 +183,13 @@ def comparison(course: Course) -> Figure:
                 size = measure(each.errors)
                 label = f"RMSE {np.sqrt(np.mean(size**2)):.3g} {unit}"
                 values = each.broken(size)
-                ax.plot(each.broken(each.time_s), values, color=_colour(course, each), lw=1.5, label=label)
+                ax.plot(
+                    course.times(each),
+                    values,
+                    color=_colour(course, each),
+                    lw=1.5,
+                    label=label,
+                )
             ax.legend(loc="lower right", bbox_to_anchor=(1.0, 0.98), ncols=len(drawn), fontsize=10.5, borderpad=0.1)
         column[0].set_title(backend, pad=24)
     _finish(figure, panels, names)
@@ -219,7 +235,7 @@ def _finish(figure: Figure, panels: Any, names: Sequence[str]) -> None:
     for row, name in zip(panels, names, strict=True):
         row[0].set_ylabel(name)
     for ax in panels[-1]:
-        ax.set_xlabel("time of flight [s]")
+        ax.set_xlabel("time since the first estimate [s]")
         ax.margins(x=0.01)
     figure.align_ylabels(panels[:, 0])
 

@@ -115,9 +115,9 @@ def nees_over_time(course: Course) -> Figure | None:
         for ax, part in zip(column, _PARTS, strict=True):
             for each in drawn:
                 nees = next(n for n in each.errors.nees if n.part == part)
-                time_s = (nees.t_ns - each.errors.truth.t_ns[0]) * 1e-9
                 label = f"mean {nees.mean:.3g}, {100 * nees.inside:.0f} % inside"
-                ax.plot(time_s, nees.values, lw=1.3, color=course.look.colour(each.group.cell.detector), label=label)
+                shade = course.look.colour(each.group.cell.detector)
+                ax.plot(course.time_s(nees.t_ns), nees.values, lw=1.3, color=shade, label=label)
                 ax.axhspan(*nees.band, color=_HONEST, alpha=0.2 / len(drawn), lw=0)
                 dof = nees.dof
             ax.axhline(dof, color=_HONEST, lw=1.2)
@@ -129,7 +129,7 @@ def nees_over_time(course: Course) -> Figure | None:
             if ax in panels[:, 0]:
                 ax.set_ylabel(f"{part}\nNEES (ideally {dof})")
         column[0].set_title(backend, pad=24)
-        column[-1].set_xlabel("time of flight [s]")
+        column[-1].set_xlabel("time since the first estimate [s]")
     figure.align_ylabels(panels[:, 0])
     legend(figure, course.look.handles(of_backends=False))
     course.explain(

@@ -30,8 +30,8 @@ def error_curves(curves: Sequence[Curve], found: Sequence[Group]) -> Figure:
         ax.plot(levels, [point.ate_m for point in known], lw=1.8, **style)
         _fill(ax, known, shift, lambda point: point.band, 1.0, style["color"])
         for point in known:
-            # Hollow where the mean is only of those that came through.
-            face = style["color"] if point.group.evaluated == point.group.count else "white"
+            # Hollow where the mean is not of whole flights alone.
+            face = style["color"] if point.group.all_complete else "white"
             ax.plot(point.level + shift, point.ate_m, marker, ms=6, mfc=face, mec=style["color"], zorder=4)
             spread = point.group.spread("ate_m")
             values = spread.values if spread else ()
@@ -42,7 +42,8 @@ def error_curves(curves: Sequence[Curve], found: Sequence[Group]) -> Figure:
     explain(
         figure,
         "Lines: geometric mean over the seeds; small dots: every flight; bands: 95 % confidence (Student's t in the "
-        f"logarithm, spread pooled over the levels). Hollow: some flights have no error. {_about(found)}",
+        "logarithm, spread pooled over the levels). Hollow: some flights are not complete, or have no error. "
+        f"{_about(found)}",
     )
     return figure
 

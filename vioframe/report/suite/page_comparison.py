@@ -57,8 +57,8 @@ def stress_curves(found: Sequence[Curve], look: Look) -> Plot:
         "Error and success by level of the condition",
         cases,
         "Above: geometric mean of the ATE of the flights that have one, with its 95 % confidence band; the scale is "
-        "logarithmic, a hollow point flatters as some of its flights have none. Below: part of all flights that "
-        "succeeded, failed ones counted, with Wilson's 95 % interval.",
+        "logarithmic, a hollow point flatters as some of its flights have none or are not complete. Below: part of all "
+        "flights that succeeded, failed ones counted, with Wilson's 95 % interval.",
         height=520,
         narrow_height=460,
     )
@@ -147,8 +147,8 @@ def _curve(
         marker={
             "size": 7,
             "color": look.colour(*contender),
-            # Hollow where some flights have no error, so that the point flatters.
-            "symbol": ["circle" if panel or p.group.evaluated == p.group.count else "circle-open" for p in points],
+            # Hollow where some flights have no error or only that of a part, so that the point flatters.
+            "symbol": ["circle" if panel or p.group.all_complete else "circle-open" for p in points],
         },
         customdata=[
             f"{says.format(value)}, seeds: {p.group.seeds_text}" for p, value in zip(points, values, strict=True)
