@@ -155,7 +155,7 @@ def test_figures_say_what_the_data_was_and_which_flight_is_shown(course):
     for draw in (figures_flights.trajectories_3d, figures_flights.side_view, figures_spread.nees_over_time):
         caption = " ".join(draw(course).get_supxlabel().split())
         assert caption.endswith(
-            "Shown: the seed of the median ATE. Data (rendered): MH_05_difficult: made up for a test."
+            "Shown: the seed of the median ATE, of two the worse. Data (rendered): MH_05_difficult: made up for a test."
         )
 
 

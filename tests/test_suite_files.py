@@ -5,6 +5,7 @@ from shutil import copytree, move
 
 import numpy as np
 import pytest
+from click.testing import CliRunner
 from suite_recordings import record_toy
 
 from vioframe import registry
@@ -13,6 +14,7 @@ from vioframe.bench.suites import suite as suites
 from vioframe.bench.suites.euroc import EUROC
 from vioframe.bench.suites.plan import plan
 from vioframe.bench.suites.suite import Suite
+from vioframe.cli import main
 from vioframe.convert import convert
 from vioframe.errors import ConfigError, DatasetError, VioframeError
 from vioframe.report.suite.results import Data
@@ -88,6 +90,16 @@ class TestFiles:
         assert part.seeds == 1
         with pytest.raises(ConfigError, match="it has shi_tomasi, keypointnet"):
             suites.narrowed(whole, detectors=["orb"])
+
+    @pytest.mark.parametrize(
+        ("name", "option"),
+        [("detector_fps", "--seeds=2"), ("detector_fps", "--workers=1"), ("consistency", "--data=.")],
+    )
+    def test_an_option_that_would_do_nothing_is_an_error(self, tmp_path, name, option):
+        result = CliRunner().invoke(main, ["bench", name, option, "--out", str(tmp_path / "out")])
+        assert result.exit_code == 2
+        assert f"{option.partition('=')[0]} does nothing in a suite of kind" in result.stderr
+        assert not (tmp_path / "out").exists()
 
 
 class TestSources:

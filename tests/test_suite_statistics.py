@@ -94,6 +94,9 @@ def test_the_median_flight_is_one_that_was_flown(tmp_path):
     made.failed(labels(seed=3))
     (group,) = groups(made.load())
     assert group.median_flight().seed == 2
+    made.failed(labels(seed=2))
+    (group,) = groups(made.load())
+    assert group.median_flight().seed == 0  # Of two, the worse.
 
 
 def test_a_failed_flight_that_does_not_know_its_data_stands_with_its_siblings(tmp_path):

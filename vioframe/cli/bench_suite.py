@@ -64,7 +64,9 @@ def _run(
     from vioframe.bench.suites.store import Store
     from vioframe.bench.suites.sweep import agenda, sweep
 
-    suite = suites.narrowed(suites.read(suites.find(name)), **narrowing)
+    whole = suites.read(suites.find(name))
+    _check_used(whole, data=data, scheduler=scheduler, workers=workers, recordings=recordings, seeds=narrowing["seeds"])
+    suite = suites.narrowed(whole, **narrowing)
     planned = plan(suite, data, registry.load())
     store = Store.at(out or Path("results") / suite.name, recordings)
     store.begin(planned, overwrite=overwrite)
@@ -76,6 +78,17 @@ def _run(
         from vioframe.cli.report import write_and_say
 
         write_and_say(store.path)
+
+
+_NO_USE = {"detector_speed": ("seeds", "workers", "scheduler", "recordings"), "trials": ("data", "recordings")}
+
+
+def _check_used(suite: Suite, **given: Any) -> None:
+    """Raise ConfigError for an option that a suite of this kind has no use for."""
+    from vioframe.errors import ConfigError
+
+    if unused := next((name for name in _NO_USE.get(suite.kind, ()) if given[name]), None):
+        raise ConfigError(f"--{unused} does nothing in a suite of kind {suite.kind}; leave it out")
 
 
 def _workers(suite: Suite, asked: int | None) -> int | None:

@@ -87,7 +87,7 @@ class Course:
 
     def explain(self, figure: Figure, text: str) -> None:
         counts = {each.group.evaluated for each in self.drawn}
-        shown = "" if counts == {1} else " Shown: the seed of the median ATE."
+        shown = "" if counts == {1} else " Shown: the seed of the median ATE, of two the worse."
         explain(figure, f"{text}{shown} {data_caption([each.group for each in self.drawn])}")
 
 

@@ -79,7 +79,8 @@ class Course:
         seeds = max(group.count for group in self.groups)
         parts = [self.data_note]
         if seeds > 1:
-            parts.append(f"Of {seeds} seeds the one with the median error is drawn.")
+            one = "one with the larger" if seeds == 2 else "one with the median"
+            parts.append(f"Of {seeds} seeds the {one} error is drawn.")
         drawn = {line.group.cell for line in self.lines}
         if missing := [group.cell for group in self.groups if group.cell not in drawn]:
             names = ", ".join(f"{cell.detector} with {cell.backend}" for cell in missing)

@@ -140,9 +140,9 @@ class Group:
         return {name.removeprefix(prefix): mean for name in names if (mean := self.mean(name)) is not None}
 
     def median_flight(self) -> Flight | None:
-        """The evaluated flight whose ATE is the (lower) median one: the one to draw for the group."""
+        """The one to draw for the group: that of the median ATE, of two in the middle the worse."""
         found = sorted((f for f in self.flights if f.evaluated), key=lambda f: f.figures["ate_m"])
-        return found[(len(found) - 1) // 2] if found else None
+        return found[len(found) // 2] if found else None
 
 
 @dataclass(frozen=True)
