@@ -10,8 +10,8 @@ import numpy as np
 from ruamel.yaml import YAML
 from trajectory_helpers import disturbed, flight, write_run
 
+from vioframe.report.matched_truth import write_matched_truth
 from vioframe.report.run_folder import RunFolder
-from vioframe.report.suite.matched_truth import write_matched_truth
 from vioframe.report.suite.results import Data, Kind, Labels, SuiteResults, load_results
 from vioframe.trajectory import Trajectory, evaluate
 

@@ -53,7 +53,7 @@ def vioframe_backends():
 
 
 def record_toy(folder: Path, name: str = "TOY", **settings: object) -> Path:
-    """A bag of 3 s at 10 Hz with small images, its truth in it, that says nothing of having been simulated."""
+    """An ASL folder of 3 s at 10 Hz with small images and truth, which says nothing of having been simulated."""
     calibration = packaged_calibration("euroc")
     camera = calibration.camera
     small = replace(
@@ -65,7 +65,7 @@ def record_toy(folder: Path, name: str = "TOY", **settings: object) -> Path:
     write_calibration(replace(calibration, camera=small), files)
     config = SimulationConfig(duration_s=3.0, frame_rate_hz=10.0, calibration=(files,), **settings)
     installed = registry.load()
-    path = folder / f"{name}.bag"
+    path = folder / name
     record(SimulatedRecording(complete(config, installed), installed), [path])
     rmtree(simulation_folder(path))
     return path

@@ -1,7 +1,7 @@
 """Suites as files, what a sequence is flown on, and the tasks that come of both."""
 
 from pathlib import Path
-from shutil import copytree, move
+from shutil import copytree, move, rmtree
 
 import numpy as np
 import pytest
@@ -28,7 +28,7 @@ TOY = "detectors: [fast]\nbackends: [msckf]\nsequences: [TOY]\ntitle: toy\n"
 
 @pytest.fixture(scope="module")
 def toy(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder of TOY.bag."""
+    """The folder that TOY is in."""
     return record_toy(tmp_path_factory.mktemp("toy")).parent
 
 
@@ -66,6 +66,8 @@ class TestFiles:
             (TOY + "conditions: {fog: [0.0]}\n", "greater than 0"),
             (TOY + "clear: false\n", "nothing to fly"),
             (TOY.replace("[fast]", "[fast, fast]"), "'fast' is named twice"),
+            (TOY + "conditions: {fog: [0.5, 0.5]}\n", "fog has a level twice"),
+            (TOY + "frontend: {max_pointz: 9}\n", "did you mean 'max_points'"),
             (TOY.replace("[fast]", "[]"), "flights need detectors, backends and sequences"),
             (TOY + "rounds: 3\n", "rounds does nothing in a suite of kind flights"),
             ("title: t\nkind: trials\nbackends: [msckf]\nsetup: {speed: 1}\n", "its keys are flight"),
@@ -114,20 +116,21 @@ class TestSources:
 
     def test_a_recording_is_found_and_taken_as_it_is(self, toy, tmp_path):
         found = self.flown("TOY", [toy])
-        assert (found.data, found.recording, found.simulated) == (Data.REAL, toy / "TOY.bag", None)
+        assert (found.data, found.recording, found.simulated) == (Data.REAL, toy / "TOY", None)
         # As EuRoC's site has it: a folder a place, a folder a sequence.
         deep = tmp_path / "hall" / "TOY"
         copytree(toy, deep)
-        assert self.flown("TOY", [tmp_path]).recording == deep / "TOY.bag"
+        assert self.flown("TOY", [tmp_path]).recording == deep / "TOY"
 
     def test_data_are_known_by_what_they_are_not_by_where(self, toy, tmp_path):
         copytree(toy, tmp_path / "copy")
         here, there = self.flown("TOY", [toy]), self.flown("TOY", [tmp_path / "copy"])
         assert sources.fingerprint(here) == sources.fingerprint(there)
-        bag = tmp_path / "copy" / "TOY.bag"
-        content = bag.read_bytes()
-        bag.write_bytes(content[:-1] + bytes([content[-1] ^ 255]))
-        assert sources.fingerprint(here) != sources.fingerprint(self.flown("TOY", [tmp_path / "copy"]))
+        for changed in ("imu0/data.csv", "cam0/sensor.yaml"):
+            before = sources.fingerprint(self.flown("TOY", [tmp_path / "copy"]))
+            file = tmp_path / "copy" / "TOY" / "mav0" / changed
+            file.write_text(file.read_text() + "\n")
+            assert sources.fingerprint(self.flown("TOY", [tmp_path / "copy"])) != before
 
     def test_what_the_simulator_wrote_is_never_called_real(self, tmp_path):
         config = complete(SimulationConfig(duration_s=0.3), INSTALLED)
@@ -135,6 +138,9 @@ class TestSources:
         assert self.flown("MH_01_easy", [tmp_path]).data is Data.SIMULATED
         with pytest.raises(ConfigError, match="simulation already"):
             self.flown("MH_01_easy", [tmp_path], {"fog": 0.5})
+        rmtree(tmp_path / "MH_01_easy.bag.simulation")
+        with pytest.raises(DatasetError, match=r"MH_01_easy.bag.simulation .* copy that too"):
+            self.flown("MH_01_easy", [tmp_path])
 
     @pytest.mark.parametrize("name", EUROC)
     def test_every_sequence_has_a_stand_in_that_can_be_flown(self, name):
@@ -207,11 +213,31 @@ class TestPlan:
             assert changed[what] != first[what]
             assert changed["code"] == first["code"]
 
+    def test_two_tasks_of_one_name_are_an_error(self, tmp_path):
+        twins = "[{name: fast, label: a b}, {name: orb, label: a_b}]"
+        with pytest.raises(ConfigError, match="give their parts other labels"):
+            plan(read(tmp_path, TOY.replace("[fast]", twins).replace("TOY", "hover")), (), INSTALLED)
+
+    def test_a_flight_may_start_later_and_a_stand_in_does_not(self, tmp_path):
+        later = TOY.replace("[TOY]", "[{name: hover, start_s: 5, duration_s: 3}, {name: V1_02_medium, start_s: 5}]")
+        hover, stand_in = plan(read(tmp_path, later), (), INSTALLED).jobs
+        assert (hover.config.start_s, hover.recording.config.duration_s) == (5.0, 8.0)
+        assert stand_in.config.start_s == 0.0
+
+    def test_detectors_can_be_timed_on_recorded_frames(self, tmp_path, toy):
+        text = "title: t\nkind: detector_speed\nsequences: [TOY]\n"
+        (job,) = plan(read(tmp_path, text), [toy], INSTALLED).jobs
+        assert (job.data, job.recording) == (Data.REAL, toy / "TOY")
+        (drawn,) = plan(read(tmp_path, text), (), INSTALLED).jobs
+        assert (drawn.data, drawn.recording) == (None, None)
+        assert drawn.fingerprint["data"] != job.fingerprint["data"]
+
     def test_what_is_missing_is_said_before_anything_is_flown(self, tmp_path):
         for text in (
             TOY.replace("fast", "nothing"),
             TOY.replace("msckf", "nothing"),
             TOY + "metrics: [nothing]\n",
+            "title: t\nkind: trials\nbackends: [msckf]\nsetup: {flight: nothing}\n",
             TOY.replace("[fast]", "[superpoint]"),
         ):
             with pytest.raises(VioframeError):

@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 from suite_helpers import MadeUp, comparison, key, labels, stress
 from trajectory_helpers import flight
 
+from vioframe.report.matched_truth import write_matched_truth
 from vioframe.report.run_folder import RunFolder
 from vioframe.report.suite.flights import Flight, Outcome
-from vioframe.report.suite.matched_truth import write_matched_truth
 from vioframe.report.suite.pooled import BAND_M, inside_band, pool_relative
 from vioframe.report.suite.results import Data, Kind, SuiteResults
 from vioframe.report.suite.statistics import Spread, averages, expected_tasks, groups, unplaced

@@ -33,7 +33,7 @@ metrics: ["band:half_width_m=0.2"]
 
 @pytest.fixture(scope="module")
 def toy(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder of TOY.bag."""
+    """The folder that TOY is in."""
     return record_toy(tmp_path_factory.mktemp("toy")).parent
 
 
@@ -43,14 +43,17 @@ def parts(tmp_path, monkeypatch):
     monkeypatch.setenv("OMP_NUM_THREADS", "1")
 
 
-def run(folder: Path, text: str, data: Path, *, out: str = "results", **how) -> tuple[Outcome, list[Event], Path]:
+def run(
+    folder: Path, text: str, data: Path | None, *, out: str = "results", **how
+) -> tuple[Outcome, list[Event], Path]:
     file = folder / "toy.yaml"
     file.write_text(text)
-    planned = plan(suites.read(file), [data], registry.load())
+    planned = plan(suites.read(file), [] if data is None else [data], registry.load())
     store = Store.at(folder / out)
     store.begin(planned, overwrite=how.pop("overwrite", False))
     events: list[Event] = []
-    outcome = sweep(agenda(planned, store), store, on_event=events.append, **{"workers": 2, **how})
+    with store.alone():
+        outcome = sweep(agenda(planned, store), store, on_event=events.append, **{"workers": 2, **how})
     return outcome, events, store.path
 
 
@@ -104,7 +107,7 @@ class TestSweep:
 
     def test_another_suite_does_not_get_the_folder(self, tmp_path, toy):
         run(tmp_path, GRID, toy)
-        with pytest.raises(RunError, match="another suite's results"):
+        with pytest.raises(RunError, match="another suite's results, which differs in frontend"):
             run(tmp_path, GRID + "frontend: {max_points: 50}\n", toy)
         assert run(tmp_path, GRID + "frontend: {max_points: 50}\n", toy, overwrite=True)[0].done == 4
         (tmp_path / "mine").mkdir()
@@ -112,6 +115,12 @@ class TestSweep:
         with pytest.raises(RunError, match="is no results folder"):
             run(tmp_path, GRID, toy, out="mine", overwrite=True)
         assert (tmp_path / "mine" / "thesis.tex").exists()
+
+    def test_two_sweeps_keep_out_of_each_others_folder(self, tmp_path, toy):
+        _, _, path = run(tmp_path, GRID, toy)
+        with Store.at(path).alone(), pytest.raises(RunError, match="another sweep is at work"):
+            run(tmp_path, GRID, toy)
+        assert run(tmp_path, GRID, toy)[0].reused == 4
 
     def test_a_task_that_fails_once_is_done_the_second_time(self, tmp_path, toy):
         outcome, _, path = run(tmp_path, unreliable(tmp_path, "fail", 1), toy)
@@ -163,7 +172,7 @@ def test_a_simulated_recording_is_made_once_and_goes_when_it_is_no_longer_needed
     outcome, events, path = run(tmp_path, text, tmp_path)
     assert (outcome.done, outcome.failed) == (8, {})
     assert sum(not event.is_task for event in events) == 2
-    assert list((path / "recordings").glob("*.bag")) == []
+    assert not (path / "recordings").exists()
     assert {task.data for task in found(path).tasks} == {Data.SIMULATED}
 
 
@@ -208,7 +217,7 @@ end_header
 @pytest.mark.usefixtures("parts")
 def test_trials_leave_their_nees(tmp_path):
     text = "title: t\nkind: trials\nbackends: [msckf]\nseeds: 2\nsetup: {flight: figure_eight, duration_s: 10.0}\n"
-    outcome, _, path = run(tmp_path, text, tmp_path)
+    outcome, _, path = run(tmp_path, text, None)
     assert (outcome.done, outcome.failed) == (2, {})
     for task in found(path).of(Kind.TRIAL):
         assert len(task.result["t_s"]) == len(task.result["nees"]["pose"]) > 50
@@ -216,12 +225,16 @@ def test_trials_leave_their_nees(tmp_path):
 
 
 @pytest.mark.usefixtures("parts")
-def test_detectors_are_timed_in_turns_in_this_process(tmp_path):
+def test_detectors_are_timed_in_turns_in_this_process(tmp_path, toy):
     text = "title: t\nkind: detector_speed\ndetectors: [fast, orb]\nrounds: 1\nimages: 2\n"
-    outcome, _, path = run(tmp_path, text, tmp_path)
+    outcome, _, path = run(tmp_path, text, None)
     assert outcome.done == 1
     (task,) = found(path).of(Kind.DETECTOR_SPEED)
     assert [row["detector"] for row in task.result["rows"]] == ["fast", "orb"]
+    assert task.result["settings"]["images"] == "drawn surfaces"
+    recorded = run(tmp_path, text + "sequences: [TOY]\n", toy, out="recorded")[2]
+    (task,) = found(recorded).of(Kind.DETECTOR_SPEED)
+    assert task.result["settings"]["images"] == "frames of TOY"
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no such signals there")

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MsckfOptions:
-    """Defaults follow the published settings of OpenVINS for EuRoC where they name one, but for the noise of the IMU."""
+    """Defaults follow the published settings of OpenVINS for EuRoC where they name one, but for the IMU's noise."""
 
     max_clones: int = 11
     """Past poses kept in the state."""
@@ -42,5 +42,7 @@ class MsckfOptions:
     def __post_init__(self) -> None:
         if self.max_clones < 3 or self.max_features < 1 or self.min_track_length < 2 or self.max_slam_features < 0:
             raise ValueError("needs max_clones >= 3, max_features >= 1, min_track_length >= 2, max_slam_features >= 0")
-        if not (self.pixel_sigma > 0.0 and self.imu_noise_factor > 0.0 and 0.0 < self.gate_quantile < 1.0 and self.max_blind_s > 0.0):
-            raise ValueError("needs pixel_sigma > 0, imu_noise_factor > 0, 0 < gate_quantile < 1 and max_blind_s > 0")
+        if not (
+            min(self.pixel_sigma, self.imu_noise_factor, self.max_blind_s) > 0.0 and 0.0 < self.gate_quantile < 1.0
+        ):
+            raise ValueError("needs pixel_sigma, imu_noise_factor and max_blind_s > 0, and 0 < gate_quantile < 1")

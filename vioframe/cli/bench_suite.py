@@ -11,6 +11,9 @@ if TYPE_CHECKING:
     from vioframe.bench.suites.suite import Suite
     from vioframe.bench.suites.sweep import Agenda, Event, Outcome
 
+EXIT_FAILED = 1
+"""Some task came to nothing; the others, and the report, are there."""
+
 _FOLDER = click.Path(file_okay=False, path_type=Path)
 
 
@@ -70,14 +73,19 @@ def _run(
     planned = plan(suite, data, registry.load())
     store = Store.at(out or Path("results") / suite.name, recordings)
     store.begin(planned, overwrite=overwrite)
-    left = agenda(planned, store)
-    with _Watch(left, quiet) as watch:
-        outcome = sweep(left, store, workers=_workers(suite, workers), scheduler=scheduler, on_event=watch)
+    with store.alone():
+        left = agenda(planned, store)
+        if left.stale:
+            click.echo(f"note: {left.stale} results are of other code or data, and are made again", err=True)
+        with _Watch(left, quiet) as watch:
+            outcome = sweep(left, store, workers=_workers(suite, workers), scheduler=scheduler, on_event=watch)
     _say(outcome, store.path)
     if not no_report:
         from vioframe.cli.report import write_and_say
 
         write_and_say(store.path)
+    if outcome.failed:
+        click.get_current_context().exit(EXIT_FAILED)
 
 
 _NO_USE = {"detector_speed": ("seeds", "workers", "scheduler", "recordings"), "trials": ("data", "recordings")}

@@ -13,12 +13,13 @@ from vioframe import machine
 from vioframe.registry import Registry
 
 # They read results and make none.
-_NO_PART = ("report", "cli")
+_NO_PART = (("cli",), ("report", "suite"))
+_ENDINGS = (".py", ".yaml")
 
 
 def code_version(installed: Registry) -> str:
     """A digest of vioframe, of every installed plug-in, and of the versions of what they are built on."""
-    modules = {part.source.module for table in installed.parts.values() for part in table.values()}
+    modules = {part.source.module.partition(".")[0] for table in installed.parts.values() for part in table.values()}
     return _digest(tuple(sorted(modules)))
 
 
@@ -33,8 +34,9 @@ def _digest(modules: tuple[str, ...]) -> str:
 
 def _framework() -> Iterator[Path]:
     root = Path(vioframe.__file__).parent
-    for path in sorted(root.rglob("*.py")):
-        if path.relative_to(root).parts[0] not in _NO_PART:
+    for path in sorted(root.rglob("*")):
+        parts = path.relative_to(root).parts
+        if path.suffix in _ENDINGS and not any(parts[: len(none)] == none for none in _NO_PART):
             yield path
 
 

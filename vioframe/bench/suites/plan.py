@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
@@ -19,10 +19,12 @@ from vioframe.bench.suites.sources import Flown
 from vioframe.bench.suites.suite import SEED_SHIFT_S, BackendContender, Contender, Suite, montecarlo_setup
 from vioframe.calibration import packaged_calibration
 from vioframe.config import Config, DatasetConfig, PartConfig
+from vioframe.errors import ConfigError, DatasetError
 from vioframe.registry import BACKEND, DETECTOR, Registry
 from vioframe.report.metrics import create_metrics
 from vioframe.report.suite.results import Data, Kind, Labels
 from vioframe.simulation.config import SimulationConfig
+from vioframe.simulation.flights import flight as named_flight
 
 CLEAR = "clear"
 
@@ -72,11 +74,12 @@ class TrialJob(Job):
 
 @dataclass(frozen=True, slots=True)
 class SpeedJob(Job):
-    """All detectors timed in turns."""
+    """All detectors timed in turns, on so many ``images`` of ``recording``, or on drawn surfaces."""
 
     detectors: tuple[Contender, ...]
     rounds: int
     images: int
+    recording: Path | None
 
 
 AnyJob = FlightJob | TrialJob | SpeedJob
@@ -92,13 +95,20 @@ class Plan:
 
 def plan(suite: Suite, folders: Sequence[Path], installed: Registry) -> Plan:
     """Raises :class:`vioframe.errors.VioframeError` for all that can be told before the first task."""
+    jobs: Iterable[AnyJob]
     if suite.kind == "flights":
         _create(suite, installed)
-        return Plan(suite, tuple(_flights(suite, folders, installed)))
-    if suite.kind == "trials":
+        jobs = _flights(suite, folders, installed)
+    elif suite.kind == "trials":
         _create(suite, installed)
-        return Plan(suite, tuple(_trials(suite, installed)))
-    return Plan(suite, (_speed(suite, installed),))
+        jobs = _trials(suite, installed)
+    else:
+        jobs = [_speed(suite, folders, installed)]
+    by_key: dict[str, AnyJob] = {}
+    for job in jobs:
+        if by_key.setdefault(job.key, job) is not job:
+            raise ConfigError(f"two tasks of {suite.name} would be called {job.key}; give their parts other labels")
+    return Plan(suite, tuple(by_key.values()))
 
 
 def _create(suite: Suite, installed: Registry) -> None:
@@ -184,6 +194,7 @@ def _recording(sequence: str, config: SimulationConfig, data: str, code: str) ->
 
 def _trials(suite: Suite, installed: Registry) -> Iterator[TrialJob]:
     code, setup = code_version(installed), montecarlo_setup(suite)
+    named_flight(setup.flight, setup.duration_s, packaged_calibration("euroc").R_BC)  # says so where there is none
     for backend, seed in product(suite.backends, range(suite.seeds)):
         options = installed.find(BACKEND, backend.name).validate(backend.options)
         labels = Labels(setup.flight, CLEAR, 0.0, "simulated tracks", backend.called, seed)
@@ -201,21 +212,29 @@ def _trials(suite: Suite, installed: Registry) -> Iterator[TrialJob]:
         )
 
 
-def _speed(suite: Suite, installed: Registry) -> SpeedJob:
+def _speed(suite: Suite, folders: Sequence[Path], installed: Registry) -> SpeedJob:
     for detector in suite.detectors:
         installed.find(DETECTOR, detector.name).validate(detector.options)
     about = [each.model_dump() for each in suite.detectors]
+    found = [sources.find_source(each.name, folders, installed) for each in suite.sequences] if folders else []
+    source = next((each for each in found if each.recording is not None), None)
+    if folders and source is None:
+        names = ", ".join(each.name for each in suite.sequences) or "no sequence"
+        raise DatasetError(f"--data holds no images of {names}; leave it out to time detectors on drawn surfaces")
+    images = "drawn surfaces" if source is None else f"frames of {source.name}"
+    data = "drawn" if source is None or source.recording is None else sources.fingerprint_of([source.recording])
     return SpeedJob(
         "detector_speed",
         Kind.DETECTOR_SPEED,
         None,
-        None,
-        "drawn surfaces, 640 x 480, 300 keypoints, one image at a time",
-        {"code": code_version(installed), "config": _digest(about, suite.rounds, suite.images), "data": "drawn"},
+        None if source is None else source.kind,
+        f"{images}, 640 x 480, 300 keypoints, one image at a time",
+        {"code": code_version(installed), "config": _digest(about, suite.rounds, suite.images), "data": data},
         60.0,
         suite.detectors,
         suite.rounds,
         suite.images,
+        None if source is None else source.recording,
     )
 
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from vioframe.bench.suites.euroc import EUROC
+from vioframe.calibration import sidecar_folder
 from vioframe.config import PartConfig
 from vioframe.errors import ConfigError, DatasetError
 from vioframe.options import did_you_mean
@@ -55,7 +56,7 @@ def find_source(name: str, folders: Sequence[Path], installed: Registry) -> Sour
     recording, kind, motion = None, Data.REAL, None
     for path in _candidates(name, folders):
         if recording is None and _has_images(path):
-            recording, kind = path, _kind_of(path)
+            recording, kind = path, _kind_of(path, installed)
         if motion is None and _is_motion(path):
             motion = path
     known = name in EUROC or name in installed.names(FLIGHT)
@@ -103,32 +104,34 @@ def flown(
     flight = known.stand_in.flight if known else PartConfig(name=source.name)
     usual_s = known.stand_in.duration_s if known else DEFAULT_STAND_IN_S
     # A stand-in begins at its beginning: there is no shaking before the take-off to be skipped.
+    start_s = 0.0 if known or start_s is None else start_s
     config = SimulationConfig(
         flight=flight,
-        duration_s=min(usual_s, duration_s or usual_s) if known else duration_s or usual_s,
+        duration_s=min(usual_s, duration_s or usual_s) if known else start_s + (duration_s or usual_s),
         seed=seed,
         conditions={**(known.stand_in.conditions if known else {}), **conditions},
     )
-    stands_in = f"a simulated flight stands in for {source.name}: its length, speed and light, not its path"
+    stands_in = f"a simulated flight stands in for {source.name}: its speed and light, not its path"
     note = stands_in if known else f"simulated flight {source.name}"
-    return Flown(Data.SIMULATED, note, 0.0, simulated=simulation.complete(config, installed))
+    return Flown(Data.SIMULATED, note, start_s, simulated=simulation.complete(config, installed))
 
 
 def fingerprint(flown: Flown) -> str:
     """Tells data from other data: of a recording its files' names, sizes and samples of their bytes."""
-    digest = hashlib.sha256()
     if flown.simulated is not None:
         # Where the motion lies says nothing about it.
         motion = flown.simulated.recorded
         plain = flown.simulated.model_copy(update={"recorded": None, "made": {}}).model_dump_json()
-        digest.update(plain.encode())
-        if motion is not None:
-            _add_files(digest, _motion_files(motion))
-    else:
-        assert flown.recording is not None
-        _add_files(digest, _files_of(flown.recording))
-        if flown.ground_truth is not None:
-            _add_files(digest, [flown.ground_truth])
+        return fingerprint_of([] if motion is None else _motion_files(motion), plain)
+    assert flown.recording is not None
+    return fingerprint_of([flown.recording] if flown.ground_truth is None else [flown.recording, flown.ground_truth])
+
+
+def fingerprint_of(paths: Iterable[Path], text: str = "") -> str:
+    """Of recordings with the calibration beside them, of other files, and of a text."""
+    digest = hashlib.sha256(text.encode())
+    for path in paths:
+        _add_files(digest, [*_files_of(path), *_files_of(sidecar_folder(path))])
     return digest.hexdigest()[:16]
 
 
@@ -167,10 +170,15 @@ def _motion_files(path: Path) -> list[Path]:
     return list(motion_files(sensor_folder(path)))
 
 
-def _kind_of(recording: Path) -> Data:
+def _kind_of(recording: Path, installed: Registry) -> Data:
     """A recording of vioframe's simulator says so itself, by what lies beside it."""
     manifest = simulation_folder(recording) / MANIFEST
     if not manifest.is_file():
+        if recording.is_file() and installed.open_dataset(recording).ground_truth is not None:
+            raise DatasetError(
+                f"{recording} holds ground truth, so the simulator wrote it, but {manifest.parent.name} with what it "
+                "was made of is not beside it; copy that too"
+            )
         return Data.REAL
     return Data.RENDERED if simulation.read(manifest).recorded is not None else Data.SIMULATED
 
@@ -188,6 +196,7 @@ def _truth_of(recording: Path, motion: Path | None, installed: Registry) -> Path
 
 
 def _files_of(recording: Path) -> list[Path]:
+    """The files that tell a recording; none where there is nothing."""
     if recording.is_file():
         return [recording]
     # Thousands of images: the list of their stamps, and the readings, tell the sequence as well.

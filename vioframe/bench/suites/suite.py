@@ -14,7 +14,7 @@ from vioframe.bench.montecarlo import Setup
 from vioframe.config import PartConfig, Section, read_tree, to_yaml, validate
 from vioframe.errors import ConfigError
 from vioframe.frontend import FrontendOptions
-from vioframe.options import did_you_mean
+from vioframe.options import did_you_mean, validate_options
 from vioframe.simulation.conditions import Conditions
 
 Kind = Literal["flights", "detector_speed", "trials"]
@@ -112,8 +112,10 @@ class Suite(Section):
                 raise ValueError(f"{what}: {twice!r} is named twice; give each a label of its own")
         if not (self.clear or self.conditions):
             raise ValueError("neither clear nor under a condition there is nothing to fly")
-        for name in self.conditions:
+        for name, levels in self.conditions.items():
             Conditions.of({name: 1.0})
+            if len(set(levels)) < len(levels):
+                raise ValueError(f"conditions: {name} has a level twice")
         _check_unused(self)
         return self
 
@@ -126,7 +128,7 @@ _USES: Mapping[Kind, frozenset[str]] = {
         ("detectors", "backends", "sequences", "conditions", "clear", "seeds", "seeds_vary", "metrics", "frontend")
     )
     | {"workers", "published"},
-    "detector_speed": frozenset(("detectors", "rounds", "images")),
+    "detector_speed": frozenset(("detectors", "sequences", "rounds", "images")),
     "trials": frozenset(("backends", "seeds", "setup", "workers")),
 }
 _ALWAYS = frozenset(("name", "title", "description", "kind"))
@@ -166,7 +168,7 @@ def read(path: Path) -> Suite:
     suite = validate(Suite, tree, str(path))
     if suite.kind == "trials":
         montecarlo_setup(suite)
-    FrontendOptions(**suite.frontend) if suite.frontend else None
+    FrontendOptions(**validate_options("the front-end", FrontendOptions, suite.frontend))
     return suite
 
 
@@ -177,6 +179,8 @@ def narrowed(
     changes: dict[str, Any] = {} if seeds is None else {"seeds": seeds}
     for kind, names in (("detectors", detectors), ("backends", backends), ("sequences", sequences)):
         have = {each.called: each for each in getattr(suite, kind)}
+        if not have and suite.kind == "detector_speed":
+            have = {name: Contender(name=name) for name in names}  # it names none and means all
         for name in names:
             if name not in have:
                 there = f"; it has {', '.join(have)}" if have else ""

@@ -14,9 +14,10 @@ from typing import TYPE_CHECKING, Any
 
 from vioframe.bench.suites import tasks
 from vioframe.bench.suites.cluster import connected
+from vioframe.bench.suites.code import code_version
 from vioframe.bench.suites.plan import AnyJob, FlightJob, Plan, RecordingJob, SpeedJob
 from vioframe.bench.suites.store import Store
-from vioframe.errors import VioframeError
+from vioframe.errors import RunError, VioframeError
 from vioframe.registry import describe
 
 if TYPE_CHECKING:
@@ -50,6 +51,8 @@ class Agenda:
 
     jobs: tuple[AnyJob, ...]
     reused: int
+    stale: int
+    """Results there are that other code or data made, and that are made again."""
 
     @property
     def recordings(self) -> dict[str, RecordingJob]:
@@ -64,7 +67,7 @@ class Agenda:
 def agenda(plan: Plan, store: Store) -> Agenda:
     """Every task of ``plan`` that ``store`` has no result of, by the same code on the same data."""
     left = tuple(job for job in plan.jobs if not store.done(job))
-    return Agenda(left, len(plan.jobs) - len(left))
+    return Agenda(left, len(plan.jobs) - len(left), sum(store.stale(job) for job in left))
 
 
 def sweep(
@@ -88,8 +91,18 @@ def sweep(
             _report(outcome, on_event, job, _attempt_here(store, job))
     if flown:
         with connected(workers, scheduler) as client:
+            if scheduler is not None:
+                _check_code(client)
             _Drive(client, store, flown, left, outcome, on_event, helpers=scheduler is None).run()
     return outcome
+
+
+def _check_code(client: Client) -> None:
+    """Raise :class:`RunError` where a worker elsewhere would not run what runs here."""
+    here = code_version(tasks.installed())
+    others = [worker for worker, version in client.run(tasks.code).items() if version != here]
+    if others:
+        raise RunError(f"the worker {others[0]} has other code, plug-ins or versions; install the same there")
 
 
 class _Drive:
@@ -122,11 +135,16 @@ class _Drive:
                 self._ready.append(job)
 
     def run(self) -> None:
+        from concurrent.futures import CancelledError
+
         from distributed import wait
 
         while self._ready or self._to_record or self._running:
             self._hand_out()
-            done = wait(list(self._running), return_when="FIRST_COMPLETED").done
+            try:
+                done = wait(list(self._running), return_when="FIRST_COMPLETED").done
+            except (CancelledError, OSError) as error:
+                raise RunError("the scheduler is gone; the same command goes on where it was") from error
             for future in done:
                 self._take_in(self._running.pop(future), future)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from functools import cache
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -11,18 +12,19 @@ from vioframe import config as configuration
 from vioframe import experiment, registry
 from vioframe.bench.montecarlo import fly
 from vioframe.bench.processes import single_threaded
+from vioframe.bench.suites.code import code_version
 from vioframe.bench.suites.plan import AnyJob, FlightJob, RecordingJob, SpeedJob, TrialJob, at
 from vioframe.bench.suites.store import Store
 from vioframe.errors import TrajectoryError
 from vioframe.report.evaluated import Evaluated, evaluate_path, with_loop_closure
+from vioframe.report.matched_truth import write_matched_truth
 from vioframe.report.metrics import create_metrics, measure
 from vioframe.report.run_folder import RunFolder
-from vioframe.report.suite.matched_truth import write_matched_truth
 from vioframe.report.suite.results import RUN_FOLDER
 from vioframe.simulation.record import record
 from vioframe.simulation.recording import SimulatedRecording
 from vioframe.trajectory import Comparison
-from vioframe.types import NS_PER_S
+from vioframe.types import NS_PER_S, Frame, Image
 
 Figures = Mapping[str, Any]
 
@@ -36,7 +38,9 @@ def perform(store: Store, job: AnyJob, attempts: int) -> None:
 def simulate(store: Store, job: RecordingJob, workers: int) -> None:
     """Make a recording by ``workers`` processes, unless it is there already."""
     path = store.recording(job)
-    if not path.exists():
+    if path.exists():
+        return
+    with single_threaded():
         record(SimulatedRecording(job.config, installed(), workers), [path])
 
 
@@ -44,6 +48,19 @@ def simulate(store: Store, job: RecordingJob, workers: int) -> None:
 def installed() -> registry.Registry:
     """Loaded once in each process."""
     return registry.load()
+
+
+def code() -> str:
+    """The version of the code in this process."""
+    return code_version(installed())
+
+
+def _frames(recording: Path, count: int) -> list[Image]:
+    """``count`` images of a recording, evenly over it."""
+    dataset = installed().open_dataset(recording)
+    step = max((dataset.frame_count or count) // count, 1)
+    frames = (each.image for each in dataset.measurements() if isinstance(each, Frame))
+    return list(islice(frames, 0, step * count, step))
 
 
 def _do(job: AnyJob, store: Store, folder: Path) -> Figures:
@@ -103,17 +120,22 @@ def _trial(job: TrialJob) -> Figures:
 def speed(job: SpeedJob) -> Figures:
     """Frames a second of each detector; those that lack something are absent, with the reason."""
     from vioframe.bench.detectors.entrants import Entrant, everyone, line_up, parse_entrants
-    from vioframe.bench.detectors.images import procedural_images
+    from vioframe.bench.detectors.images import fit, procedural_images
     from vioframe.bench.detectors.speed import MAX_POINTS, RESOLUTION, devices, time_detectors
 
     entrants = [Entrant(each.called, each.name, each.options) for each in job.detectors]
     if not entrants:
         entrants = parse_entrants(everyone(installed(), "speed"), (), installed())
     lined_up = line_up(entrants, installed())
-    rows = time_detectors(lined_up.ready, procedural_images(job.images, RESOLUTION, 0), job.rounds)
+    if job.recording is None:
+        images, source = procedural_images(job.images, RESOLUTION, 0), "drawn surfaces"
+    else:
+        images = [fit(frame, RESOLUTION) for frame in _frames(job.recording, job.images)]
+        source = f"frames of {job.recording.stem}"
+    rows = time_detectors(lined_up.ready, images, job.rounds)
     settings = {
-        "images": "drawn surfaces",
-        "image_count": job.images,
+        "images": source,
+        "image_count": len(images),
         "rounds": job.rounds,
         "resolution": RESOLUTION,
         "max_points": MAX_POINTS,
