@@ -28,7 +28,7 @@ COLUMNS = {"workers": "d", "flights": "d", "seconds": ".1f", "flights_per_minute
 
 @benchmark
 @click.option("--flights", default=24, show_default=True, help="Flights of 10 s.")
-@click.option("--rounds", default=2, show_default=True, help="Turns.")
+@click.option("--rounds", default=1, show_default=True, help="Turns.")
 def main(data: Path, backend: str, assignments: tuple[str, ...], keep: bool, flights: int, rounds: int) -> None:
     """Throughput of a sweep by the number of its workers."""
     del data, assignments
