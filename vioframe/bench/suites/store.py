@@ -153,6 +153,7 @@ def _locked(folder: Path) -> Iterator[None]:
     except ImportError:  # not on Windows
         yield
         return
+    folder.mkdir(parents=True, exist_ok=True)
     with (folder / ".lock").open("w") as file:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
