@@ -87,6 +87,22 @@ def test_a_flight_that_was_lost_for_long_or_cut_short_is_not_complete(tmp_path):
     assert [f.succeeded for f in group.flights] == [False, True, False]
 
 
+@pytest.mark.parametrize(("after_s", "outcome"), [(5.9, Outcome.COMPLETE), (6.1, Outcome.INCOMPLETE)])
+def test_a_flight_that_is_initialised_in_its_second_half_is_not_complete(tmp_path, after_s, outcome):
+    made = MadeUp(tmp_path / "r")
+    task = made.flight(labels()).parent / "task.json"
+    tree = json.loads(task.read_text())
+    tree["result"]["summary"] |= {
+        "initialised_after_s": after_s,
+        "first_frame_t_ns": 10**18,
+        "last_frame_t_ns": 10**18 + 12 * 10**9,
+    }
+    task.write_text(json.dumps(tree))
+    ((flown,),) = [group.flights for group in groups(made.load())]
+    assert flown.outcome is outcome
+    assert flown.reason == ("" if flown.complete else "initialised only after 6.1 s")
+
+
 def test_the_median_flight_is_one_that_was_flown(tmp_path):
     made = MadeUp(tmp_path / "r")
     for seed, sigma_m in enumerate((0.3, 0.02, 0.1)):

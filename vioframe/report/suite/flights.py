@@ -10,9 +10,12 @@ from typing import Any
 import numpy as np
 
 from vioframe.report.suite.results import TaskResult
+from vioframe.types import NS_PER_S
 
 COMPLETE_FROM = 0.95
 """A flight is complete where at least this part of its frames is tracked, from initialisation on."""
+BEGUN_BY = 0.5
+"""... and it was initialised before this part of its time was over."""
 SUCCESS_PERCENT = 5.0
 """A complete flight succeeded where its ATE is below this part of its path."""
 
@@ -22,7 +25,7 @@ class Outcome(StrEnum):
 
     COMPLETE = "complete"
     INCOMPLETE = "not complete"
-    """Estimated, but lost for more than a twentieth of the frames, or cut short."""
+    """Estimated, but begun late, lost for more than a twentieth of the frames, or cut short."""
     NOT_EVALUATED = "not evaluated"
     """Estimated, but there is no error to show: of too few poses, or without a ground truth."""
     NEVER_INITIALISED = "never initialised"
@@ -73,6 +76,8 @@ class Flight:
                 return str(self.task.result.get("not_evaluated") or "there is no ground truth to compare with")
             case Outcome.INCOMPLETE if self.task.result["summary"].get("finished") is False:
                 return "cut short"
+            case Outcome.INCOMPLETE if _begun_late(self.task.result["summary"], self.figures):
+                return f"initialised only after {self.figures['initialised_after_s']:.1f} s"
             case Outcome.INCOMPLETE:
                 return f"tracked {100 * self.figures['completion']:.1f} % of its frames"
         return ""
@@ -121,4 +126,11 @@ def _outcome(task: TaskResult, figures: Mapping[str, float]) -> Outcome:
     if "ate_m" not in figures:
         return Outcome.NOT_EVALUATED
     done = summary.get("finished", True) and figures.get("completion", 0.0) >= COMPLETE_FROM
-    return Outcome.COMPLETE if done else Outcome.INCOMPLETE
+    return Outcome.COMPLETE if done and not _begun_late(summary, figures) else Outcome.INCOMPLETE
+
+
+def _begun_late(summary: Mapping[str, Any], figures: Mapping[str, float]) -> bool:
+    if not {"first_frame_t_ns", "last_frame_t_ns"} <= summary.keys():
+        return False
+    flown_s = (summary["last_frame_t_ns"] - summary["first_frame_t_ns"]) / NS_PER_S
+    return bool(figures["initialised_after_s"] > BEGUN_BY * flown_s)
