@@ -23,8 +23,8 @@ from vioframe import registry
 from vioframe.bench import run_backend
 from vioframe.bench.consistency import PARTS, Outcome, Trial, average_band
 from vioframe.bench.contenders import Contender, parse_contenders
-from vioframe.bench.montecarlo import Setup, _installed, nees_by_stretch, run_montecarlo
-from vioframe.bench.processes import usable_cores
+from vioframe.bench.montecarlo import Setup, nees_by_stretch, run_montecarlo
+from vioframe.bench.processes import installed, usable_cores
 from vioframe.cli import main
 from vioframe.errors import ConfigError, PluginError
 from vioframe.geometry import so3
@@ -89,9 +89,9 @@ def parts(tmp_path, monkeypatch):
     """A working folder of its own, with the back-ends above installed."""
     install(tmp_path / "site", monkeypatch, distribution="odd-parts", module="odd_parts", code=PARTS_THAT_FAIL)
     monkeypatch.chdir(tmp_path)
-    _installed.cache_clear()
+    installed.cache_clear()
     yield
-    _installed.cache_clear()
+    installed.cache_clear()
 
 
 def montecarlo(*arguments: object, code: int = 0):

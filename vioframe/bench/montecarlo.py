@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
-from functools import cache
 from itertools import product
 
 import numpy as np
@@ -16,7 +15,7 @@ import numpy as np
 from vioframe import registry
 from vioframe.bench.consistency import PARTS, Outcome, Trial
 from vioframe.bench.contenders import Contender
-from vioframe.bench.processes import map_in_processes
+from vioframe.bench.processes import installed, map_in_processes
 from vioframe.bench.results import backend_row
 from vioframe.bench.run import BackendRun, run_backend
 from vioframe.calibration import packaged_calibration
@@ -116,7 +115,7 @@ def check_montecarlo(setups: Sequence[Setup], contenders: Sequence[Contender], s
         named_flight(setup.flight, setup.duration_s, calibration.R_BC)
     for contender in contenders:
         # Creating one also compiles its kernels, which the workers would do all at once.
-        _installed().create_backend(contender.backend, calibration, contender.options)
+        installed().create_backend(contender.backend, calibration, contender.options)
 
 
 def fly(setup: Setup, contender: Contender, seed: int) -> Trial:
@@ -124,7 +123,7 @@ def fly(setup: Setup, contender: Contender, seed: int) -> Trial:
     from threadpoolctl import threadpool_limits
 
     sequence = setup.sequence(seed)
-    backend = _installed().create_backend(contender.backend, sequence.calibration, contender.options)
+    backend = installed().create_backend(contender.backend, sequence.calibration, contender.options)
     # Small matrices; and sums in another order would be other results.
     with threadpool_limits(1):
         try:
@@ -176,9 +175,3 @@ def _against(run: BackendRun, truth: Trajectory) -> list[tuple[Trajectory, Traje
 
 def _fly_job(job: _Job) -> Trial:
     return fly(job.setup, job.contender, job.seed)
-
-
-@cache
-def _installed() -> registry.Registry:
-    """Loaded once in each process."""
-    return registry.load()

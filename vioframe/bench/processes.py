@@ -9,13 +9,22 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
+from functools import cache
 from multiprocessing import active_children, get_context
 from typing import TypeVar
 
+from vioframe import registry
 from vioframe.errors import RunError
+from vioframe.registry import Registry
 
 JobT = TypeVar("JobT")
 ResultT = TypeVar("ResultT")
+
+
+@cache
+def installed() -> Registry:
+    """The installed parts, loaded once in each process."""
+    return registry.load()
 
 
 def usable_cores() -> int:

@@ -144,14 +144,7 @@ def _speed(request: _Request, images: Path | None, limit: int | None, rounds: in
     lined_up = line_up(request.entrants, request.installed)
     with _watch("rounds", rounds + 1, request.quiet) as on_done:
         rows = speed.time_detectors(lined_up.ready, pictures, rounds, on_round=on_done)
-    settings = {
-        "images": source,
-        "image_count": len(pictures),
-        "rounds": rounds,
-        "resolution": speed.RESOLUTION,
-        "max_points": speed.MAX_POINTS,
-        "devices": speed.devices(),
-    }
+    settings = speed.speed_settings(source, len(pictures), rounds)
     return _Answer(rows, settings, [tables.speed_table(rows, lined_up.absent, settings)], lined_up)
 
 

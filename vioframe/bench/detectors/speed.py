@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Sequence
 from time import perf_counter
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -71,6 +71,18 @@ def devices() -> list[str]:
         found[0] += f", torch on {torch.get_num_threads()}"
         found += [torch.cuda.get_device_name(k) for k in range(torch.cuda.device_count())]
     return found
+
+
+def speed_settings(images: str, image_count: int, rounds: int) -> dict[str, Any]:
+    """What figures of speed are to be read with: ``images`` says what was looked at."""
+    return {
+        "images": images,
+        "image_count": image_count,
+        "rounds": rounds,
+        "resolution": RESOLUTION,
+        "max_points": MAX_POINTS,
+        "devices": devices(),
+    }
 
 
 def _row(entrant: Entrant, detector: Detector, seconds: Float, points: Int) -> Row:

@@ -17,7 +17,7 @@ from vioframe.report.suite.results import Data
 from vioframe.simulation import config as simulation
 from vioframe.simulation.config import SimulationConfig
 from vioframe.simulation.files import MANIFEST, simulation_folder
-from vioframe.simulation.recorded_motion import GROUND_TRUTH_FILES, find_file, sensor_folder
+from vioframe.simulation.recorded_motion import GROUND_TRUTH_FILES, find_file, motion_files, sensor_folder
 
 DEFAULT_STAND_IN_S = 30.0
 # EuRoC's own site has MACHINE/SEQUENCE/SEQUENCE.bag.
@@ -81,26 +81,25 @@ def flown(
 ) -> Flown:
     """What to fly ``source`` on. Under ``conditions`` images are rendered; the seed is that of what is simulated."""
     known = EUROC.get(source.name)
+    begin_s = start_s if start_s is not None else known.start_s if known else 0.0
     if source.recording is not None and (not conditions or source.kind is not Data.REAL):
         if conditions:
             raise ConfigError(f"{source.recording} is a simulation already: conditions need the real recording")
-        start_s = (known.start_s if known else 0.0) if start_s is None else start_s
         note = {
             Data.REAL: f"{source.name}: recorded images and IMU",
             Data.RENDERED: f"{source.name}: recorded IMU and motion, images rendered",
             Data.SIMULATED: f"{source.name}: simulated motion, IMU and images",
         }[source.kind]
-        return Flown(source.kind, note, start_s, source.recording, source.ground_truth)
+        return Flown(source.kind, note, begin_s, source.recording, source.ground_truth)
     if source.motion is not None:
-        start_s = (known.start_s if known else 0.0) if start_s is None else start_s
         config = SimulationConfig(
             recorded=source.motion,
-            duration_s=None if duration_s is None else start_s + duration_s,
+            duration_s=None if duration_s is None else begin_s + duration_s,
             seed=seed,
             conditions=dict(conditions),
         )
         note = f"{source.name}: its recorded IMU and motion, images rendered along them; not EuRoC's images"
-        return Flown(Data.RENDERED, note, start_s, simulated=simulation.complete(config, installed))
+        return Flown(Data.RENDERED, note, begin_s, simulated=simulation.complete(config, installed))
     flight = known.stand_in.flight if known else PartConfig(name=source.name)
     usual_s = known.stand_in.duration_s if known else DEFAULT_STAND_IN_S
     # A stand-in begins at its beginning: there is no shaking before the take-off to be skipped.
@@ -122,7 +121,7 @@ def fingerprint(flown: Flown) -> str:
         # Where the motion lies says nothing about it.
         motion = flown.simulated.recorded
         plain = flown.simulated.model_copy(update={"recorded": None, "made": {}}).model_dump_json()
-        return fingerprint_of([] if motion is None else _motion_files(motion), plain)
+        return fingerprint_of([] if motion is None else motion_files(sensor_folder(motion)), plain)
     assert flown.recording is not None
     return fingerprint_of([flown.recording] if flown.ground_truth is None else [flown.recording, flown.ground_truth])
 
@@ -158,16 +157,10 @@ def _is_motion(path: Path) -> bool:
     if not path.is_dir():
         return False
     try:
-        _motion_files(path)
+        motion_files(sensor_folder(path))
     except DatasetError:
         return False
     return True
-
-
-def _motion_files(path: Path) -> list[Path]:
-    from vioframe.simulation.recorded_motion import motion_files
-
-    return list(motion_files(sensor_folder(path)))
 
 
 def _kind_of(recording: Path, installed: Registry) -> Data:

@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Any
 
 from vioframe.bench.suites import tasks
 from vioframe.bench.suites.cluster import connected
-from vioframe.bench.suites.code import code_version
 from vioframe.bench.suites.plan import AnyJob, FlightJob, Plan, RecordingJob, SpeedJob
 from vioframe.bench.suites.store import Store
 from vioframe.errors import RunError, VioframeError
@@ -99,7 +98,7 @@ def sweep(
 
 def _check_code(client: Client) -> None:
     """Raise :class:`RunError` where a worker elsewhere would not run what runs here."""
-    here = code_version(tasks.installed())
+    here = tasks.code()
     others = [worker for worker, version in client.run(tasks.code).items() if version != here]
     if others:
         raise RunError(f"the worker {others[0]} has other code, plug-ins or versions; install the same there")

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from functools import cache
 from itertools import islice
 from pathlib import Path
 from typing import Any
 
-from vioframe import config as configuration
-from vioframe import experiment, registry
+from vioframe import experiment
 from vioframe.bench.montecarlo import fly
-from vioframe.bench.processes import single_threaded
+from vioframe.bench.processes import installed, single_threaded
 from vioframe.bench.suites.code import code_version
 from vioframe.bench.suites.plan import AnyJob, FlightJob, RecordingJob, SpeedJob, TrialJob, at
 from vioframe.bench.suites.store import Store
@@ -44,12 +42,6 @@ def simulate(store: Store, job: RecordingJob, workers: int) -> None:
         record(SimulatedRecording(job.config, installed(), workers), [path])
 
 
-@cache
-def installed() -> registry.Registry:
-    """Loaded once in each process."""
-    return registry.load()
-
-
 def code() -> str:
     """The version of the code in this process."""
     return code_version(installed())
@@ -76,7 +68,7 @@ def _flight(job: FlightJob, store: Store, folder: Path) -> Figures:
     if job.recording is not None:
         config = config.model_copy(update={"dataset": at(config.dataset, store.recording(job.recording))})
     run = folder / RUN_FOLDER
-    summary = experiment.record(experiment.prepare(configuration.complete(config, installed()), installed()), run)
+    summary = experiment.record(experiment.prepare(config, installed()), run)
     figures: dict[str, Any] = {"summary": summary, "evaluation": None, "evaluation_loop": None, "metrics": {}}
     figures |= _timing(run)
     try:
@@ -121,7 +113,7 @@ def speed(job: SpeedJob) -> Figures:
     """Frames a second of each detector; those that lack something are absent, with the reason."""
     from vioframe.bench.detectors.entrants import Entrant, everyone, line_up, parse_entrants
     from vioframe.bench.detectors.images import fit, procedural_images
-    from vioframe.bench.detectors.speed import MAX_POINTS, RESOLUTION, devices, time_detectors
+    from vioframe.bench.detectors.speed import RESOLUTION, speed_settings, time_detectors
 
     entrants = [Entrant(each.called, each.name, each.options) for each in job.detectors]
     if not entrants:
@@ -133,12 +125,5 @@ def speed(job: SpeedJob) -> Figures:
         images = [fit(frame, RESOLUTION) for frame in _frames(job.recording, job.images)]
         source = f"frames of {job.recording.stem}"
     rows = time_detectors(lined_up.ready, images, job.rounds)
-    settings = {
-        "images": source,
-        "image_count": len(images),
-        "rounds": job.rounds,
-        "resolution": RESOLUTION,
-        "max_points": MAX_POINTS,
-        "devices": devices(),
-    }
+    settings = speed_settings(source, len(images), job.rounds)
     return {"rows": rows, "absent": dict(lined_up.absent), "settings": settings}

@@ -19,6 +19,7 @@ from vioframe.trajectory.metrics import rotation_error_deg
 from vioframe.types import NS_PER_S, Float, Int
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 _COLUMN_INCH = 5.6
@@ -135,16 +136,8 @@ def translation_error(course: Course) -> Figure:
             ax.axhspan(-BAND_M, BAND_M, **_BAND)
             ax.axhline(0.0, color="black", lw=0.8)
             for each, share in zip(drawn, shares, strict=True):
-                label = f"{share[axis]:.1f} % inside"
-                values = each.broken(each.errors.position_m[:, k])
-                ax.plot(
-                    course.times(each),
-                    values,
-                    color=_colour(course, each),
-                    lw=1.5,
-                    label=label,
-                )
-            ax.legend(loc="lower right", bbox_to_anchor=(1.0, 0.98), ncols=len(drawn), fontsize=10.5, borderpad=0.1)
+                _plot(ax, course, each, each.errors.position_m[:, k], f"{share[axis]:.1f} % inside")
+            _legend_above(ax, drawn)
         column[0].set_title(backend, pad=24)
     _finish(figure, panels, names)
     sizes = [[each.errors.position_m for each in drawn] for _, drawn in course.columns()]
@@ -163,8 +156,7 @@ def rotation_error(course: Course) -> Figure:
         for k, ax in enumerate(column):
             ax.axhline(0.0, color="black", lw=0.8)
             for each in drawn:
-                values = each.broken(each.errors.rotation_rpy_deg[:, k])
-                ax.plot(course.times(each), values, color=_colour(course, each), lw=1.5)
+                _plot(ax, course, each, each.errors.rotation_rpy_deg[:, k])
         column[0].set_title(backend)
     _finish(figure, panels, names)
     _scale(panels, [[each.errors.rotation_rpy_deg for each in drawn] for _, drawn in course.columns()], symmetric=True)
@@ -181,16 +173,8 @@ def comparison(course: Course) -> Figure:
         for ax, measure, unit in zip(column, _SIZES, ("m", "deg"), strict=True):
             for each in drawn:
                 size = measure(each.errors)
-                label = f"RMSE {np.sqrt(np.mean(size**2)):.3g} {unit}"
-                values = each.broken(size)
-                ax.plot(
-                    course.times(each),
-                    values,
-                    color=_colour(course, each),
-                    lw=1.5,
-                    label=label,
-                )
-            ax.legend(loc="lower right", bbox_to_anchor=(1.0, 0.98), ncols=len(drawn), fontsize=10.5, borderpad=0.1)
+                _plot(ax, course, each, size, f"RMSE {np.sqrt(np.mean(size**2)):.3g} {unit}")
+            _legend_above(ax, drawn)
         column[0].set_title(backend, pad=24)
     _finish(figure, panels, names)
     for row, measure in zip(panels, _SIZES, strict=True):
@@ -217,6 +201,15 @@ def _median(group: Group) -> Drawn | None:
 
 def _colour(course: Course, each: Drawn) -> str:
     return course.look.colour(each.group.cell.detector)
+
+
+def _plot(ax: Axes, course: Course, each: Drawn, values: Float, label: str | None = None) -> None:
+    """``values`` (N,) of a flight over its time."""
+    ax.plot(course.times(each), each.broken(values), color=_colour(course, each), lw=1.5, label=label)
+
+
+def _legend_above(ax: Axes, drawn: Sequence[Drawn]) -> None:
+    ax.legend(loc="lower right", bbox_to_anchor=(1.0, 0.98), ncols=len(drawn), fontsize=10.5, borderpad=0.1)
 
 
 def _figure(course: Course, height: float) -> Figure:
