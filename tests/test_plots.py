@@ -157,6 +157,12 @@ def test_the_bars_add_up_to_the_time_a_frame(runs):
     assert f"{max(ends):.1f} ms" in {text.get_text() for text in ax.texts}
 
 
+def test_a_run_without_times_has_no_bar(runs):
+    truth = flight()
+    ax = plot_cost.timing([evaluate_run(truth, truth), *runs]).axes[0]
+    assert [label.get_text() for label in ax.get_yticklabels()] == [run.name for run in runs]
+
+
 def test_figures_that_cannot_be_written_are_one_line(folder, tmp_path):
     (tmp_path / "file").write_text("")
     result = CliRunner().invoke(main, ["plot", str(folder / "a"), "--out", str(tmp_path / "file")])

@@ -9,6 +9,7 @@ from pathlib import Path
 from time import monotonic, sleep
 
 import pytest
+from plugin_helpers import install
 from suite_recordings import install_parts, record_toy
 
 from vioframe import registry
@@ -28,6 +29,12 @@ backends: [{name: counting, options: {}}]
 sequences: [TOY]
 seeds: 2
 metrics: ["band:half_width_m=0.2"]
+"""
+
+MORE = """
+@hookimpl
+def vioframe_backends():
+    return {"idle": object}
 """
 
 
@@ -152,11 +159,15 @@ class TestSweep:
         assert len(outcome.failed) == 2
         assert {task.error for task in found(path).tasks} == {"", "its worker died, killed or short of memory"}
 
-    def test_workers_of_a_scheduler_elsewhere_do_it_as_well(self, tmp_path, toy):
+    def test_workers_of_a_scheduler_elsewhere_do_it_as_well(self, tmp_path, toy, monkeypatch):
         from distributed import LocalCluster
 
         with LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=None, memory_limit=0) as cluster:
             outcome, _, path = run(tmp_path, GRID, toy, scheduler=cluster.scheduler_address)
+            # A plug-in that is installed here since, and not there.
+            install(tmp_path / "more", monkeypatch, distribution="more", module="more_parts", code=MORE)
+            with pytest.raises(RunError, match="has other code, plug-ins or versions"):
+                run(tmp_path, GRID, toy, scheduler=cluster.scheduler_address, out="again")
         assert outcome.done == 4
         assert estimates(path) == estimates(run(tmp_path, GRID, toy, out="local")[2])
 

@@ -21,22 +21,24 @@ def timing(runs: Sequence[Evaluated]) -> Figure:
     from matplotlib.figure import Figure
     from matplotlib.patches import Patch
 
-    spent = [run.stage_ms() for run in runs]
+    # What loop closure made of a run has no times of its own.
+    timed = [(run.name, stage_ms) for run in runs if (stage_ms := run.stage_ms())]
+    spent = [stage_ms for _, stage_ms in timed]
     stages = list(dict.fromkeys(stage for each in spent for stage in each))
-    figure = Figure(figsize=(10.0, 2.6 + 0.75 * len(runs) + 0.25 * (len(stages) // 3)), layout="constrained")
+    figure = Figure(figsize=(10.0, 2.6 + 0.75 * len(timed) + 0.25 * (len(stages) // 3)), layout="constrained")
     ax: Any = figure.subplots()
-    left = np.zeros(len(runs))
+    left = np.zeros(len(timed))
     handles = []
     for k, stage in enumerate(stages):
         hatch = _HATCHES[(k // PALETTE_SIZE) % len(_HATCHES)]
         look: dict[str, Any] = {"facecolor": colour(k), "hatch": hatch, "edgecolor": "white", "lw": 0.5}
         width = np.array([each.get(stage, 0.0) for each in spent])
-        ax.barh(range(len(runs)), width, left=left, height=0.6, **look)
+        ax.barh(range(len(timed)), width, left=left, height=0.6, **look)
         left += width
         handles.append(Patch(**look, label=stage))
     for i, total in enumerate(left):
         ax.annotate(f"{total:.1f} ms", (total, i), xytext=(6, 0), textcoords="offset points", va="center")
-    ax.set_yticks(range(len(runs)), [run.name for run in runs])
+    ax.set_yticks(range(len(timed)), [name for name, _ in timed])
     ax.invert_yaxis()
     ax.set_xlim(0.0, 1.12 * max(float(left.max()), 1e-3))
     ax.set_xlabel("mean time a frame [ms]")

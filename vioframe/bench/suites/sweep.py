@@ -91,15 +91,14 @@ def sweep(
     if flown:
         with connected(workers, scheduler) as client:
             if scheduler is not None:
-                _check_code(client)
+                _check_code(client, planned=flown[0].fingerprint["code"])
             _Drive(client, store, flown, left, outcome, on_event, helpers=scheduler is None).run()
     return outcome
 
 
-def _check_code(client: Client) -> None:
-    """Raise :class:`RunError` where a worker elsewhere would not run what runs here."""
-    here = tasks.code()
-    others = [worker for worker, version in client.run(tasks.code).items() if version != here]
+def _check_code(client: Client, planned: str) -> None:
+    """Raise :class:`RunError` where a worker elsewhere has other code than the tasks were ``planned`` with."""
+    others = [worker for worker, version in client.run(tasks.code).items() if version != planned]
     if others:
         raise RunError(f"the worker {others[0]} has other code, plug-ins or versions; install the same there")
 
