@@ -143,7 +143,13 @@ class TestRealMotion:
         assert 0.2 < np.mean([errors.nees for _, errors, _ in results if errors]) < 2.0
 
     @pytest.mark.slow
-    @pytest.mark.parametrize("name", ["MH_02_easy", "MH_03_medium", "MH_05_difficult", "V1_01_easy", "V1_02_medium"])
+    @pytest.mark.parametrize(
+        "name",
+        [
+            *("MH_03_medium", "MH_05_difficult", "V1_02_medium"),
+            *(pytest.param(name, marks=pytest.mark.very_slow) for name in ("MH_02_easy", "V1_01_easy")),
+        ],
+    )
     def test_never_wrong_wherever_it_starts(self, shared_data: Path, name: str):
         """Started every 9 s along the whole flight. Refusing is right where a vehicle hovers or lands."""
         sequence = real_motion_sequence(shared_data / "euroc_imu_gt" / name)

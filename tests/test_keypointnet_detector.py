@@ -19,7 +19,7 @@ from vioframe.types import Keypoints  # noqa: E402
 from vioframe_keypointnet import vioframe_detectors  # noqa: E402
 from vioframe_keypointnet import weights as weights_file  # noqa: E402
 from vioframe_keypointnet.folding import fold  # noqa: E402
-from vioframe_keypointnet.peaks import select_peaks  # noqa: E402
+from vioframe_keypointnet.peaks import Peaks  # noqa: E402
 from vioframe_keypointnet.runtimes import cuda  # noqa: E402
 from vioframe_keypointnet.selection import OFFSET_PX, Rules, candidate_places, padded_to_cells, select  # noqa: E402
 from vioframe_keypointnet.tensors import ranged_layers  # noqa: E402
@@ -102,6 +102,12 @@ def response_of_peaks(shape=(120, 160), seed=0):
     return cv2.GaussianBlur(np.random.default_rng(seed).normal(size=shape).astype(np.float32), (0, 0), 1.0)
 
 
+def folded(response, f=2):
+    """As networks give it: (H/f, W/f, f^2)."""
+    rows, columns = response.shape[0] // f, response.shape[1] // f
+    return np.ascontiguousarray(response.reshape(rows, f, columns, f).swapaxes(1, 2)).reshape(rows, columns, f * f)
+
+
 def peaks_by_definition(response, image, shape, rules):
     reach = max(int(np.ceil(rules.nms_px)) - 1, 1)
     kept = []
@@ -115,23 +121,24 @@ def peaks_by_definition(response, image, shape, rules):
     return np.array(kept)
 
 
-@pytest.mark.parametrize("nms_px", [0.0, 3.0, 4.5, 15.0])
-def test_peaks_are_as_defined(nms_px):
+@pytest.mark.parametrize("f", [2, 4, 8])
+@pytest.mark.parametrize("nms_px", [0.0, 3.0, 4.0, 4.5, 15.0])
+def test_peaks_are_as_defined(nms_px, f):
     response, image, rules = response_of_peaks(), half_blank((120, 160)), Rules(nms_px, min_contrast=4)
-    xy, score = select_peaks(response, image, (110, 155), 1000, rules)
+    xy, score = Peaks(rules)(folded(response, f), image, (110, 155), 1000)
     expected = peaks_by_definition(response, image, (110, 155), rules)
     assert len(expected) > 5
     assert np.array_equal(np.round(xy)[:, ::-1], expected)
     assert np.allclose(score, 1.0 / (1.0 + np.exp(-response[tuple(expected.T)])))
     assert 0.05 < np.abs(xy - np.round(xy)).mean() < 0.35
-    first, _ = select_peaks(response, image, (110, 155), 7, rules)
+    first, _ = Peaks(rules)(folded(response, f), image, (110, 155), 7)
     assert np.array_equal(first, xy[:7])
 
 
 def test_a_peak_between_pixels_is_found_there():
     rows, columns = np.indices((40, 48), dtype=np.float32)
     response = -((columns - 20.3) ** 2) - (rows - 17.6) ** 2
-    xy, _ = select_peaks(response, texture((40, 48)), (40, 48), 5, Rules(4.0, 0))
+    xy, _ = Peaks(Rules(4.0, 0))(folded(response), texture((40, 48)), (40, 48), 5)
     assert np.abs(xy - [[20.3, 17.6]]).max() < 1e-3
 
 
@@ -140,7 +147,7 @@ def test_a_peak_between_pixels_is_found_there():
 def test_peaks_on_the_device_are_the_same(nms_px, shape):
     response, rules = response_of_peaks(), Rules(nms_px, min_contrast=4)
     image = padded_to_cells(half_blank(shape))
-    xy, score = select_peaks(response, image, shape, 100, rules)
+    xy, score = Peaks(rules)(folded(response), image, shape, 100)
     rows = TorchPeaks(image.shape, shape, rules, "cpu")(
         torch.from_numpy(response), torch.from_numpy(image).float(), None, 100
     )
@@ -154,7 +161,7 @@ def test_of_a_plateau_the_first_pixel_is_the_peak():
     response = np.zeros((40, 48), np.float32)
     response[20:22, 30:33] = 1.0
     image, rules = texture((40, 48)), Rules(3.0, 0)
-    xy, _ = select_peaks(response, image, (40, 48), 1, rules)
+    xy, _ = Peaks(rules)(folded(response), image, (40, 48), 1)
     rows = TorchPeaks((40, 48), (40, 48), rules, "cpu")(
         torch.from_numpy(response), torch.from_numpy(image).float(), None, 1
     )
@@ -264,7 +271,8 @@ def on_cpu(folded, rules, image) -> Keypoints:
     from vioframe_keypointnet.detector import OnCpu
     from vioframe_keypointnet.runtimes.torch import TorchOnCpu
 
-    return OnCpu(TorchOnCpu(folded, 1), rules, folded.architecture.peaks)(padded_to_cells(image), image.shape, 60)
+    peaks = Peaks(rules) if folded.architecture.peaks else None
+    return OnCpu(TorchOnCpu(folded, 1), rules, peaks)(padded_to_cells(image), image.shape, 60)
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")

@@ -7,14 +7,13 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from keypointnet_helpers import ARCHITECTURES, COMPACT, NARROW, network, texture, weights  # noqa: E402
+from keypointnet_helpers import ARCHITECTURES, COMPACT, NARROW, QUICK, network, texture, weights  # noqa: E402
 
 from vioframe.errors import ConfigError  # noqa: E402
 from vioframe_keypointnet import runtimes  # noqa: E402
 from vioframe_keypointnet.description import describe  # noqa: E402
 from vioframe_keypointnet.folding import fold  # noqa: E402
 from vioframe_keypointnet.network import describe as describe_in_torch  # noqa: E402
-from vioframe_keypointnet.peaks import unfolded  # noqa: E402
 from vioframe_keypointnet.quantisation import measure_ranges  # noqa: E402
 from vioframe_keypointnet.selection import candidate_places  # noqa: E402
 
@@ -35,7 +34,7 @@ def as_trained(net, image):
         found = net(images.expand(-1, net.architecture.image_channels, -1, -1))
     for hook in hooks:
         hook.remove()
-    heads = caught["R"] if net.architecture.peaks else torch.cat([caught["Db"], caught["Pb"]])
+    heads = caught["R"].permute(1, 2, 0) if net.architecture.peaks else torch.cat([caught["Db"], caught["Pb"]])
     return [output.numpy() for output in (heads, found.descriptors[0])], found
 
 
@@ -71,7 +70,7 @@ def test_one_runtime_takes_images_of_several_sizes(runtime):
         assert np.abs(heads - as_trained(net, image)[0][0]).max() < 1e-4
 
 
-@pytest.mark.parametrize("architecture", [COMPACT, NARROW], ids=lambda a: a.name)
+@pytest.mark.parametrize("architecture", [COMPACT, QUICK, NARROW], ids=lambda a: a.name)
 @pytest.mark.parametrize("runtime", NOT_TORCH)
 def test_int8_is_near(architecture, runtime):
     pytest.importorskip(runtime)
@@ -84,7 +83,7 @@ def test_int8_is_near(architecture, runtime):
     assert max(errors) < INT8_ERROR[architecture.name]
 
 
-INT8_ERROR = {"compact": 0.13, "full-x0.125": 0.2}
+INT8_ERROR = {"compact": 0.13, "quick": 0.13, "full-x0.125": 0.2}
 """The narrow network has twice as many layers that each add to the error, and half as many channels to average it."""
 
 
@@ -114,10 +113,12 @@ def test_places_are_those_of_the_trained_network():
     assert np.abs(np.stack(candidate_places(heads)) - found.xy[0].numpy()).max() < 1e-3
 
 
-def test_the_response_of_each_pixel_is_that_of_the_trained_network():
-    (response, _), found = as_trained(network(COMPACT), texture())
-    by_cells = torch.nn.functional.pixel_shuffle(found.response, 8)[0, 0].numpy()
-    assert np.array_equal(unfolded(response), by_cells)
+@pytest.mark.parametrize("architecture", [COMPACT, QUICK], ids=lambda a: a.name)
+def test_the_response_of_each_pixel_is_that_of_the_trained_network(architecture):
+    (response, _), found = as_trained(network(architecture), texture())
+    rows, columns, f = *response.shape[:2], architecture.fold
+    by_pixels = response.reshape(rows, columns, f, f).swapaxes(1, 2).reshape(f * rows, f * columns)
+    assert np.array_equal(by_pixels, torch.nn.functional.pixel_shuffle(found.response, 8)[0, 0].numpy())
 
 
 @pytest.mark.parametrize("descriptors", [False, True])

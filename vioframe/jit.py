@@ -25,14 +25,17 @@ _PACKAGE = Path(__file__).parent
 
 
 def kernel(function: FunctionT) -> FunctionT:
-    """Compile ``function`` in nopython mode at its first call, or load it from the cache."""
+    """Compile ``function`` in nopython mode at its first call, or load it from the cache.
+
+    It divides as numpy does: by zero is no error. Loops with divisions can be vectorised then.
+    """
     source = Path(function.__code__.co_filename)
     in_package = (source.parent / "__init__.py").exists()
     settings: Any = numba.config
     before = settings.CACHE_DIR
     settings.CACHE_DIR = str(_folder(before) / _fingerprint(source.parent if in_package else source))
     try:
-        return cast(FunctionT, numba.njit(cache=True)(function))
+        return cast(FunctionT, numba.njit(cache=True, error_model="numpy")(function))
     finally:
         settings.CACHE_DIR = before
 

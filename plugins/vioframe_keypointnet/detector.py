@@ -15,7 +15,7 @@ from vioframe_keypointnet import runtimes
 from vioframe_keypointnet.description import describe
 from vioframe_keypointnet.folding import fold
 from vioframe_keypointnet.options import KeypointNetOptions
-from vioframe_keypointnet.peaks import select_peaks, unfolded
+from vioframe_keypointnet.peaks import Peaks
 from vioframe_keypointnet.selection import Rules, padded_to_cells, select
 from vioframe_keypointnet.weights import load
 
@@ -34,12 +34,13 @@ class OnCpu:
 
     run: runtimes.Run
     rules: Rules
-    peaks: bool
+    peaks: Peaks | None
+    """Of a network of peaks."""
 
     def __call__(self, padded: Image, shape: tuple[int, int], max_points: int) -> Keypoints:
         found, *described = self.run(padded)
-        if self.peaks:
-            xy, score = select_peaks(unfolded(found), padded, shape, max_points, self.rules)
+        if self.peaks is not None:
+            xy, score = self.peaks(found, padded, shape, max_points)
         else:
             xy, score = select(found, padded, shape, max_points, self.rules)
         return Keypoints(xy, score, describe(described[0], xy) if described else None)
@@ -75,5 +76,5 @@ def keypointnet(options: KeypointNetOptions) -> Detector:
         engine = OnCuda(network, rules, precision)
     else:
         run = runtimes.on_cpu(runtime, precision, network, weights.activation_ranges, options.threads)
-        engine = OnCpu(run, rules, network.architecture.peaks)
+        engine = OnCpu(run, rules, Peaks(rules) if network.architecture.peaks else None)
     return KeypointNet(engine, runtime, precision, device)

@@ -31,7 +31,7 @@ NodeT = TypeVar("NodeT")
 
 @dataclass(frozen=True, slots=True)
 class Convolution:
-    """A convolution padded with zeros so that the size is kept (halved by stride 2), then LeakyReLU if activated."""
+    """A convolution padded with zeros so that the size is kept, then LeakyReLU if activated."""
 
     name: str
     weight: NDArray[np.float32]
@@ -39,21 +39,17 @@ class Convolution:
     bias: NDArray[np.float32]
     """(out,)."""
     activated: bool = True
-    stride: int = 1
 
     @property
     def pad(self) -> int:
-        return (int(self.weight.shape[2]) - self.stride) // 2
+        return int(self.weight.shape[2]) // 2
 
 
 class Operations(Protocol[NodeT]):
     """What a library must offer; a node is a tensor, or its name in a graph."""
 
-    def centred(self, image: NodeT) -> NodeT:
-        """Grey levels less :data:`NEUTRAL_GREY`."""
-
-    def normalised(self, image: NodeT) -> NodeT:
-        """What :func:`vioframe_keypointnet.network.locally_normalised` makes of grey levels."""
+    def seen(self, x: NodeT, peaks: bool) -> NodeT:
+        """What comes in, as the first layer wants it: grey levels less :data:`NEUTRAL_GREY`, or local contrast."""
 
     def convolve(self, layer: Convolution, x: NodeT) -> NodeT: ...
 
@@ -66,6 +62,9 @@ class Operations(Protocol[NodeT]):
     def join(self, a: NodeT, b: NodeT) -> NodeT:
         """The channels of ``a``, then those of ``b``."""
 
+    def channels_last(self, x: NodeT) -> NodeT:
+        """(B, h, w, C) of (B, C, h, w)."""
+
 
 @dataclass(frozen=True, slots=True)
 class FoldedNetwork:
@@ -73,28 +72,31 @@ class FoldedNetwork:
 
     architecture: Architecture
     encoder: tuple[Convolution, ...]
-    """Of a network of peaks that does not describe, the first two blocks: its response needs no more."""
+    """Of a network of peaks that does not describe, the first block of layers: its response needs no more."""
     heads: tuple[Convolution, ...]
     """Hidden layer and output of score and place; of a network of peaks the one that gives the response."""
     description: tuple[Convolution, ...] = ()
     """Fa, Fb, Faa, Fbb, or nothing."""
 
-    def build(self, operations: Operations[NodeT], image: NodeT) -> tuple[NodeT, ...]:
-        """From (B, 1, H, W) grey levels: (B, 3, H/8, W/8), before sigmoid and tanh, the score, x and y of each cell.
+    def build(self, operations: Operations[NodeT], seen: NodeT) -> tuple[NodeT, ...]:
+        """From (B, C, h, w), what an :class:`~vioframe_keypointnet.seeing.Eye` sees, to what it finds.
 
-        For a network of peaks: (B, 4, H/2, W/2) the response, 2 x 2 pixels in each place. Then, if it describes,
-        (B, D, H/4, W/4) descriptors, not normalised yet.
+        (B, 3, H/8, W/8), before sigmoid and tanh, the score, x and y of each cell; of a network of peaks that folds
+        f x f pixels (B, H/f, W/f, f^2), the response. Then, if it describes, (B, D, H/4, W/4) descriptors, not yet
+        normalised.
         """
         peaks = self.architecture.peaks
-        x = operations.normalised(image) if peaks else operations.centred(image)
+        x = operations.seen(seen, peaks)
         after = {}
         for layer in self.encoder:
             x = after[layer.name[0]] = operations.convolve(layer, x)
             if layer.name in self.architecture.pooled:
                 x = operations.pool(x)
-        found = after["2"] if peaks else x
+        found = after[self.architecture.finest[0]] if peaks else x
         for layer in self.heads:
             found = operations.convolve(layer, found)
+        if peaks:
+            found = operations.channels_last(found)
         if not self.description:
             return (found,)
         first, second, third, fourth = self.description
@@ -105,7 +107,8 @@ class FoldedNetwork:
 def fold(weights: Weights, descriptors: bool = False) -> FoldedNetwork:
     """The network of ``weights`` for grey images, which equals the trained one on R = G = B exactly."""
     architecture, tensors = weights.architecture, weights.tensors
-    needed = [name for name, *_ in architecture.encoder if descriptors or not architecture.peaks or name < "3"]
+    finest = architecture.finest[0]
+    needed = [name for name, *_ in architecture.encoder if descriptors or not architecture.peaks or name[0] == finest]
     encoder = [_normalised(tensors, name) for name in needed]
     encoder[0] = _on_grey_levels(encoder[0], architecture)
     heads: tuple[Convolution, ...]
@@ -134,21 +137,14 @@ def _normalised(tensors: Tensors, name: str, activated: bool = True) -> Convolut
 def _on_grey_levels(first: Convolution, architecture: Architecture) -> Convolution:
     """The first layer on (grey level - 127.5) of one channel, in place of (x / 255 - 0.5) * 0.225 of all.
 
-    For a network of peaks, on the one normalised channel in place of all.
-
-    Only the factor may go into the weights: the shift has to stay before the padding, whose zeros mean neutral grey.
-    A 3 x 3 convolution on folded pixels is one of 6 x 6 and stride 2 on the image: the folded pixel of row r holds the
-    rows 2 r + dy in its channels 2 dy + dx, so that kernel row k reaches the rows 2 (r + k - 1) + dy.
+    For a network of peaks, on the local contrast of one channel, folded, in place of all. Only the factor may go into
+    the weights: the shift has to stay before the padding, whose zeros mean neutral grey.
     """
     out = len(first.weight)
     weight = first.weight.reshape(out, architecture.image_channels, -1, 3, 3).sum(axis=1)
     if not architecture.peaks:
         weight *= np.float32(_SCALE)
-    if not architecture.folds_pixels:
-        return Convolution(first.name, weight, first.bias)
-    # (out, dy, dx, row, column) -> (out, row, dy, column, dx)
-    unfolded = weight.reshape(out, 2, 2, 3, 3).transpose(0, 3, 1, 4, 2).reshape(out, 1, 6, 6)
-    return Convolution(first.name, np.ascontiguousarray(unfolded), first.bias, stride=2)
+    return Convolution(first.name, weight, first.bias)
 
 
 def _stacked(name: str, layers: Sequence[Convolution]) -> Convolution:

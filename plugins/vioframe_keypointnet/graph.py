@@ -14,18 +14,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vioframe_keypointnet.architecture import FAINT
 from vioframe_keypointnet.folding import LEAK, NEUTRAL_GREY, Convolution, FoldedNetwork
 from vioframe_keypointnet.optional import needs
+from vioframe_keypointnet.seeing import CONTRAST_STEP, ZERO
 from vioframe_keypointnet.tensors import OUT, RESPONSE
 
 _OPSET, _IR = 17, 9
-
-_MIDDLE_GREY = 128
-"""The whole number nearest to :data:`NEUTRAL_GREY`, so that an image's own 8 bits can be multiplied."""
-
-_MOST_DEVIATIONS = 6.0
-"""Locally normalised images reach that far in 8 bits; what lies farther out is noise on a blank surface."""
 
 
 def onnx_model(
@@ -33,18 +27,19 @@ def onnx_model(
 ) -> bytes:
     """A serialised ONNX model of ``network`` for images of ``shape`` (H, W), multiples of 8; int8 if given the ranges.
 
-    Takes ``image`` (1, 1, H, W) uint8; gives what :meth:`FoldedNetwork.build` does.
+    Takes as ``seen`` what an :class:`~vioframe_keypointnet.seeing.Eye` sees, in 8 bits if in int8; gives what
+    :meth:`FoldedNetwork.build` does.
     """
     with needs("onnx", "onnxruntime"):
         from onnx import TensorProto, helper
 
-    graph = _Graph(shape, activation_ranges or {})
-    seen = _seeing_integers(network) if activation_ranges and not network.architecture.peaks else network
-    outputs = seen.build(graph, "image")
-    height, width = shape
-    image = helper.make_tensor_value_info("image", TensorProto.UINT8, [1, 1, height, width])
+    graph = _Graph(activation_ranges or {})
+    peaks, f = network.architecture.peaks, network.architecture.fold
+    outputs = (_seeing_integers(network) if activation_ranges and not peaks else network).build(graph, "seen")
+    kind = TensorProto.FLOAT if peaks and not activation_ranges else TensorProto.UINT8
+    seen = helper.make_tensor_value_info("seen", kind, [1, f * f, shape[0] // f, shape[1] // f])
     found = [helper.make_tensor_value_info(name, TensorProto.FLOAT, None) for name in outputs]
-    made = helper.make_graph(graph.nodes, "keypointnet", [image], found, graph.constants)
+    made = helper.make_graph(graph.nodes, "keypointnet", [seen], found, graph.constants)
     model = helper.make_model(made, opset_imports=[helper.make_opsetid("", _OPSET)], ir_version=_IR)
     return bytes(model.SerializeToString())
 
@@ -52,66 +47,36 @@ def onnx_model(
 def _seeing_integers(network: FoldedNetwork) -> FoldedNetwork:
     """``network`` for grey levels less a whole number; only what it sees beyond the border differs, by half a level."""
     first, *rest = network.encoder
-    shift = first.weight.sum(axis=(1, 2, 3)) * np.float32(_MIDDLE_GREY - NEUTRAL_GREY)
+    shift = first.weight.sum(axis=(1, 2, 3)) * np.float32(ZERO - NEUTRAL_GREY)
     return replace(network, encoder=(replace(first, bias=first.bias + shift), *rest))
-
-
-def smoothing(side: int) -> NDArray[np.float32]:
-    """(side, side / 4) from means of 4 px to the mean of about 20 px around each pixel: five means, interpolated.
-
-    As :func:`vioframe_keypointnet.network.locally_normalised` has it, along one axis. As a matrix it takes a hundredth
-    of the time that the libraries take to interpolate.
-    """
-    means = np.pad(np.eye(side // 4, dtype=np.float32), ((2, 2), (0, 0)), mode="edge")
-    boxes = np.mean([means[k : k + side // 4] for k in range(5)], axis=0)
-    at = np.clip((np.arange(side) + 0.5) / 4.0 - 0.5, 0.0, side // 4 - 1.0)
-    low = at.astype(np.intp)
-    high = np.minimum(low + 1, side // 4 - 1)
-    share = (at - low).astype(np.float32)[:, None]
-    matrix: NDArray[np.float32] = (1.0 - share) * boxes[low] + share * boxes[high]
-    return matrix
 
 
 class _Graph:
     """Operations of ONNX; a node is the name of its output."""
 
-    def __init__(self, shape: tuple[int, int], activation_ranges: Mapping[str, float]) -> None:
+    def __init__(self, activation_ranges: Mapping[str, float]) -> None:
         from onnx import NodeProto, TensorProto
 
         self.nodes: list[NodeProto] = []
         self.constants: list[TensorProto] = []
-        self._smoothing = smoothing(shape[0]), smoothing(shape[1])
         self._ranges = activation_ranges
         self._steps: dict[str, np.float32] = {}
         """Values that have 8 bits, and the step of these."""
 
-    def centred(self, image: str) -> str:
-        if self._ranges:
-            return self.dequantised(image, np.float32(1.0), _MIDDLE_GREY)
-        return self.node("Sub", [self._floats_of(image), self.constant(np.float32(NEUTRAL_GREY))])
-
-    def normalised(self, image: str) -> str:
-        grey = self._floats_of(image)
-        flat = self.node("Sub", [grey, self._smooth(grey)])
-        faint = self.constant(np.float32((255.0 * FAINT) ** 2))
-        deviation = self.node("Sqrt", [self.node("Add", [self._smooth(self.node("Mul", [flat, flat])), faint])])
-        x = self.node("Div", [flat, deviation])
-        return self._quantised(x, np.float32(_MOST_DEVIATIONS / 127.0), _MIDDLE_GREY) if self._ranges else x
-
-    def _smooth(self, x: str) -> str:
-        coarse = self.node("AveragePool", [x], kernel_shape=[4, 4], strides=[4, 4])
-        rows, columns = (self.constant(matrix) for matrix in (self._smoothing[0], self._smoothing[1].T.copy()))
-        return self.node("MatMul", [rows, self.node("MatMul", [coarse, columns])])
-
-    def _floats_of(self, image: str) -> str:
+    def seen(self, x: str, peaks: bool) -> str:
         from onnx import TensorProto
 
-        return self.node("Cast", [image], to=TensorProto.FLOAT)
+        if self._ranges:
+            return self.dequantised(x, CONTRAST_STEP if peaks else np.float32(1.0), ZERO)
+        if peaks:
+            return x
+        levels = self.node("Cast", [x], to=TensorProto.FLOAT)
+        return self.node("Sub", [levels, self.constant(np.float32(NEUTRAL_GREY))])
 
     def convolve(self, layer: Convolution, x: str) -> str:
         integer = x in self._steps and (layer.name in self._ranges or layer.name in (OUT, RESPONSE))
         weight, bias = self._integers(layer, self._steps[x]) if integer else self._floats(layer)
-        y = self.node("Conv", [x, weight, bias], pads=[layer.pad] * 4, strides=[layer.stride] * 2)
+        y = self.node("Conv", [x, weight, bias], pads=[layer.pad] * 4)
         if layer.name in self._ranges:
             return self._quantised(self.node("Relu", [y]), np.float32(self._ranges[layer.name] / 255.0), 0)
         return self.node("LeakyRelu", [y], alpha=LEAK) if layer.activated else y
@@ -127,6 +92,9 @@ class _Graph:
 
     def join(self, a: str, b: str) -> str:
         return self.node("Concat", [a, b], axis=1)
+
+    def channels_last(self, x: str) -> str:
+        return self.node("Transpose", [x], perm=[0, 2, 3, 1])
 
     def dequantised(self, x: str, step: np.float32, zero: int) -> str:
         """The values of ``x`` uint8, of which convolutions may make use as they are."""

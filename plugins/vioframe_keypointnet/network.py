@@ -5,6 +5,7 @@ Layer names are those of the published checkpoints, so that these load as they a
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -51,22 +52,19 @@ class KeypointNet(nn.Module):
         head, quarter = architecture.head, architecture.blocks[2][-1]
         self.convDa, self.convDb = _conv_bn(deepest, head), nn.Conv2d(head, 1, 3, padding=1)
         if architecture.peaks:
-            # Four pixels of the response at each place of the second block.
-            self.convR = nn.Conv2d(architecture.blocks[1][-1], 4, 3, padding=1)
+            self.convR = nn.Conv2d(architecture.finest[1], architecture.fold**2, 3, padding=1)
         else:
             self.convPa, self.convPb = _conv_bn(deepest, head), nn.Conv2d(head, 2, 3, padding=1)
         self.convFa, self.convFb = _conv_bn(deepest, head), _conv_bn(head, 4 * quarter)
         self.convFaa = _conv_bn(quarter + skip, head)
         self.convFbb = nn.Conv2d(head, architecture.descriptor, 3, padding=1)
-        self.fold, self.unfold = nn.PixelUnshuffle(2), nn.PixelShuffle(2)
+        self.fold, self.unfold = nn.PixelUnshuffle(architecture.fold), nn.PixelShuffle(2)
         self.act, self.pool = nn.LeakyReLU(inplace=True), nn.MaxPool2d(2)
         self.dropout = nn.Dropout2d(dropout)
 
     def forward(self, images: Tensor) -> Detection:
         """``images`` (B, C, H, W) in [0, 1], H and W multiples of 8."""
-        x = locally_normalised(images) if self.architecture.peaks else (images - 0.5) * 0.225
-        if self.architecture.folds_pixels:
-            x = self.fold(x)
+        x = self.fold(locally_normalised(images) if self.architecture.peaks else (images - 0.5) * 0.225)
         after: dict[str, Tensor] = {}
         for name, *_ in self.architecture.encoder:
             x = self.act(self.get_submodule(f"conv{name}")(x))
@@ -79,7 +77,7 @@ class KeypointNet(nn.Module):
         response = None
         score = self.convDb(self.dropout(self.act(self.convDa(x)))).float()[:, 0]
         if self.architecture.peaks:
-            response = cells_of(self.convR(after["2"]).float())
+            response = cells_of(self.convR(after[self.architecture.finest[0]]).float())
             score = score + torch.logsumexp(response, dim=1)
             place = peak_places(response)
         else:
@@ -102,8 +100,8 @@ def locally_normalised(images: Tensor) -> Tensor:
 
 
 def cells_of(response: Tensor) -> Tensor:
-    """(B, 64, h, w), the pixels of each cell row by row, of what ``convR`` gives: (B, 4, H/2, W/2), 2 x 2 px each."""
-    return pixel_unshuffle(pixel_shuffle(response, 2), CELL_PX)
+    """(B, 64, h, w), the pixels of each cell row by row, of what ``convR`` gives: (B, f^2, H/f, W/f), f x f px each."""
+    return pixel_unshuffle(pixel_shuffle(response, math.isqrt(response.shape[1])), CELL_PX)
 
 
 def peak_places(response: Tensor) -> Tensor:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from math import ceil
+from functools import lru_cache
+from math import ceil, isqrt
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,82 +19,139 @@ def reach_px(rules: Rules) -> int:
     return max(ceil(rules.nms_px) - 1, 1)
 
 
-def unfolded(response: Array) -> Array:
-    """(H, W) of (4, H/2, W/2), 2 x 2 pixels in each place."""
-    _, h, w = response.shape
-    return response.reshape(2, 2, h, w).transpose(2, 0, 3, 1).reshape(2 * h, 2 * w)
-
-
-def select_peaks(
-    response: Array, image: Image, shape: tuple[int, int], max_points: int, rules: Rules
-) -> tuple[Array, Array]:
-    """``xy`` (N, 2) px and ``score`` (N,) in (0, 1), strongest first, of the peaks of ``response`` (H, W).
+class Peaks:
+    """Selects among the peaks of responses.
 
     A peak is the highest within :func:`reach_px` along both axes, of equals the first row by row; its place is that of
     the parabolas through it and its neighbours. Not taken: what :func:`vioframe_keypointnet.selection.select` leaves.
     """
-    import cv2
 
-    side = 2 * reach_px(rules) + 1
-    highest = cv2.dilate(response, np.ones((side, side), np.uint8))
-    pixels = np.empty(response.size // 4 + 1, np.int64)  # no two peaks touch
-    found = pixels[: _find(pixels, response, highest, side // 2, shape[0], shape[1])]
-    order = np.argsort(-response.ravel()[found], kind="stable")
-    xy = np.empty((max(min(max_points, len(found)), 0), 2), np.float32)
-    score = np.empty(len(xy), np.float32)
-    count = _take(xy, score, found[order], response, image, shape[0], shape[1], rules.min_contrast)
-    return xy[:count], sigmoid(score[:count])
+    def __init__(self, rules: Rules) -> None:
+        self._rules, self._reach = rules, reach_px(rules)
+        # A peak is the highest of its square of 2 x 2 px, and of all squares that it reaches wherever in its own it is.
+        side = 2 * ((self._reach - 1) // 2) + 1
+        self._squares = np.ones((side, side), np.uint8)
+        self._scratch = lru_cache(maxsize=4)(_Scratch)
+
+    def __call__(self, response: Array, image: Image, shape: tuple[int, int], max_points: int) -> tuple[Array, Array]:
+        """``xy`` (N, 2) px and ``score`` (N,) in (0, 1), strongest first, of ``response`` (H/f, W/f, f^2).
+
+        In each place there are f x f pixels, row by row, f a power of two.
+        """
+        import cv2
+
+        f = isqrt(response.shape[2])
+        scratch = self._scratch(response.shape[0] * f // 2, response.shape[1] * f // 2)
+        _highest_of_four(response, f, scratch.highest)
+        cv2.dilate(scratch.highest, self._squares, scratch.around)
+        squares = scratch.found[: _find(scratch.found, scratch.highest, scratch.around)]
+        squares = squares[_descending(scratch.highest.ravel()[squares])]
+        xy = np.empty((max(min(max_points, len(squares)), 0), 2), np.float32)
+        score, shift = np.empty(len(xy), np.float32), f.bit_length() - 1
+        least = self._rules.min_contrast
+        count = _take(xy, score, squares, response, shift, self._reach, image, shape[0], shape[1], least)
+        return xy[:count], sigmoid(score[:count])
+
+
+class _Scratch:
+    """Arrays for responses of one size: as new ones each time they would take longer than what fills them."""
+
+    def __init__(self, rows: int, columns: int) -> None:
+        self.highest, self.around = (np.empty((rows, columns), np.float32) for _ in range(2))
+        self.found = np.empty(rows * columns + 1, np.int32)
+
+
+def _descending(values: Array) -> NDArray[np.int64]:
+    """``np.argsort(-values, kind="stable")``, several times as fast: one sort of whole numbers.
+
+    Each is made of the value's bits, which are in order (negative ones in reverse order), and its index.
+    """
+    bits = values.view(np.int32)
+    ascending = bits ^ ((bits >> 31) & 0x7FFFFFFF)
+    keys = (~ascending).astype(np.int64) << 32 | np.arange(len(values))
+    keys.sort()
+    return np.asarray(keys & 0xFFFFFFFF)
 
 
 @kernel
-def _find(pixels: NDArray[np.int64], response: Array, highest: Array, reach: int, height: int, width: int) -> int:
-    """Fill ``pixels`` with the indices of all peaks off the border; their number."""
-    rows, columns = response.shape
+def _highest_of_four(response: Array, f: int, highest: Array) -> None:
+    """Fill ``highest`` (H/2, W/2) with the maximum of each 2 x 2 px."""
+    per = f // 2
+    for row in range(highest.shape[0]):
+        for k in range(per):
+            upper = (row % per) * 2 * f + 2 * k
+            for column in range(response.shape[1]):
+                four = response[row // per, column]
+                a, b = max(four[upper], four[upper + 1]), max(four[upper + f], four[upper + f + 1])
+                highest[row, column * per + k] = max(a, b)
+
+
+@kernel
+def _find(squares: NDArray[np.int32], highest: Array, around: Array) -> int:
+    """Fill ``squares`` with the indices of those off the border that may hold a peak; their number."""
+    rows, columns = highest.shape
+    border = CELL_PX // 2
     count = 0
-    for y in range(CELL_PX, min(rows - CELL_PX, height)):
-        for x in range(CELL_PX, min(columns - CELL_PX, width)):
-            if response[y, x] == highest[y, x] and _is_first(response, y, x, reach):
-                pixels[count] = y * columns + x
+    for row in range(border, rows - border):
+        for column in range(border, columns - border):
+            if highest[row, column] == around[row, column]:
+                squares[count] = row * columns + column
                 count += 1
     return count
-
-
-@kernel
-def _is_first(response: Array, y: int, x: int, reach: int) -> bool:
-    """Whether nothing before it in its neighbourhood, row by row, is as high."""
-    for r in range(max(y - reach, 0), y + 1):
-        for c in range(max(x - reach, 0), min(x + reach + 1, response.shape[1])):
-            if (r < y or c < x) and response[r, c] == response[y, x]:
-                return False
-    return True
 
 
 @kernel
 def _take(
     xy: Array,
     score: Array,
-    pixels: NDArray[np.int64],
+    squares: NDArray[np.int32],
     response: Array,
+    shift: int,
+    reach: int,
     image: Image,
     height: int,
     width: int,
     min_contrast: int,
 ) -> int:
-    """Fill ``xy`` and ``score`` with the first of ``pixels`` where the image is not blank; their number."""
-    columns = response.shape[1]
+    """Fill ``xy`` and ``score`` with peaks in the first of ``squares``, where the image is not blank; their number."""
+    columns = response.shape[1] << (shift - 1)
     count = 0
-    for pixel in pixels:
+    for square in squares:
         if count == len(xy):
             break
-        y, x = pixel // columns, pixel % columns
-        if not varies(image, x, y, height, width, min_contrast):
+        y, x = _peak(response, shift, 2 * (square // columns), 2 * (square % columns), reach)
+        if y < 0 or y >= height or x >= width or not varies(image, x, y, height, width, min_contrast):
             continue
-        here = response[y, x]
-        xy[count, 0] = x + _summit(response[y, x - 1], here, response[y, x + 1])
-        xy[count, 1] = y + _summit(response[y - 1, x], here, response[y + 1, x])
+        here = _at(response, shift, y, x)
+        xy[count, 0] = x + _summit(_at(response, shift, y, x - 1), here, _at(response, shift, y, x + 1))
+        xy[count, 1] = y + _summit(_at(response, shift, y - 1, x), here, _at(response, shift, y + 1, x))
         score[count] = here
         count += 1
     return count
+
+
+@kernel
+def _peak(response: Array, shift: int, y: int, x: int, reach: int) -> tuple[int, int]:
+    """Row and column of the peak in the 2 x 2 px from (x, y) on; negative if there is none."""
+    top, left = y, x
+    for r in range(y, y + 2):
+        for c in range(x, x + 2):
+            if _at(response, shift, r, c) > _at(response, shift, top, left):
+                top, left = r, c
+    here = _at(response, shift, top, left)
+    for r in range(max(top - reach, 0), min(top + reach + 1, response.shape[0] << shift)):
+        for c in range(max(left - reach, 0), min(left + reach + 1, response.shape[1] << shift)):
+            there = _at(response, shift, r, c)
+            if there > here or (there == here and (r < top or (r == top and c < left))):
+                return -1, -1
+    return top, left
+
+
+@kernel
+def _at(response: Array, shift: int, y: int, x: int) -> np.float32:
+    """The response of the pixel (x, y), 1 << ``shift`` of which are folded: divisions would take most of the time."""
+    inside = (1 << shift) - 1
+    return response[y >> shift, x >> shift, ((y & inside) << shift) + (x & inside)]
 
 
 @kernel

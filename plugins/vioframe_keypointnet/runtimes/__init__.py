@@ -1,8 +1,8 @@
 """The libraries that run the network, and which of them is taken.
 
 A runtime takes an image whose sides are multiples of 8 to what :meth:`FoldedNetwork.build` gives, without the batch's
-axis: the heads (3, h, w) and, if the network describes, the descriptors (D, 2 h, 2 w). These are float32 and stay as
-they are until the next call.
+axis: the heads (3, h, w) or the response, and, if the network describes, the descriptors (D, 2 h, 2 w). These are
+float32 and stay as they are until the next call.
 """
 
 from __future__ import annotations

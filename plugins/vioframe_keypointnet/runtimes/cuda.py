@@ -19,7 +19,9 @@ from vioframe_keypointnet.torch_selection import TorchPeaks, TorchSelection
 with needs("torch", "keypointnet"):
     import torch
     from torch import Tensor
-    from torch.nn.functional import pixel_shuffle
+    from torch.nn.functional import pixel_shuffle, pixel_unshuffle
+
+    from vioframe_keypointnet.network import locally_normalised
 
 _WARM_UP_RUNS = 3
 
@@ -52,15 +54,16 @@ def detection(
     device: str,
 ) -> Callable[[Tensor], Tensor]:
     """From an image (1, 1, H, W) uint8 on ``device`` to what :class:`TorchSelection` selects; nothing leaves it."""
-    operations = TorchOperations(device, dtype)
+    operations, architecture, f = TorchOperations(device, dtype), network.architecture, network.architecture.fold
     cells, peaks = TorchSelection(padded, shape, rules, device), TorchPeaks(padded, shape, rules, device)
 
     def detect(image: Tensor) -> Tensor:
         grey = image.float()
-        found, *rest = (output[0].float() for output in network.build(operations, grey))
+        seen = pixel_unshuffle(locally_normalised(grey / 255.0), f) if architecture.peaks else grey
+        found, *rest = (output[0].float() for output in network.build(operations, seen))
         descriptors = rest[0] if rest else None
-        if network.architecture.peaks:
-            return peaks(pixel_shuffle(found, 2)[0], grey[0, 0], descriptors, max_points)
+        if architecture.peaks:
+            return peaks(pixel_shuffle(found.permute(2, 0, 1), f)[0], grey[0, 0], descriptors, max_points)
         return cells(found[0], OFFSET_PX * torch.tanh(found[1:]), grey[0, 0], descriptors, max_points)
 
     return detect

@@ -13,6 +13,7 @@ from vioframe.types import Image
 from vioframe_keypointnet.folding import FoldedNetwork
 from vioframe_keypointnet.graph import onnx_model
 from vioframe_keypointnet.optional import needs
+from vioframe_keypointnet.seeing import Eye
 
 _WARNINGS_AND_LESS = 3
 
@@ -28,10 +29,11 @@ class OnnxRuntime:
         self._options.log_severity_level = _WARNINGS_AND_LESS
         self._options.intra_op_num_threads = threads
         self._network, self._ranges = network, ranges
+        self._see = Eye(network.architecture, eight_bits=ranges is not None)
         self._session = lru_cache(maxsize=4)(self._load)
 
     def __call__(self, image: Image) -> tuple[NDArray[np.float32], ...]:
-        found = self._session(cast(tuple[int, int], image.shape)).run(None, {"image": image[None, None]})
+        found = self._session(cast(tuple[int, int], image.shape)).run(None, {"seen": self._see(image)[None]})
         return tuple(array[0] for array in found)
 
     def _load(self, shape: tuple[int, int]) -> Any:

@@ -13,6 +13,7 @@ from vioframe.types import Image
 from vioframe_keypointnet.folding import FoldedNetwork
 from vioframe_keypointnet.graph import onnx_model
 from vioframe_keypointnet.optional import needs
+from vioframe_keypointnet.seeing import Eye
 
 
 class OpenVino:
@@ -24,15 +25,15 @@ class OpenVino:
 
         self._core = openvino.Core()
         self._network, self._ranges = network, ranges
+        self._see = Eye(network.architecture, eight_bits=ranges is not None)
         self._settings: dict[str, Any] = {"INFERENCE_PRECISION_HINT": hint, "PERFORMANCE_HINT": "LATENCY"}
         if threads:
             self._settings["INFERENCE_NUM_THREADS"] = threads
         self._request = lru_cache(maxsize=4)(self._compile)
 
     def __call__(self, image: Image) -> tuple[NDArray[np.float32], ...]:
-        found = self._request(cast(tuple[int, int], image.shape)).infer(
-            {0: image[None, None]}, share_inputs=True, share_outputs=True
-        )
+        request = self._request(cast(tuple[int, int], image.shape))
+        found = request.infer({0: self._see(image)[None]}, share_inputs=True, share_outputs=True)
         return tuple(array[0] for array in found.to_tuple())
 
     def _compile(self, shape: tuple[int, int]) -> Any:

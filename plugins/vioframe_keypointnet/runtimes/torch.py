@@ -8,13 +8,12 @@ from numpy.typing import NDArray
 from vioframe.types import Image
 from vioframe_keypointnet.folding import LEAK, NEUTRAL_GREY, Convolution, FoldedNetwork
 from vioframe_keypointnet.optional import needs
+from vioframe_keypointnet.seeing import Eye
 
 with needs("torch", "keypointnet"):
     import torch
     from torch import Tensor
     from torch.nn import functional
-
-    from vioframe_keypointnet.network import locally_normalised
 
 
 class TorchOperations:
@@ -24,18 +23,15 @@ class TorchOperations:
         self._device, self._dtype = device, dtype
         self._layers: dict[str, tuple[Tensor, Tensor]] = {}
 
-    def centred(self, image: Tensor) -> Tensor:
-        return (image - NEUTRAL_GREY).to(self._dtype, memory_format=torch.channels_last)
-
-    def normalised(self, image: Tensor) -> Tensor:
-        return locally_normalised(image / 255.0).to(self._dtype, memory_format=torch.channels_last)
+    def seen(self, x: Tensor, peaks: bool) -> Tensor:
+        return (x if peaks else x - NEUTRAL_GREY).to(self._dtype, memory_format=torch.channels_last)
 
     def convolve(self, layer: Convolution, x: Tensor) -> Tensor:
         if layer.name not in self._layers:
             weight = torch.from_numpy(layer.weight).to(self._device, self._dtype, memory_format=torch.channels_last)
             self._layers[layer.name] = weight, torch.from_numpy(layer.bias).to(self._device, self._dtype)
         weight, bias = self._layers[layer.name]
-        y = functional.conv2d(x, weight, bias, stride=layer.stride, padding=layer.pad)
+        y = functional.conv2d(x, weight, bias, padding=layer.pad)
         return functional.leaky_relu(y, LEAK, inplace=True) if layer.activated else y
 
     def pool(self, x: Tensor) -> Tensor:
@@ -47,6 +43,9 @@ class TorchOperations:
     def join(self, a: Tensor, b: Tensor) -> Tensor:
         return torch.cat([a, b], dim=1)
 
+    def channels_last(self, x: Tensor) -> Tensor:
+        return x.permute(0, 2, 3, 1)
+
 
 class TorchOnCpu:
     """Runs a network on images of any size; the number of threads, if given, is set for torch as a whole."""
@@ -55,10 +54,11 @@ class TorchOnCpu:
         if threads:
             torch.set_num_threads(threads)
         self._network, self._operations = network, operations or TorchOperations()
+        self._see = Eye(network.architecture, eight_bits=False)
 
     @torch.inference_mode()
     def __call__(self, image: Image) -> tuple[NDArray[np.float32], ...]:
         # A copy: torch wants no memory that it may not write to.
-        x = torch.from_numpy(image.astype(np.float32))[None, None]
+        x = torch.from_numpy(self._see(image).astype(np.float32))[None]
         outputs = self._network.build(self._operations, x)
         return tuple(output[0].contiguous().numpy() for output in outputs)

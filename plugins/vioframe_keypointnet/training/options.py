@@ -16,11 +16,11 @@ class TrainingOptions:
     """Options of the trainer ``keypointnet``; raises :class:`ConfigError` on a value out of range."""
 
     network: str = "compact"
-    """full (as published) or compact."""
+    """full (as published), compact or quick."""
     width: float = 1.0
     """Factor on the channels of every layer."""
     dropout: float = 0.2
-    """Of whole channels; the compact network, which has none to spare, does better with 0."""
+    """Of whole channels; small networks, which have none to spare, do better with 0."""
     seed: int = 0
     """Of the initial weights, the views and their order."""
     size: tuple[int, int] = (320, 240)

@@ -8,14 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch.nn.functional import pixel_shuffle
 
 from vioframe.bench.detectors.metrics import lands_inside, repeated
 from vioframe.bench.detectors.thinning import distinct
 from vioframe.types import Float
-from vioframe_keypointnet.architecture import CELL_PX
 from vioframe_keypointnet.network import KeypointNet
-from vioframe_keypointnet.peaks import select_peaks
+from vioframe_keypointnet.peaks import Peaks
 from vioframe_keypointnet.selection import Rules
 from vioframe_keypointnet.training.homography import HomographyRange, random_homography
 from vioframe_keypointnet.training.images import Picture
@@ -61,9 +59,9 @@ def _strongest(network: KeypointNet, image: NDArray[np.uint8]) -> Float:
     with torch.no_grad():
         seen = network(pixels)
     if seen.response is not None:
-        response = pixel_shuffle(seen.response, CELL_PX)[0, 0].cpu().numpy()
+        response = np.ascontiguousarray(seen.response[0].permute(1, 2, 0).cpu().numpy())
         grey = image if image.ndim == 2 else image[..., 1]
-        return select_peaks(response, grey, grey.shape, _MOST, Rules(_NMS_PX, 0))[0].astype(np.float64)
+        return Peaks(Rules(_NMS_PX, 0))(response, grey, grey.shape, _MOST)[0].astype(np.float64)
     order = seen.score.flatten().argsort(descending=True)
     xy: Float = seen.xy[0].flatten(1).T[order].cpu().double().numpy()
     return xy[distinct(xy, _NMS_PX, _MOST)]
