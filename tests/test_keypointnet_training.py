@@ -271,6 +271,15 @@ def test_command_trains_resumes_and_finetunes(folder, tmp_path):
     np.testing.assert_allclose(after["conv2a.0.weight"], before["conv2a.0.weight"], atol=1e-6)
 
 
+def test_the_log_goes_on_where_lessons_end(folder, tmp_path):
+    done = train("--images", folder, "--out", tmp_path, "-o", "lesson_epochs=1", "-o", "epochs=2", *FLAGS)
+    assert done.exit_code == 0, done.output
+    lesson, after = csv.DictReader((tmp_path / "log.csv").open())
+    assert float(lesson["place"]) > 0.0
+    assert lesson["location"] == after["place"] == ""
+    assert float(after["location"]) > 0.0
+
+
 def test_command_reads_options_from_a_file(folder, tmp_path):
     (tmp_path / "options.yaml").write_text("width: 0.25\nsize: [96, 64]\nbatch: 2\nepoch_samples: 2\nepochs: 1\n")
     done = train("--images", folder, "--config", tmp_path / "options.yaml", "--out", tmp_path / "out", "-o", "seed=3")

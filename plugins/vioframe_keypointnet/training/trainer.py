@@ -102,7 +102,8 @@ def _grey(pixels: NDArray[np.uint8]) -> Image:
 def _write_csv(path: Path, rows: list[Mapping[str, float]]) -> None:
     part = path.with_name(f"{path.name}.part")
     with part.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, list(rows[-1]))
+        # Epochs of lessons have other losses than those that follow.
+        writer = csv.DictWriter(file, list(dict.fromkeys(column for row in rows for column in row)))
         writer.writeheader()
         writer.writerows(rows)
     os.replace(part, path)
