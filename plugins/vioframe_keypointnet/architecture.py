@@ -18,9 +18,8 @@ class Architecture:
     """Channels of every layer; the published network by default (Tang et al., ICLR 2020).
 
     ``blocks`` are the encoder's four, at 1, 1/2, 1/4 and 1/8 of the resolution, each a tuple of the channels that its
-    3 x 3 convolutions give. In a network of peaks the first, or the first two, are empty: pixels are folded into
-    channels instead, 2 x 2 or 4 x 4, which loses nothing and saves the costliest layers. ``image_channels`` is 3 (RGB)
-    or 1 (grey).
+    3 x 3 convolutions give. A network of peaks has an empty first block: it folds 2 x 2 pixels into channels instead,
+    which loses nothing and saves the costliest layers. ``image_channels`` is 3 (RGB) or 1 (grey).
     """
 
     name: str = "full"
@@ -29,20 +28,16 @@ class Architecture:
     head: int = 256
     descriptor: int = 256
     peaks: bool = False
-    """Whether a keypoint is the peak of a response as fine as the image, which the first block of layers gives, and
-    images, folded, are freed of local brightness and contrast first. The published network regresses places from its
-    deepest block, which takes it days to learn."""
+    """Whether a keypoint is the peak of a response as fine as the image, which the second block gives, and images are
+    freed of local brightness and contrast first. The published network regresses places from its deepest block, which
+    takes it days to learn."""
 
     def __post_init__(self) -> None:
         channels = (*(c for block in self.blocks for c in block), self.head, self.descriptor)
+        if len(self.blocks) != 4 or not all(self.blocks[1:]) or min(channels) < 1 or self.image_channels not in (1, 3):
+            raise ConfigError(f"no KeypointNet can be built of {self}: four blocks of channels, the first may be empty")
         if self.peaks != (self.fold > 1):
             raise ConfigError(f"no KeypointNet can be built of {self}: peaks need an empty first block, and only they")
-        whole = len(self.blocks) == 4 and all(self.blocks[2:]) and (bool(self.blocks[1]) or not self.blocks[0])
-        if not whole or min(channels) < 1 or self.image_channels not in (1, 3):
-            raise ConfigError(
-                f"no KeypointNet can be built of {self}: four blocks of channels, of the first two none, "
-                "the first or both may be empty"
-            )
 
     def widened(self, factor: float) -> Architecture:
         """With ``factor`` times the channels in every layer."""
@@ -58,18 +53,8 @@ class Architecture:
 
     @property
     def fold(self) -> int:
-        """Side of the squares of pixels that become channels of one place; 1 for none."""
-        return 1 << self.empty_blocks
-
-    @property
-    def empty_blocks(self) -> int:
-        """How many blocks at the beginning only fold pixels."""
-        return next((k for k, block in enumerate(self.blocks) if block), 0)
-
-    @property
-    def finest(self) -> tuple[str, int]:
-        """Number, as in the layers' names, and channels out of the first block that has layers."""
-        return str(self.empty_blocks + 1), self.blocks[self.empty_blocks][-1]
+        """Side of the squares of pixels that become channels of one place."""
+        return 1 if self.blocks[0] else 2
 
     @property
     def encoder(self) -> tuple[tuple[str, int, int], ...]:

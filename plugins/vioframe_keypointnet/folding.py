@@ -72,7 +72,7 @@ class FoldedNetwork:
 
     architecture: Architecture
     encoder: tuple[Convolution, ...]
-    """Of a network of peaks that does not describe, the first block of layers: its response needs no more."""
+    """Of a network of peaks that does not describe, the first two blocks: its response needs no more."""
     heads: tuple[Convolution, ...]
     """Hidden layer and output of score and place; of a network of peaks the one that gives the response."""
     description: tuple[Convolution, ...] = ()
@@ -92,7 +92,7 @@ class FoldedNetwork:
             x = after[layer.name[0]] = operations.convolve(layer, x)
             if layer.name in self.architecture.pooled:
                 x = operations.pool(x)
-        found = after[self.architecture.finest[0]] if peaks else x
+        found = after["2"] if peaks else x
         for layer in self.heads:
             found = operations.convolve(layer, found)
         if peaks:
@@ -107,8 +107,7 @@ class FoldedNetwork:
 def fold(weights: Weights, descriptors: bool = False) -> FoldedNetwork:
     """The network of ``weights`` for grey images, which equals the trained one on R = G = B exactly."""
     architecture, tensors = weights.architecture, weights.tensors
-    finest = architecture.finest[0]
-    needed = [name for name, *_ in architecture.encoder if descriptors or not architecture.peaks or name[0] == finest]
+    needed = [name for name, *_ in architecture.encoder if descriptors or not architecture.peaks or name < "3"]
     encoder = [_normalised(tensors, name) for name in needed]
     encoder[0] = _on_grey_levels(encoder[0], architecture)
     heads: tuple[Convolution, ...]

@@ -52,7 +52,7 @@ class KeypointNet(nn.Module):
         head, quarter = architecture.head, architecture.blocks[2][-1]
         self.convDa, self.convDb = _conv_bn(deepest, head), nn.Conv2d(head, 1, 3, padding=1)
         if architecture.peaks:
-            self.convR = nn.Conv2d(architecture.finest[1], architecture.fold**2, 3, padding=1)
+            self.convR = nn.Conv2d(architecture.blocks[1][-1], architecture.fold**2, 3, padding=1)
         else:
             self.convPa, self.convPb = _conv_bn(deepest, head), nn.Conv2d(head, 2, 3, padding=1)
         self.convFa, self.convFb = _conv_bn(deepest, head), _conv_bn(head, 4 * quarter)
@@ -77,7 +77,7 @@ class KeypointNet(nn.Module):
         response = None
         score = self.convDb(self.dropout(self.act(self.convDa(x)))).float()[:, 0]
         if self.architecture.peaks:
-            response = cells_of(self.convR(after[self.architecture.finest[0]]).float())
+            response = cells_of(self.convR(after["2"]).float())
             score = score + torch.logsumexp(response, dim=1)
             place = peak_places(response)
         else:

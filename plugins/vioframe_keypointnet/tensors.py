@@ -32,7 +32,7 @@ def shapes(architecture: Architecture) -> dict[str, tuple[int, ...]]:
         found[f"conv{name}.0.weight"] = (after, before, 3, 3)
         for statistic in ("weight", "bias", "running_mean", "running_var"):
             found[f"conv{name}.1.{statistic}"] = (after,)
-    place = ("R", architecture.finest[1], architecture.fold**2) if architecture.peaks else ("Pb", head, 2)
+    place = ("R", architecture.blocks[1][-1], architecture.fold**2) if architecture.peaks else ("Pb", head, 2)
     for name, before, after in (("Db", head, 1), place, ("Fbb", head, architecture.descriptor)):
         found[f"conv{name}.weight"] = (after, before, 3, 3)
         found[f"conv{name}.bias"] = (after,)
@@ -42,7 +42,7 @@ def shapes(architecture: Architecture) -> dict[str, tuple[int, ...]]:
 def ranged_layers(architecture: Architecture) -> tuple[str, ...]:
     """Names of the layers whose outputs int8 inference represents in 8 bits: all of the detector's but the last."""
     names = tuple(name for name, *_ in architecture.encoder)
-    return tuple(name for name in names if name[0] == architecture.finest[0]) if architecture.peaks else (*names, HEADS)
+    return tuple(name for name in names if name < "3") if architecture.peaks else (*names, HEADS)
 
 
 def untrained(architecture: Architecture) -> dict[str, NDArray[np.float32]]:

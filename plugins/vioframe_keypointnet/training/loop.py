@@ -163,8 +163,7 @@ def step_losses(
 def _detecting(network: KeypointNet) -> list[Module]:
     """The layers that keypoints depend on; the rest only serves descriptors and, of a network of peaks, training."""
     if network.architecture.peaks:
-        finest = network.architecture.finest[0]
-        names = [*(f"conv{name}" for name, *_ in network.architecture.encoder if name[0] == finest), "convR"]
+        names = [*(f"conv{name}" for name, *_ in network.architecture.encoder if name < "3"), "convR"]
     else:
         names = [*(f"conv{name}" for name, *_ in network.architecture.encoder), "convDa", "convDb", "convPa", "convPb"]
     return [network.get_submodule(name) for name in names]
