@@ -31,11 +31,15 @@ class Architecture:
     """Whether a keypoint is the peak of a response as fine as the image, which the second block gives, and images are
     freed of local brightness and contrast first. The published network regresses places from its deepest block, which
     takes it days to learn."""
+    response_kernel: int = 3
+    """Side of the kernel that gives the response of a network of peaks: 3 or 1."""
 
     def __post_init__(self) -> None:
         channels = (*(c for block in self.blocks for c in block), self.head, self.descriptor)
         if len(self.blocks) != 4 or not all(self.blocks[1:]) or min(channels) < 1 or self.image_channels not in (1, 3):
             raise ConfigError(f"no KeypointNet can be built of {self}: four blocks of channels, the first may be empty")
+        if self.response_kernel not in (1, 3):
+            raise ConfigError(f"no KeypointNet can be built of {self}: the kernel of the response is 3 or 1")
         if self.peaks != (self.fold > 1):
             raise ConfigError(f"no KeypointNet can be built of {self}: peaks need an empty first block, and only they")
 
@@ -84,5 +88,5 @@ class Architecture:
 
 FULL = Architecture()
 COMPACT = Architecture("compact", 1, ((), (16, 16, 16), (32,), (64,)), 64, 64, peaks=True)
-QUICK = Architecture("quick", 1, ((), (16, 16), (32,), (64,)), 64, 64, peaks=True)
+QUICK = Architecture("quick", 1, ((), (16, 16), (32,), (64,)), 64, 64, peaks=True, response_kernel=1)
 ARCHITECTURES = {architecture.name: architecture for architecture in (FULL, COMPACT, QUICK)}

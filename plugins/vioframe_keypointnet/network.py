@@ -52,7 +52,8 @@ class KeypointNet(nn.Module):
         head, quarter = architecture.head, architecture.blocks[2][-1]
         self.convDa, self.convDb = _conv_bn(deepest, head), nn.Conv2d(head, 1, 3, padding=1)
         if architecture.peaks:
-            self.convR = nn.Conv2d(architecture.blocks[1][-1], architecture.fold**2, 3, padding=1)
+            side = architecture.response_kernel
+            self.convR = nn.Conv2d(architecture.blocks[1][-1], architecture.fold**2, side, padding=side // 2)
         else:
             self.convPa, self.convPb = _conv_bn(deepest, head), nn.Conv2d(head, 2, 3, padding=1)
         self.convFa, self.convFb = _conv_bn(deepest, head), _conv_bn(head, 4 * quarter)

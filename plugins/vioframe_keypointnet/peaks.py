@@ -13,6 +13,11 @@ from vioframe.types import Image
 from vioframe_keypointnet.architecture import CELL_PX
 from vioframe_keypointnet.selection import Array, Rules, sigmoid, varies
 
+_SQUARES_A_POINT = 6
+"""So many squares of 2 x 2 px are looked at for each point that is wanted, before all are."""
+_EVERY = 8
+"""Of rows and of columns, one in so many is looked at to find the bound that these exceed."""
+
 
 def reach_px(rules: Rules) -> int:
     """How far along either axis a peak has to be the highest."""
@@ -28,9 +33,6 @@ class Peaks:
 
     def __init__(self, rules: Rules) -> None:
         self._rules, self._reach = rules, reach_px(rules)
-        # A peak is the highest of its square of 2 x 2 px, and of all squares that it reaches wherever in its own it is.
-        side = 2 * ((self._reach - 1) // 2) + 1
-        self._squares = np.ones((side, side), np.uint8)
         self._scratch = lru_cache(maxsize=4)(_Scratch)
 
     def __call__(self, response: Array, image: Image, shape: tuple[int, int], max_points: int) -> tuple[Array, Array]:
@@ -38,18 +40,19 @@ class Peaks:
 
         In each place there are f x f pixels, row by row, f a power of two.
         """
-        import cv2
-
         f = isqrt(response.shape[2])
         scratch = self._scratch(response.shape[0] * f // 2, response.shape[1] * f // 2)
         _highest_of_four(response, f, scratch.highest)
-        cv2.dilate(scratch.highest, self._squares, scratch.around)
-        squares = scratch.found[: _find(scratch.found, scratch.highest, scratch.around)]
-        squares = squares[_descending(scratch.highest.ravel()[squares])]
-        xy = np.empty((max(min(max_points, len(squares)), 0), 2), np.float32)
-        score, shift = np.empty(len(xy), np.float32), f.bit_length() - 1
-        least = self._rules.min_contrast
-        count = _take(xy, score, squares, response, shift, self._reach, image, shape[0], shape[1], least)
+        most = min(max(max_points, 0), scratch.highest.size)
+        xy, score = np.empty((most, 2), np.float32), np.empty(most, np.float32)
+        count, shift, least = 0, f.bit_length() - 1, self._rules.min_contrast
+        # The strongest squares nearly always hold enough peaks; to look at and to sort all takes several times as long.
+        for above in (_exceeded_by(scratch.highest, _SQUARES_A_POINT * most), -np.inf):
+            found = scratch.found[: _find(scratch.found, scratch.highest, np.float32(above), (self._reach - 1) // 2)]
+            found = found[_descending(scratch.highest.ravel()[found])]
+            count = _take(xy, score, found, response, shift, self._reach, image, shape[0], shape[1], least)
+            if count == most:
+                break
         return xy[:count], sigmoid(score[:count])
 
 
@@ -57,8 +60,15 @@ class _Scratch:
     """Arrays for responses of one size: as new ones each time they would take longer than what fills them."""
 
     def __init__(self, rows: int, columns: int) -> None:
-        self.highest, self.around = (np.empty((rows, columns), np.float32) for _ in range(2))
-        self.found = np.empty(rows * columns + 1, np.int32)
+        self.highest = np.empty((rows, columns), np.float32)
+        self.found = np.empty(rows * columns, np.int32)
+
+
+def _exceeded_by(values: Array, count: int) -> float:
+    """A bound that about ``count`` of ``values`` (H, W) exceed, from a sample."""
+    sample = values[::_EVERY, ::_EVERY].ravel()
+    rank = int(len(sample) * (1.0 - count / values.size))
+    return float(np.partition(sample, rank)[rank]) if 0 <= rank < len(sample) else -np.inf
 
 
 def _descending(values: Array) -> NDArray[np.int64]:
@@ -87,17 +97,29 @@ def _highest_of_four(response: Array, f: int, highest: Array) -> None:
 
 
 @kernel
-def _find(squares: NDArray[np.int32], highest: Array, around: Array) -> int:
-    """Fill ``squares`` with the indices of those off the border that may hold a peak; their number."""
+def _find(found: NDArray[np.int32], highest: Array, above: np.float32, reach: int) -> int:
+    """Fill ``found`` with the squares off the border that may hold a peak ``above`` a bound; their number.
+
+    A peak is the highest of its square of 2 x 2 px, and of all squares up to ``reach`` away.
+    """
     rows, columns = highest.shape
     border = CELL_PX // 2
     count = 0
     for row in range(border, rows - border):
         for column in range(border, columns - border):
-            if highest[row, column] == around[row, column]:
-                squares[count] = row * columns + column
+            if highest[row, column] > above and _is_highest(highest, row, column, reach):
+                found[count] = row * columns + column
                 count += 1
     return count
+
+
+@kernel
+def _is_highest(highest: Array, row: int, column: int, reach: int) -> bool:
+    for r in range(max(row - reach, 0), min(row + reach + 1, highest.shape[0])):
+        for c in range(max(column - reach, 0), min(column + reach + 1, highest.shape[1])):
+            if highest[r, c] > highest[row, column]:
+                return False
+    return True
 
 
 @kernel

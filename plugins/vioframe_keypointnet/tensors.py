@@ -34,7 +34,8 @@ def shapes(architecture: Architecture) -> dict[str, tuple[int, ...]]:
             found[f"conv{name}.1.{statistic}"] = (after,)
     place = ("R", architecture.blocks[1][-1], architecture.fold**2) if architecture.peaks else ("Pb", head, 2)
     for name, before, after in (("Db", head, 1), place, ("Fbb", head, architecture.descriptor)):
-        found[f"conv{name}.weight"] = (after, before, 3, 3)
+        side = architecture.response_kernel if name == "R" else 3
+        found[f"conv{name}.weight"] = (after, before, side, side)
         found[f"conv{name}.bias"] = (after,)
     return found
 

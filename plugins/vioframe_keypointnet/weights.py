@@ -70,7 +70,7 @@ def save(
 def load(source: str | Path) -> Weights:
     """Weights by the name of those that ship, or from a ``.safetensors`` file or an official ``.ckpt``.
 
-    ``untrained:full`` and ``untrained:compact`` are random, for measuring speed: only ever by this explicit wish.
+    ``untrained:full`` and the like are random, for measuring speed: only ever by this explicit wish.
     Raises :class:`ConfigError` saying how to get weights.
     """
     name = str(source)

@@ -15,11 +15,17 @@ from vioframe.registry import DETECTOR, Registry, describe
 from vioframe.types import Image, Keypoints
 
 _DESCRIPTORS = "descriptors"
+_QUICK = "keypointnet:weights=quick"
 _VARIANTS: Mapping[str, Mapping[str, Sequence[str]]] = {
     # Speed does not depend on what the weights are: the published size is timed also where there are none for it.
-    "speed": {"keypointnet": tuple(f"keypointnet:weights=untrained:full{how}" for how in ("", ",precision=float32"))},
+    "speed": {
+        "keypointnet": (
+            _QUICK,
+            *(f"keypointnet:weights=untrained:full{how}" for how in ("", ",precision=float32")),
+        )
+    },
     # 10 px between corners, the default, suits tracking; it leaves out many that could be found again.
-    "quality": {"shi_tomasi": ("shi_tomasi:min_distance_px=4",)},
+    "quality": {"shi_tomasi": ("shi_tomasi:min_distance_px=4",), "keypointnet": (_QUICK,)},
 }
 
 
