@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from functools import partial
 
 import cv2
 import numpy as np
@@ -271,8 +272,8 @@ def on_cpu(folded, rules, image) -> Keypoints:
     from vioframe_keypointnet.detector import OnCpu
     from vioframe_keypointnet.runtimes.torch import TorchOnCpu
 
-    peaks = Peaks(rules) if folded.architecture.peaks else None
-    return OnCpu(TorchOnCpu(folded, 1), rules, peaks)(padded_to_cells(image), image.shape, 60)
+    choose = Peaks(rules) if folded.architecture.peaks else partial(select, rules=rules)
+    return OnCpu(TorchOnCpu(folded, 1), choose)(padded_to_cells(image), image.shape, 60)
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")

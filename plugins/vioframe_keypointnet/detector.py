@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Protocol, cast
 
 import numpy as np
@@ -16,8 +18,11 @@ from vioframe_keypointnet.description import describe
 from vioframe_keypointnet.folding import fold
 from vioframe_keypointnet.options import KeypointNetOptions
 from vioframe_keypointnet.peaks import Peaks
-from vioframe_keypointnet.selection import Rules, padded_to_cells, select
+from vioframe_keypointnet.selection import Array, Rules, padded_to_cells, select
 from vioframe_keypointnet.weights import load
+
+Choose = Callable[[Array, Image, tuple[int, int], int], tuple[Array, Array]]
+"""From what the network found to the places and scores of keypoints; the arguments of :func:`select` but its rules."""
 
 _LOG = logging.getLogger(__name__)
 
@@ -33,16 +38,11 @@ class OnCpu:
     """A network run by any library, its keypoints selected here."""
 
     run: runtimes.Run
-    rules: Rules
-    peaks: Peaks | None
-    """Of a network of peaks."""
+    choose: Choose
 
     def __call__(self, padded: Image, shape: tuple[int, int], max_points: int) -> Keypoints:
         found, *described = self.run(padded)
-        if self.peaks is not None:
-            xy, score = self.peaks(found, padded, shape, max_points)
-        else:
-            xy, score = select(found, padded, shape, max_points, self.rules)
+        xy, score = self.choose(found, padded, shape, max_points)
         return Keypoints(xy, score, describe(described[0], xy) if described else None)
 
 
@@ -76,5 +76,5 @@ def keypointnet(options: KeypointNetOptions) -> Detector:
         engine = OnCuda(network, rules, precision)
     else:
         run = runtimes.on_cpu(runtime, precision, network, weights.activation_ranges, options.threads)
-        engine = OnCpu(run, rules, Peaks(rules) if network.architecture.peaks else None)
+        engine = OnCpu(run, Peaks(rules) if network.architecture.peaks else partial(select, rules=rules))
     return KeypointNet(engine, runtime, precision, device)

@@ -50,31 +50,31 @@ class _Sight:
 
     def __init__(self, shape: tuple[int, int], fold: int) -> None:
         rows, columns = shape
-        self._folded = (fold * fold, rows // fold, columns // fold)
-        self._off, self._steps = np.empty(shape, np.float32), np.empty(shape, np.uint8)
+        self._fold, self._folded = fold, (fold * fold, rows // fold, columns // fold)
+        self._contrast, self._steps = np.empty(shape, np.float32), np.empty(shape, np.uint8)
         self._seen = np.empty(self._folded, np.uint8)
         self._coarse, self._means = (np.empty((rows // COARSE_PX, columns // COARSE_PX), np.float32) for _ in range(2))
         self._around = np.empty((rows // COARSE_PX, columns), np.float32)
 
     def contrast(self, image: Image) -> Floats:
-        """``image`` less its mean, over its deviation, of about 20 px around; flat parts stay small."""
-        _, rows, columns = self._folded
-        _divide(self._off, self._variance(image), _FAINT, self._off)
-        by_place = self._off.reshape(rows, -1, columns, image.shape[1] // columns).transpose(1, 3, 0, 2)
+        """Local contrast, folded."""
+        f, (_, rows, columns) = self._fold, self._folded
+        by_place = self._local_contrast(image).reshape(rows, f, columns, f).transpose(1, 3, 0, 2)
         return np.ascontiguousarray(by_place).reshape(self._folded)
 
     def contrast_in_steps(self, image: Image) -> Image:
         """The same in 8 bits."""
-        _divide_in_steps(self._off, self._variance(image), _FAINT, np.float32(1.0) / CONTRAST_STEP, self._steps)
+        _round(self._local_contrast(image), np.float32(1.0) / CONTRAST_STEP, self._steps)
         # The pixels of a row that one place holds, as one whole number, of which shifts take them apart.
-        _fold(self._steps.view(f"<u{len(self._steps[0]) // self._folded[2]}"), self._seen)
+        _fold(self._steps.view(f"<u{self._fold}"), self._seen)
         return self._seen
 
-    def _variance(self, image: Image) -> Floats:
-        """(H/4, W) of ``image``, whose differences from the local mean are left in ``_off``."""
+    def _local_contrast(self, image: Image) -> Floats:
+        """``image`` less its mean, over its deviation, of about 20 px around; flat parts stay small."""
         _means(image, self._coarse)
-        _take_away(image, self._smoothed(), self._off, self._coarse)
-        return self._smoothed()
+        _take_away(image, self._smoothed(), self._contrast, self._coarse)
+        _divide(self._contrast, self._smoothed(), _FAINT)
+        return self._contrast
 
     def _smoothed(self) -> Floats:
         """(H/4, W): the mean of the coarse values around each, interpolated within the rows; kernels do it between."""
@@ -127,25 +127,21 @@ def _take_away(image: Image, mean: Floats, off: Floats, variance: Floats) -> Non
 
 
 @kernel
-def _divide(off: Floats, variance: Floats, faint: np.float32, contrast: Floats) -> None:
-    """Fill ``contrast`` (H, W) with ``off`` over the local deviation."""
+def _divide(off: Floats, variance: Floats, faint: np.float32) -> None:
+    """Divide ``off`` (H, W) by the local deviation."""
     for y in range(off.shape[0]):
         above, below, share = _between(y, len(variance))
         rest = np.float32(1.0) - share
         for x in range(off.shape[1]):
-            deviation = np.sqrt(rest * variance[above, x] + share * variance[below, x] + faint)
-            contrast[y, x] = off[y, x] / deviation
+            off[y, x] /= np.sqrt(rest * variance[above, x] + share * variance[below, x] + faint)
 
 
 @kernel
-def _divide_in_steps(off: Floats, variance: Floats, faint: np.float32, per_step: np.float32, steps: Image) -> None:
-    """What :func:`_divide` does, in 8 bits."""
-    for y in range(off.shape[0]):
-        above, below, share = _between(y, len(variance))
-        rest = np.float32(1.0) - share
-        for x in range(off.shape[1]):
-            deviation = np.sqrt(rest * variance[above, x] + share * variance[below, x] + faint)
-            rounded = off[y, x] / deviation * per_step + np.float32(ZERO + 0.5)
+def _round(contrast: Floats, per_step: np.float32, steps: Image) -> None:
+    """Fill ``steps`` (H, W) with ``contrast`` in 8 bits."""
+    for y in range(contrast.shape[0]):
+        for x in range(contrast.shape[1]):
+            rounded = contrast[y, x] * per_step + np.float32(ZERO + 0.5)
             # By way of int32, as processors convert no vector of floats to bytes.
             steps[y, x] = np.uint8(np.int32(min(max(rounded, np.float32(0.0)), np.float32(255.0))))
 
