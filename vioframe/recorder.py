@@ -219,9 +219,14 @@ class Recorder:
 
 
 def write_json(path: Path, tree: Mapping[str, Any]) -> None:
+    """Replace ``path`` as a whole."""
+    write_whole(path, json.dumps(tree, indent=2, default=str) + "\n")
+
+
+def write_whole(path: Path, text: str) -> None:
     """Replace ``path`` as a whole, so that a reader never sees half of it."""
     partial = path.with_suffix(".partial")
-    partial.write_text(json.dumps(tree, indent=2, default=str) + "\n", encoding="utf-8")
+    partial.write_text(text, encoding="utf-8")
     partial.replace(path)
 
 

@@ -5,17 +5,16 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatch
-from itertools import islice
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from vioframe import registry
+from vioframe.bench.detectors.images import frames_of
 from vioframe.errors import ConfigError, DatasetError
 from vioframe.images import decode_image, to_gray8
 from vioframe.interfaces import Dataset
-from vioframe.types import Frame
 
 _SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".ppm", ".pgm", ".tif", ".tiff", ".webp"})
 _SMALLEST_PX = 64
@@ -77,9 +76,7 @@ def _photographs(folder: Path, channels: int) -> list[Picture]:
 
 
 def _frames(dataset: Dataset, channels: int, count: int, where: str) -> list[Picture]:
-    every = max(1, (dataset.frame_count or count) // count)
-    frames = (m for m in dataset.measurements() if isinstance(m, Frame))
-    taken = islice(enumerate(frames), 0, every * count, every)
+    taken = frames_of(dataset, count)
     return [Picture(f"{where}#{k}", _with_channels(frame.image, channels, where)) for k, frame in taken]
 
 

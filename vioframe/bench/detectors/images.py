@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from itertools import islice
 from pathlib import Path
 from typing import TypeVar
 
@@ -10,7 +11,8 @@ import numpy as np
 
 from vioframe.errors import DatasetError
 from vioframe.images import decode_image, to_gray8
-from vioframe.types import Float, Image
+from vioframe.interfaces import Dataset
+from vioframe.types import Float, Frame, Image
 
 ItemT = TypeVar("ItemT")
 
@@ -40,6 +42,13 @@ def evenly(items: Sequence[ItemT], count: int | None) -> list[ItemT]:
     if count is None or count >= len(items):
         return list(items)
     return [items[i] for i in np.round(np.linspace(0, len(items) - 1, count)).astype(int)]
+
+
+def frames_of(dataset: Dataset, count: int) -> Iterator[tuple[int, Frame]]:
+    """At most ``count`` frames of a recording, evenly over it, each with its number."""
+    every = max(1, (dataset.frame_count or count) // count)
+    frames = (measurement for measurement in dataset.measurements() if isinstance(measurement, Frame))
+    return islice(enumerate(frames), 0, every * count, every)
 
 
 def fitting(shape: tuple[int, ...], resolution: tuple[int, int]) -> Float:

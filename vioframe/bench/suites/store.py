@@ -20,7 +20,7 @@ from vioframe.calibration import sidecar_folder
 from vioframe.config import read_tree
 from vioframe.convert import appearing
 from vioframe.errors import RunError
-from vioframe.recorder import write_json
+from vioframe.recorder import write_json, write_whole
 from vioframe.registry import describe
 from vioframe.report.suite.results import SUITE_FILE, TASK_FILE, TASKS_FOLDER
 from vioframe.simulation.files import simulation_folder
@@ -65,9 +65,7 @@ class Store:
             (self.path / TASKS_FOLDER).mkdir(parents=True, exist_ok=True)
             self.recordings.mkdir(parents=True, exist_ok=True)
             if not file.is_file():
-                partial = file.with_suffix(".partial")
-                partial.write_text(text, encoding="utf-8")
-                partial.replace(file)
+                write_whole(file, text)
         except OSError as error:
             raise RunError(f"cannot write to {self.path}: {error.strerror}; choose another --out") from error
 

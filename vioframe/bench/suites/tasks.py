@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +21,7 @@ from vioframe.report.suite.results import RUN_FOLDER
 from vioframe.simulation.record import record
 from vioframe.simulation.recording import SimulatedRecording
 from vioframe.trajectory import Comparison
-from vioframe.types import NS_PER_S, Frame, Image
+from vioframe.types import NS_PER_S
 
 Figures = Mapping[str, Any]
 
@@ -45,14 +44,6 @@ def simulate(store: Store, job: RecordingJob, workers: int) -> None:
 def code() -> str:
     """The version of the code in this process."""
     return code_version(installed())
-
-
-def _frames(recording: Path, count: int) -> list[Image]:
-    """``count`` images of a recording, evenly over it."""
-    dataset = installed().open_dataset(recording)
-    step = max((dataset.frame_count or count) // count, 1)
-    frames = (each.image for each in dataset.measurements() if isinstance(each, Frame))
-    return list(islice(frames, 0, step * count, step))
 
 
 def _do(job: AnyJob, store: Store, folder: Path) -> Figures:
@@ -112,7 +103,7 @@ def _trial(job: TrialJob) -> Figures:
 def speed(job: SpeedJob) -> Figures:
     """Frames a second of each detector; those that lack something are absent, with the reason."""
     from vioframe.bench.detectors.entrants import Entrant, everyone, line_up, parse_entrants
-    from vioframe.bench.detectors.images import fit, procedural_images
+    from vioframe.bench.detectors.images import fit, frames_of, procedural_images
     from vioframe.bench.detectors.speed import RESOLUTION, speed_settings, time_detectors
 
     entrants = [Entrant(each.called, each.name, each.options) for each in job.detectors]
@@ -122,7 +113,8 @@ def speed(job: SpeedJob) -> Figures:
     if job.recording is None:
         images, source = procedural_images(job.images, RESOLUTION, 0), "drawn surfaces"
     else:
-        images = [fit(frame, RESOLUTION) for frame in _frames(job.recording, job.images)]
+        taken = frames_of(installed().open_dataset(job.recording), job.images)
+        images = [fit(frame.image, RESOLUTION) for _, frame in taken]
         source = f"frames of {job.recording.stem}"
     rows = time_detectors(lined_up.ready, images, job.rounds)
     settings = speed_settings(source, len(images), job.rounds)
