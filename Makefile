@@ -36,6 +36,7 @@ lint: install
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+	$(BIN)/lint-imports
 
 # Every detector with the filter, and the optimiser with loop closure, on the same simulated flight; nothing is downloaded.
 demo: install

@@ -12,11 +12,11 @@ import click
 from rich.console import Console
 from threadpoolctl import threadpool_limits
 
-from vioframe import config as configuration
-from vioframe import registry
 from vioframe.bench import Row, backend_row, record, run_backend, table
-from vioframe.config import Config, PartConfig
 from vioframe.errors import VioframeError
+from vioframe.parts import config as configuration
+from vioframe.parts import registry
+from vioframe.parts.config import Config, PartConfig
 from vioframe.simulation import TrackSequence
 
 HERE = Path(__file__).resolve().parent

@@ -15,16 +15,16 @@ import click
 import numpy as np
 from common import benchmark, present
 
-from vioframe import config as configuration
-from vioframe import registry
 from vioframe.bench import Row
 from vioframe.bench.detectors.entrants import line_up, parse_entrants
-from vioframe.config import Config, DatasetConfig, PartConfig
-from vioframe.convert import convert
+from vioframe.evaluation import evaluate
 from vioframe.experiment import prepare, record
-from vioframe.registry import DETECTOR, Registry
-from vioframe.report.run_folder import RunFolder
-from vioframe.trajectory import evaluate
+from vioframe.io.convert import convert
+from vioframe.parts import config as configuration
+from vioframe.parts import registry
+from vioframe.parts.config import Config, DatasetConfig, PartConfig
+from vioframe.parts.registry import DETECTOR, Registry
+from vioframe.runs.folder import RunFolder
 
 TRUTH = "mav0/state_groundtruth_estimate0/data.csv"
 COLUMNS = {

@@ -11,13 +11,13 @@ import numpy as np
 from common import SHARED_DATA, present
 from threadpoolctl import threadpool_limits
 
-from vioframe import registry
 from vioframe.bench import Row
 from vioframe.bench.epipolar import epipolar_errors_px
 from vioframe.frontend import Frontend, FrontendOptions
 from vioframe.incidents import Incidents
 from vioframe.interfaces import Dataset
-from vioframe.synchronise import synchronise
+from vioframe.io.synchronise import synchronise
+from vioframe.parts import registry
 from vioframe.types import FrameTracks
 
 COLUMNS = {

@@ -12,11 +12,11 @@ import click
 from common import benchmark, results_file
 from rich.console import Console
 
-from vioframe import registry
 from vioframe.bench import record
 from vioframe.bench.contenders import parse_contenders
 from vioframe.bench.montecarlo import Setup, run_montecarlo
 from vioframe.bench.processes import usable_cores
+from vioframe.parts import registry
 from vioframe.report.montecarlo import to_rich
 
 

@@ -16,10 +16,10 @@ import click
 from common import benchmark, present
 from euroc_clips import run
 
-from vioframe import config as configuration
-from vioframe import registry
 from vioframe.bench import Row
-from vioframe.config import Config, DatasetConfig, PartConfig
+from vioframe.parts import config as configuration
+from vioframe.parts import registry
+from vioframe.parts.config import Config, DatasetConfig, PartConfig
 from vioframe.simulation.config import SimulationConfig, complete
 from vioframe.simulation.record import record
 from vioframe.simulation.recording import SimulatedRecording

@@ -14,14 +14,14 @@ from time import perf_counter
 import click
 from common import benchmark, present
 
-from vioframe import registry
 from vioframe.bench import Row
 from vioframe.bench.suites.plan import plan
 from vioframe.bench.suites.store import Store
 from vioframe.bench.suites.suite import Suite
 from vioframe.bench.suites.sweep import agenda, sweep
 from vioframe.bench.suites.tasks import simulate
-from vioframe.config import validate
+from vioframe.parts import registry
+from vioframe.parts.config import validate
 
 COLUMNS = {"workers": "d", "flights": "d", "seconds": ".1f", "flights_per_minute": ".2f", "times_one": ".2f"}
 

@@ -7,10 +7,10 @@ from pathlib import Path
 import click
 from click.testing import CliRunner
 
-from vioframe import registry
 from vioframe.cli import main
 from vioframe.frontend import FrontendOptions
-from vioframe.options import REQUIRED, Option, options_of
+from vioframe.parts import registry
+from vioframe.parts.options import REQUIRED, Option, options_of
 
 PAGE = Path(__file__).parent / "cli.md"
 

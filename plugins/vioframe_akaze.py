@@ -5,9 +5,9 @@ from typing import Annotated
 
 from pydantic import NonNegativeFloat, PositiveInt
 
-from vioframe.hookspecs import hookimpl
+from vioframe.frontend.opencv_keypoints import detect
 from vioframe.interfaces import DetectorFactory
-from vioframe.opencv_keypoints import detect
+from vioframe.parts.hooks import hookimpl
 from vioframe.types import Image, Keypoints
 
 

@@ -9,15 +9,15 @@ from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 
-from vioframe.calibration import as_paths, load_calibration
 from vioframe.errors import DatasetError
-from vioframe.hookspecs import hookimpl
-from vioframe.images import check_bit_depth, check_size, decode_image, to_gray8
 from vioframe.interfaces import DatasetFactory
+from vioframe.io.calibration import as_paths, load_calibration
+from vioframe.io.images import check_bit_depth, check_size, decode_image, to_gray8
+from vioframe.parts.hooks import hookimpl
 from vioframe.types import Calibration, Frame, ImuSample, Measurement, Unreadable
 
 if TYPE_CHECKING:
-    from vioframe.trajectory import Trajectory
+    from vioframe.geometry.trajectory import Trajectory
 
 # An IMU row counts as due when one of it and the next few rows is: a single wild stamp must not hold up all the rest.
 _ROWS_AHEAD = 5
@@ -71,7 +71,7 @@ class EurocDataset:
         file = self._mav0 / "state_groundtruth_estimate0" / "data.csv"
         if not file.is_file():
             return None
-        from vioframe.trajectory import load_trajectory
+        from vioframe.io.trajectories import load_trajectory
 
         return load_trajectory(file)
 

@@ -12,11 +12,12 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 from vioframe.errors import PluginError, TrajectoryError
-from vioframe.hookspecs import hookimpl
+from vioframe.parts.hooks import hookimpl
 
 if TYPE_CHECKING:
+    from vioframe.evaluation import Comparison
+    from vioframe.geometry.trajectory import Trajectory
     from vioframe.interfaces import MetricFactory
-    from vioframe.trajectory import Comparison, Trajectory
 
 
 class Evo:

@@ -5,8 +5,8 @@ from typing import Annotated
 
 import numpy as np
 
-from vioframe.hookspecs import hookimpl
 from vioframe.interfaces import DetectorFactory
+from vioframe.parts.hooks import hookimpl
 from vioframe.types import Image, Keypoints
 
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import numpy as np
 from pydantic import Field
 
-from vioframe.hookspecs import hookimpl
+from vioframe.parts.hooks import hookimpl
 from vioframe.types import GRAVITY_M_S2, Float
 
 if TYPE_CHECKING:

@@ -1,4 +1,4 @@
-"""The built-in metrics: a choice of figures each, by :mod:`vioframe.trajectory`. Their meaning: ``docs/metrics.md``."""
+"""The built-in metrics: a choice of figures each, by :mod:`vioframe.evaluation`. Their meaning: ``docs/metrics.md``."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ import numpy as np
 from pydantic import AfterValidator, Field
 
 from vioframe.errors import TrajectoryError
-from vioframe.hookspecs import hookimpl
-from vioframe.trajectory.alignment import align_sim3
-from vioframe.trajectory.evaluation import LENGTHS_M
-from vioframe.trajectory.metrics import Stats, position_error_W, relative_errors
+from vioframe.evaluation.alignment import align_sim3
+from vioframe.evaluation.evaluation import LENGTHS_M
+from vioframe.evaluation.metrics import Stats, position_error_W, relative_errors
+from vioframe.parts.hooks import hookimpl
 
 if TYPE_CHECKING:
+    from vioframe.evaluation import Comparison
     from vioframe.interfaces import MetricFactory
-    from vioframe.trajectory import Comparison
 
 
 def _all_positive(lengths_m: tuple[float, ...]) -> tuple[float, ...]:

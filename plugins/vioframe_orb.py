@@ -3,9 +3,9 @@
 from collections.abc import Mapping
 from typing import Annotated
 
-from vioframe.hookspecs import hookimpl
+from vioframe.frontend.opencv_keypoints import detect
 from vioframe.interfaces import DetectorFactory
-from vioframe.opencv_keypoints import detect
+from vioframe.parts.hooks import hookimpl
 from vioframe.types import Image, Keypoints
 
 

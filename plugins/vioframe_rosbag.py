@@ -18,18 +18,18 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vioframe.calibration import as_paths, load_calibration, packaged_calibration, sidecar_folder
 from vioframe.errors import DatasetError
-from vioframe.hookspecs import hookimpl
-from vioframe.images import check_bit_depth, check_size, decode_image, to_gray8
 from vioframe.interfaces import DatasetFactory
+from vioframe.io.calibration import as_paths, load_calibration, packaged_calibration, sidecar_folder
+from vioframe.io.images import check_bit_depth, check_size, decode_image, to_gray8
+from vioframe.io.writers import GROUND_TRUTH_TOPIC
+from vioframe.parts.hooks import hookimpl
 from vioframe.types import NS_PER_S, Calibration, Frame, Image, ImuSample, Measurement, Unreadable
-from vioframe.writers import GROUND_TRUTH_TOPIC
 
 if TYPE_CHECKING:
     from rosbags.highlevel import AnyReader
 
-    from vioframe.trajectory import Trajectory
+    from vioframe.geometry.trajectory import Trajectory
 
 _log = logging.getLogger("vioframe.rosbag")
 
@@ -83,7 +83,7 @@ class RosbagDataset:
     @property
     def ground_truth(self) -> Trajectory | None:
         """That of a simulated recording. Motion capture is not aligned in time: other truth comes from a file."""
-        from vioframe.trajectory import Trajectory
+        from vioframe.geometry.trajectory import Trajectory
 
         with _opened(self._path) as reader:
             connections = [connection for connection in reader.connections if connection.topic == GROUND_TRUTH_TOPIC]

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import numpy as np
 
 from vioframe.errors import ConfigError
-from vioframe.hookspecs import hookimpl
+from vioframe.parts.hooks import hookimpl
 from vioframe.types import Float, Image
 
 if TYPE_CHECKING:
@@ -50,7 +50,8 @@ def mesh(
 ) -> MeshWorld:
     """The triangles of ``file`` as they lie in W; textures are laid on along the axis each face looks to most."""
     from vioframe.geometry.meshes import read_mesh
-    from vioframe.simulation.world import Mesh, MeshWorld
+    from vioframe.simulation.world import MeshWorld
+    from vioframe.types import Mesh
 
     if not tile_m > 0.0:
         raise ConfigError(f"tile_m must be above 0, not {tile_m:g}")

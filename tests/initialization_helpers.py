@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from vioframe.estimation.initialization import InitialEstimate, InitializationOptions, Initializer
 from vioframe.geometry import so3
 from vioframe.geometry.cameras import Camera
-from vioframe.initialization import InitialEstimate, InitializationOptions, Initializer
 from vioframe.simulation.sequence import Packet, TrackSequence
 from vioframe.types import DTHETA, DV, Calibration, Float, FrameTracks, Int
 

@@ -10,13 +10,13 @@ import numpy as np
 from simulation_helpers import INSTALLED, small_calibration
 
 from vioframe.geometry.meshes import ray_scene
+from vioframe.geometry.so3 import rotation_z
+from vioframe.geometry.trajectory import Trajectory
 from vioframe.interfaces import World
 from vioframe.simulation.flights import levelled
 from vioframe.simulation.renderer import Renderer
 from vioframe.simulation.textures import procedural_textures
 from vioframe.simulation.world import MeshBuilder, MeshWorld
-from vioframe.trajectory import Trajectory
-from vioframe.trajectory.alignment import rotation_z
 from vioframe.types import NS_PER_S, Calibration, Estimate, Float, Frame, FrameTracks, NavState, Status, Step
 
 CALIBRATION: Calibration = small_calibration(2)

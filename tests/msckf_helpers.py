@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from vioframe.calibration import packaged_calibration
 from vioframe.geometry import so3
+from vioframe.io.calibration import packaged_calibration
 from vioframe.simulation import TrackSequence, simulated_sequence
 from vioframe.types import Float, NavState
 from vioframe_msckf.state import FilterState

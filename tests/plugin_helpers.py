@@ -14,6 +14,6 @@ def install(
     info.mkdir(parents=True)
     (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {distribution}\nVersion: {version}\n")
     (info / "entry_points.txt").write_text(f"[vioframe]\n{module} = {module}\n")
-    (folder / f"{module}.py").write_text("from vioframe.hookspecs import hookimpl\n" + dedent(code))
+    (folder / f"{module}.py").write_text("from vioframe.parts.hooks import hookimpl\n" + dedent(code))
     monkeypatch.syspath_prepend(str(folder))
     monkeypatch.delitem(__import__("sys").modules, module, raising=False)

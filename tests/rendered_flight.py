@@ -9,12 +9,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from vioframe.calibration import packaged_calibration
-from vioframe.convert import convert
 from vioframe.geometry.cameras import Camera
+from vioframe.geometry.trajectory import Trajectory
+from vioframe.io.calibration import packaged_calibration
+from vioframe.io.convert import convert
+from vioframe.io.trajectories import write_tum
 from vioframe.simulation.flights import flight
 from vioframe.simulation.imu import read_imu
-from vioframe.trajectory import Trajectory, write_tum
 from vioframe.types import NS_PER_S, Calibration, Frame, ImuSample, Measurement
 
 WIDTH, HEIGHT = 376, 240

@@ -3,9 +3,9 @@
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from vioframe.calibration import packaged_calibration
-from vioframe.inertial.propagation import propagate
+from vioframe.estimation.inertial.propagation import propagate
 from vioframe.interfaces import Flight
+from vioframe.io.calibration import packaged_calibration
 from vioframe.simulation.imu import read_imu
 from vioframe.types import ImuSegment
 

@@ -7,8 +7,8 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from vioframe import registry
-from vioframe.calibration import packaged_calibration, write_calibration
+from vioframe.io.calibration import packaged_calibration, write_calibration
+from vioframe.parts import registry
 from vioframe.simulation.config import SimulationConfig, complete
 from vioframe.simulation.recording import SimulatedRecording
 from vioframe.types import Calibration

@@ -9,13 +9,13 @@ import numpy as np
 from msckf_helpers import random_covariance
 from numpy.typing import NDArray
 
-from vioframe.calibration import packaged_calibration
+from vioframe.estimation.inertial.imu_factors import ImuFactors, StateArrays
+from vioframe.estimation.inertial.preintegration import join_segments, preintegrate
+from vioframe.estimation.standstill import Standstill
 from vioframe.geometry.cameras import Camera
 from vioframe.geometry.kernels import intrinsics_of
-from vioframe.inertial.imu_factors import ImuFactors, StateArrays
-from vioframe.inertial.preintegration import join_segments, preintegrate
+from vioframe.io.calibration import packaged_calibration
 from vioframe.simulation import simulated_sequence
-from vioframe.standstill import Standstill
 from vioframe.types import Float
 from vioframe_sliding_window.landmarks import camera_poses, in_hosts, positions
 from vioframe_sliding_window.problem import STATE_SIZE, Calibrated, Prior, Problem, Variables

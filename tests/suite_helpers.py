@@ -10,10 +10,11 @@ import numpy as np
 from ruamel.yaml import YAML
 from trajectory_helpers import disturbed, flight, write_run
 
+from vioframe.evaluation import evaluate
+from vioframe.geometry.trajectory import Trajectory
 from vioframe.report.matched_truth import write_matched_truth
-from vioframe.report.run_folder import RunFolder
 from vioframe.report.suite.results import Data, Kind, Labels, SuiteResults, load_results
-from vioframe.trajectory import Trajectory, evaluate
+from vioframe.runs.folder import RunFolder
 
 MACHINE = {"vioframe": "0.1.0", "commit": "abc", "cpu": "a processor", "cpu_count": 2, "versions": {"numpy": "2.0"}}
 POSES = 160

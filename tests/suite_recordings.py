@@ -7,8 +7,8 @@ from shutil import rmtree
 import pytest
 from plugin_helpers import install
 
-from vioframe import registry
-from vioframe.calibration import packaged_calibration, write_calibration
+from vioframe.io.calibration import packaged_calibration, write_calibration
+from vioframe.parts import registry
 from vioframe.simulation.config import SimulationConfig, complete
 from vioframe.simulation.files import simulation_folder
 from vioframe.simulation.record import record

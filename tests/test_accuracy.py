@@ -14,15 +14,15 @@ import numpy as np
 import pytest
 from threadpoolctl import threadpool_limits
 
-from vioframe import registry
 from vioframe.bench import Row, backend_row, run_backend
 from vioframe.bench.april import april_sequence
-from vioframe.config import Config, DatasetConfig, PartConfig
-from vioframe.convert import convert
+from vioframe.evaluation import TrajectoryErrors, evaluate
 from vioframe.experiment import prepare, record
-from vioframe.report.run_folder import RunFolder
+from vioframe.io.convert import convert
+from vioframe.parts import registry
+from vioframe.parts.config import Config, DatasetConfig, PartConfig
+from vioframe.runs.folder import RunFolder
 from vioframe.simulation import REAL_MOTION_SEQUENCES, TrackSequence, real_motion_sequence
-from vioframe.trajectory import TrajectoryErrors, evaluate
 
 TRUTH = "mav0/state_groundtruth_estimate0/data.csv"
 

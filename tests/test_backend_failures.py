@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 from threadpoolctl import threadpool_limits
 
-from vioframe import registry
 from vioframe.bench import run_backend
-from vioframe.inertial.preintegration import join_segments
+from vioframe.estimation.inertial.preintegration import join_segments
+from vioframe.evaluation import evaluate
+from vioframe.parts import registry
 from vioframe.simulation import TrackSequence, simulated_sequence
 from vioframe.simulation.tracks import TrackOptions, TrackSimulator
-from vioframe.trajectory import evaluate
 from vioframe.types import NS_PER_S, FrameTracks, ImuSegment, Status
 
 BACKENDS = ("msckf", "sliding_window", "loose_ekf")

@@ -24,8 +24,8 @@ from recordings import Message, image_message, imu_message, write_bag
 from rendered_flight import DURATION_S, RenderedFlight, rendered_flight
 
 from vioframe.cli import main
-from vioframe.report.run_folder import RunFolder
-from vioframe.trajectory import evaluate
+from vioframe.evaluation import evaluate
+from vioframe.runs.folder import RunFolder
 from vioframe.types import NS_PER_S, Frame, ImuSample, Measurement
 
 
@@ -511,7 +511,7 @@ def test_an_evaluation_that_cannot_be_kept_is_still_shown(here, monkeypatch):
     def refuse(path: Path, tree: object) -> None:
         raise PermissionError(13, "Permission denied", str(path))
 
-    monkeypatch.setattr("vioframe.recorder.write_json", refuse)
+    monkeypatch.setattr("vioframe.runs.recorder.write_json", refuse)
     result = vioframe_("evaluate", "run", "--format", "csv")
     assert result.exit_code == 2
     assert result.stdout.count("\n") >= 2

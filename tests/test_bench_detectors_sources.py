@@ -12,7 +12,6 @@ from image_helpers import textured
 from plugin_helpers import install
 from rendered_flight import rendered_flight
 
-from vioframe import registry
 from vioframe.bench.detectors.degradations import Degradation
 from vioframe.bench.detectors.entrants import everyone, line_up, parse_entrants
 from vioframe.bench.detectors.flight import Stretch, fly_detectors
@@ -31,6 +30,7 @@ from vioframe.bench.detectors.quoted import TABLE_3_2
 from vioframe.bench.detectors.speed import time_detectors
 from vioframe.cli import main
 from vioframe.errors import ConfigError, DatasetError, PluginError
+from vioframe.parts import registry
 
 SIZE = (320, 240)
 

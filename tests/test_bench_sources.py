@@ -16,11 +16,11 @@ from vioframe.bench.april import (
     reprojection_px,
 )
 from vioframe.bench.gravity import gravity_in_frame, rotation_to_vertical
-from vioframe.calibration import packaged_calibration
 from vioframe.errors import DatasetError, TrajectoryError
 from vioframe.geometry import so3
+from vioframe.geometry.trajectory import Trajectory
+from vioframe.io.calibration import packaged_calibration
 from vioframe.simulation import simulated_sequence
-from vioframe.trajectory import Trajectory
 from vioframe.types import Estimate, NavState, Status, g_W
 
 CALIBRATION = packaged_calibration("euroc")

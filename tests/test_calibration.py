@@ -5,10 +5,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from vioframe.calibration import load_calibration, packaged_calibration, sidecar_folder, write_calibration
 from vioframe.errors import CalibrationError
 from vioframe.geometry import so3
 from vioframe.geometry.cameras import Camera
+from vioframe.io.calibration import load_calibration, packaged_calibration, sidecar_folder, write_calibration
 from vioframe.types import Calibration, ImuNoise
 
 CAMERA = Camera(458.5, 457.25, 367.0, 248.5, (-0.28, 0.07, 0.0002, 1.76e-05), (752, 480))

@@ -16,9 +16,9 @@ from plugin_helpers import install
 from ruamel.yaml import YAML
 
 import vioframe.cli
-from vioframe import config
 from vioframe.cli import main
-from vioframe.report.run_folder import RunFolder
+from vioframe.parts import config
+from vioframe.runs.folder import RunFolder
 
 HEAVY = {"cv2", "torch", "open3d", "filterpy", "numba", "matplotlib", "scipy", "numpy", "pydantic", "rich"}
 
@@ -27,7 +27,7 @@ PARTS = """
 import time
 from dataclasses import replace
 import numpy as np
-from vioframe.calibration import packaged_calibration
+from vioframe.io.calibration import packaged_calibration
 from vioframe.errors import DatasetError
 from vioframe.geometry.cameras import Camera
 from vioframe.types import *

@@ -2,10 +2,10 @@
 
 import pytest
 
-from vioframe import config, registry
-from vioframe.config import Config
 from vioframe.errors import ConfigError, VioframeError
-from vioframe.options import options_of
+from vioframe.parts import config, registry
+from vioframe.parts.config import Config
+from vioframe.parts.options import options_of
 
 
 @pytest.fixture(scope="module")

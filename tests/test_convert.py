@@ -10,9 +10,9 @@ from click.testing import CliRunner, Result
 from recordings import CALIBRATION, T0_NS, assert_equal, measurements
 
 from vioframe.cli import main
-from vioframe.convert import Conversion, convert, format_of
 from vioframe.errors import DatasetError
 from vioframe.interfaces import Dataset
+from vioframe.io.convert import Conversion, convert, format_of
 from vioframe.types import Frame, ImuSample, Measurement, Unreadable
 from vioframe_euroc import EurocDataset
 from vioframe_rosbag import RosbagDataset

@@ -7,8 +7,8 @@ import cv2
 import numpy as np
 import pytest
 
-from vioframe import registry
 from vioframe.errors import ConfigError, PluginError
+from vioframe.parts import registry
 from vioframe_akaze import Akaze
 from vioframe_brisk import Brisk
 from vioframe_surf import Surf

@@ -11,11 +11,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from vioframe import registry
-from vioframe.config import parse
+from vioframe.evaluation import evaluate
 from vioframe.experiment import prepare, record
-from vioframe.report.run_folder import RunFolder
-from vioframe.trajectory import evaluate
+from vioframe.parts import registry
+from vioframe.parts.config import parse
+from vioframe.runs.folder import RunFolder
 from vioframe.types import Frame, ImuSample
 
 S = 1_000_000_000

@@ -10,8 +10,9 @@ import pytest
 from click.testing import CliRunner
 from ruamel.yaml import YAML
 
-from vioframe import hookspecs, registry
 from vioframe.cli import main
+from vioframe.parts import hooks as hookspecs
+from vioframe.parts import registry
 from vioframe.testing import check_detector
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -15,7 +15,7 @@ from vioframe.frontend.refill import refine_whole_pixels, spread, thin
 from vioframe.geometry import so3, two_view
 from vioframe.geometry.cameras import Camera
 from vioframe.incidents import Incidents
-from vioframe.synchronise import synchronise
+from vioframe.io.synchronise import synchronise
 from vioframe.types import Frame, ImuSegment, Keypoints
 from vioframe_euroc import EurocDataset
 from vioframe_shi_tomasi import ShiTomasi

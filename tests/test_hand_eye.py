@@ -12,18 +12,20 @@ import pytest
 from initialization_helpers import Motion, judge, without_points
 from scipy.stats import chi2
 
-from vioframe.calibration import packaged_calibration
+from vioframe.estimation.initialization import CameraRotation, InitializationOptions, Initializer, RotationCalibrator
+from vioframe.estimation.initialization.epipolar_pairs import BearingPairs, _noise_of_normals
+from vioframe.evaluation import evaluate
 from vioframe.frontend import Frontend, FrontendOptions
 from vioframe.geometry import so3
+from vioframe.geometry.trajectory import Trajectory
 from vioframe.incidents import Incidents
-from vioframe.initialization import CameraRotation, InitializationOptions, Initializer, RotationCalibrator
-from vioframe.initialization.epipolar_pairs import BearingPairs, _noise_of_normals
+from vioframe.io.calibration import packaged_calibration
+from vioframe.io.synchronise import synchronise
+from vioframe.io.trajectories import load_trajectory
 from vioframe.pipeline import run
 from vioframe.simulation.flights import ShapedFlight, levelled
 from vioframe.simulation.sequence import Packet, TrackSequence
 from vioframe.simulation.synthetic import simulated_sequence
-from vioframe.synchronise import synchronise
-from vioframe.trajectory import Trajectory, evaluate, load_trajectory
 from vioframe.types import Calibration, Estimate, Float, NavState, Status
 from vioframe_euroc import EurocDataset
 from vioframe_msckf.backend import Msckf
@@ -241,7 +243,7 @@ class TestInitializer:
         s = simulated_sequence("aggressive", duration_s=10.0, bias_gyro_B=BIAS_GYRO)
         initializer = Initializer(turned(s.calibration), InitializationOptions(unknown_camera_rotation=True))
         np.testing.assert_array_equal(initializer.calibration.R_BC, np.eye(3))
-        with caplog.at_level(logging.INFO, "vioframe.initialization"):
+        with caplog.at_level(logging.INFO, "vioframe.estimation.initialization"):
             for imu, tracks in s.packets:
                 estimate = initializer.add(imu, tracks)
                 if estimate is not None:

@@ -11,16 +11,17 @@ import pytest
 from initialization_helpers import Errors, Motion, first_estimate, judge, seen_by, velocity_of, without_points
 
 from vioframe.bench.april import april_sequence
+from vioframe.estimation.initialization import InitialEstimate, Initializer
+from vioframe.estimation.initialization.attitude import level_rotation
 from vioframe.frontend import Frontend, FrontendOptions
+from vioframe.geometry.trajectory import Trajectory
 from vioframe.incidents import Incidents
-from vioframe.initialization import InitialEstimate, Initializer
-from vioframe.initialization.attitude import level_rotation
+from vioframe.io.synchronise import synchronise
+from vioframe.io.trajectories import load_trajectory
 from vioframe.simulation import real_motion_sequence
 from vioframe.simulation.poses import interpolate_poses
 from vioframe.simulation.sequence import Packet, TrackSequence
 from vioframe.simulation.synthetic import simulated_sequence
-from vioframe.synchronise import synchronise
-from vioframe.trajectory import Trajectory, load_trajectory
 from vioframe.types import DP, DTHETA, GRAVITY_M_S2, Calibration
 from vioframe_euroc import EurocDataset
 from vioframe_shi_tomasi import ShiTomasi
@@ -274,7 +275,7 @@ class TestBadInput:
 
     def test_each_attempt_is_logged_and_reset_forgets(self, sequence: TrackSequence, caplog: pytest.LogCaptureFixture):
         initializer = Initializer(sequence.calibration)
-        with caplog.at_level(logging.DEBUG, "vioframe.initialization"):
+        with caplog.at_level(logging.DEBUG, "vioframe.estimation.initialization"):
             assert any(initializer.add(imu, tracks) is not None for imu, tracks in sequence.packets)
         assert initializer.refusal == ""
         assert any("static refused: not at rest" in message for message in caplog.messages)

@@ -8,21 +8,21 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from vioframe.calibration import packaged_calibration
+from vioframe.estimation.inertial.imu_factors import ImuFactors, StateArrays
+from vioframe.estimation.inertial.preintegration import Preintegrated, preintegrate
+from vioframe.estimation.initialization import bundle_adjustment, landmarks, static
+from vioframe.estimation.initialization.alignment import _solve_on_gravity_sphere, align, rotations
+from vioframe.estimation.initialization.attitude import level_rotation
+from vioframe.estimation.initialization.bundle_adjustment import Problem
+from vioframe.estimation.initialization.estimate import RefusalError
+from vioframe.estimation.initialization.gyro_bias import estimate_gyro_bias
+from vioframe.estimation.initialization.judgement import scale_sigma
+from vioframe.estimation.initialization.landmarks import Observations
+from vioframe.estimation.initialization.options import InitializationOptions
+from vioframe.estimation.initialization.structure import solve_structure
+from vioframe.estimation.initialization.window import Window, build_window, spread_indices
 from vioframe.geometry import so3
-from vioframe.inertial.imu_factors import ImuFactors, StateArrays
-from vioframe.inertial.preintegration import Preintegrated, preintegrate
-from vioframe.initialization import bundle_adjustment, landmarks, static
-from vioframe.initialization.alignment import _solve_on_gravity_sphere, align, rotations
-from vioframe.initialization.attitude import level_rotation
-from vioframe.initialization.bundle_adjustment import Problem
-from vioframe.initialization.estimate import RefusalError
-from vioframe.initialization.gyro_bias import estimate_gyro_bias
-from vioframe.initialization.judgement import scale_sigma
-from vioframe.initialization.landmarks import Observations
-from vioframe.initialization.options import InitializationOptions
-from vioframe.initialization.structure import solve_structure
-from vioframe.initialization.window import Window, build_window, spread_indices
+from vioframe.io.calibration import packaged_calibration
 from vioframe.simulation.flights import flight
 from vioframe.simulation.imu import ImuErrors, read_imu
 from vioframe.simulation.segments import cut_segments

@@ -13,10 +13,10 @@ torch = pytest.importorskip("torch")
 
 from keypointnet_helpers import texture  # noqa: E402
 
-from vioframe import registry  # noqa: E402
 from vioframe.cli import main  # noqa: E402
 from vioframe.errors import ConfigError  # noqa: E402
 from vioframe.interfaces import Trainer  # noqa: E402
+from vioframe.parts import registry  # noqa: E402
 from vioframe.types import TrainingJob  # noqa: E402
 from vioframe_keypointnet import vioframe_trainers, weights  # noqa: E402
 from vioframe_keypointnet.folding import fold  # noqa: E402

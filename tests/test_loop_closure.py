@@ -13,14 +13,14 @@ from loop_helpers import CALIBRATION, fly, hall, path_along, tiled_corridor
 from rendered_flight import rendered_flight
 
 from vioframe.cli import main
+from vioframe.evaluation import evaluate
 from vioframe.geometry import so3
+from vioframe.geometry.so3 import rotation_z
 from vioframe.incidents import Incidents
-from vioframe.recorder import Recorder
 from vioframe.report.evaluated import Evaluated
-from vioframe.report.run_folder import RunFolder
+from vioframe.runs.folder import RunFolder
+from vioframe.runs.recorder import Recorder
 from vioframe.testing import check_loop_closer
-from vioframe.trajectory import evaluate
-from vioframe.trajectory.alignment import rotation_z
 from vioframe.types import Estimate, Status
 from vioframe_pose_graph import vioframe_loop_closers
 from vioframe_pose_graph.closer import PoseGraph

@@ -8,12 +8,13 @@ import pytest
 from msckf_helpers import after, drawn_start, pose_nees
 from threadpoolctl import threadpool_limits
 
-from vioframe import registry
 from vioframe.bench import BackendRun, run_backend
+from vioframe.evaluation import evaluate
 from vioframe.geometry import so3
+from vioframe.geometry.trajectory import Trajectory
+from vioframe.parts import registry
 from vioframe.simulation import TrackSequence, simulated_sequence
 from vioframe.testing import check_backend
-from vioframe.trajectory import Trajectory, evaluate
 from vioframe.types import NS_PER_S, Float, Status
 from vioframe_loose_ekf import vioframe_backends
 from vioframe_loose_ekf.adjustment import adjust

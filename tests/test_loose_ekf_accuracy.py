@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from vioframe import registry
-from vioframe.config import Config, DatasetConfig, PartConfig
+from vioframe.evaluation import evaluate
 from vioframe.experiment import prepare, record
-from vioframe.report.run_folder import RunFolder
-from vioframe.trajectory import evaluate
+from vioframe.parts import registry
+from vioframe.parts.config import Config, DatasetConfig, PartConfig
+from vioframe.runs.folder import RunFolder
 
 TRUTH = "mav0/state_groundtruth_estimate0/data.csv"
 

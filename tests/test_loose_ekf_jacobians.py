@@ -7,9 +7,9 @@ import pytest
 from filterpy.kalman import ExtendedKalmanFilter
 from msckf_helpers import random_covariance
 
-from vioframe.calibration import packaged_calibration
+from vioframe.estimation.inertial.propagation import propagate
 from vioframe.geometry import so3
-from vioframe.inertial.propagation import propagate
+from vioframe.io.calibration import packaged_calibration
 from vioframe.simulation import simulated_sequence
 from vioframe.types import DP, DTHETA, ImuSegment, NavState, g_W
 from vioframe_loose_ekf import measurement

@@ -11,14 +11,14 @@ from trajectory_helpers import disturbed, flight, moved, write_run
 
 from vioframe.cli import main
 from vioframe.errors import ConfigError, RunError
+from vioframe.evaluation.landmarks import belonging, read_landmarks
 from vioframe.geometry import so3
 from vioframe.geometry.meshes import distances, read_mesh
-from vioframe.recorder import write_ply
+from vioframe.io.trajectories import write_tum
 from vioframe.report.evaluated import evaluate_path
-from vioframe.report.landmarks import belonging, read_landmarks
 from vioframe.report.map_quality import MapQuality, measure_maps, simulated_world
-from vioframe.report.run_folder import RunFolder
-from vioframe.trajectory import write_tum
+from vioframe.runs.folder import RunFolder
+from vioframe.runs.recorder import write_ply
 
 HALL = box((-9.0, -8.0, -3.0), (9.0, 8.0, 3.0))
 FAR_M = np.array([0.0, 0.03, 0.08, 0.15, 0.4])

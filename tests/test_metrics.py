@@ -8,10 +8,13 @@ import pytest
 from trajectory_helpers import BEGIN_NS, PEERS, PERIOD_NS, disturbed, flight, moved
 
 from vioframe.errors import TrajectoryError
+from vioframe.evaluation import Stats, associate, evaluate
+from vioframe.evaluation.alignment import align_se3
+from vioframe.evaluation.metrics import relative_errors, rotation_error_rpy_deg
 from vioframe.geometry import so3
-from vioframe.trajectory import Stats, Trajectory, associate, evaluate, load_trajectory
-from vioframe.trajectory.alignment import align_se3, rotation_z
-from vioframe.trajectory.metrics import relative_errors, rotation_error_rpy_deg
+from vioframe.geometry.so3 import rotation_z
+from vioframe.geometry.trajectory import Trajectory
+from vioframe.io.trajectories import load_trajectory
 
 
 def straight(n=1001, speed=1.0, yaw_rate=0.0, step_m=0.1):

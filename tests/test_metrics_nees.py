@@ -3,10 +3,11 @@ import pytest
 from scipy.stats import chi2
 from trajectory_helpers import flight, moved
 
+from vioframe.evaluation import evaluate
+from vioframe.evaluation.nees import Nees, band, nees
 from vioframe.geometry import so3
-from vioframe.trajectory import Trajectory, evaluate
-from vioframe.trajectory.alignment import rotation_z
-from vioframe.trajectory.nees import Nees, band, nees
+from vioframe.geometry.so3 import rotation_z
+from vioframe.geometry.trajectory import Trajectory
 
 SIGMA = np.array([2e-3, 1e-3, 4e-3, 0.05, 0.02, 0.01])
 

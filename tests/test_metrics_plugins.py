@@ -15,16 +15,18 @@ from click.testing import CliRunner
 from plugin_helpers import install
 from trajectory_helpers import BEGIN_NS, PEERS, PERIOD_NS, disturbed, flight, moved, write_run
 
-from vioframe import registry
 from vioframe.cli import main
-from vioframe.config import PartConfig, parse_part
 from vioframe.errors import ConfigError, PluginError, TrajectoryError
+from vioframe.evaluation import Comparison, evaluate
 from vioframe.geometry import so3
+from vioframe.geometry.so3 import rotation_z
+from vioframe.geometry.trajectory import Trajectory
+from vioframe.io.trajectories import load_trajectory, write_tum
+from vioframe.parts import registry
+from vioframe.parts.config import PartConfig, parse_part
 from vioframe.report.metrics import create_metrics, measure
 from vioframe.simulation import simulated_sequence
 from vioframe.testing import check_metric
-from vioframe.trajectory import Comparison, Trajectory, evaluate, load_trajectory, write_tum
-from vioframe.trajectory.alignment import rotation_z
 
 needs_evo = pytest.mark.skipif(find_spec("evo") is None, reason="needs evo: pip install 'vioframe[evo]'")
 
@@ -322,9 +324,9 @@ def test_evo_leaves_home_logging_and_matplotlib_alone(tmp_path):
     """In a process of its own, as other tests load evo in this one."""
     code = """
         import logging, sys
-        from vioframe import registry
+        from vioframe.parts import registry
         from vioframe.report.metrics import create_metrics, measure
-        from vioframe.trajectory import Comparison
+        from vioframe.evaluation import Comparison
         from trajectory_helpers import flight
         installed = registry.load()
         assert not [m for m in sys.modules if m.startswith("evo")]

@@ -10,7 +10,9 @@ from click.testing import CliRunner
 from trajectory_helpers import disturbed, flight, write_run
 
 from vioframe.cli import main
-from vioframe.trajectory import Trajectory, evaluate, write_tum
+from vioframe.evaluation import evaluate
+from vioframe.geometry.trajectory import Trajectory
+from vioframe.io.trajectories import write_tum
 
 
 @pytest.fixture

@@ -19,7 +19,6 @@ from click.testing import CliRunner
 from plugin_helpers import install
 from scipy.stats import chi2
 
-from vioframe import registry
 from vioframe.bench import run_backend
 from vioframe.bench.consistency import PARTS, Outcome, Trial, average_band
 from vioframe.bench.contenders import Contender, parse_contenders
@@ -27,10 +26,11 @@ from vioframe.bench.montecarlo import Setup, nees_by_stretch, run_montecarlo
 from vioframe.bench.processes import installed, usable_cores
 from vioframe.cli import main
 from vioframe.errors import ConfigError, PluginError
+from vioframe.evaluation import evaluate
 from vioframe.geometry import so3
+from vioframe.geometry.so3 import rotation_z
+from vioframe.parts import registry
 from vioframe.simulation import simulated_sequence
-from vioframe.trajectory import evaluate
-from vioframe.trajectory.alignment import rotation_z
 from vioframe.types import Estimate, NavState, Status
 
 # Back-ends for a body at rest at the origin: they know the truth, and lie about it as told.

@@ -11,8 +11,8 @@ from msckf_helpers import after, drawn_start, pose_nees
 from scipy.stats import chi2
 
 from vioframe.bench import BackendRun, run_backend
-from vioframe.calibration import packaged_calibration
 from vioframe.geometry import so3
+from vioframe.io.calibration import packaged_calibration
 from vioframe.simulation import TrackSequence, simulated_sequence
 from vioframe_msckf import backend as backend_module
 from vioframe_msckf import updates

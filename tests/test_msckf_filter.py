@@ -7,8 +7,8 @@ import pytest
 from msckf_helpers import after, drawn_start, random_covariance
 
 from vioframe.bench import BackendRun, run_backend
+from vioframe.estimation.recovery import continued_from
 from vioframe.geometry import so3
-from vioframe.recovery import continued_from
 from vioframe.simulation import simulated_sequence
 from vioframe.types import Float, FrameTracks, NavState, Status
 from vioframe_msckf.backend import Msckf

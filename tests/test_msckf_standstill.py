@@ -7,11 +7,11 @@ import pytest
 from msckf_helpers import after, drawn_start, random_state
 
 from vioframe.bench import run_backend
-from vioframe.calibration import packaged_calibration
+from vioframe.estimation.standstill import StandstillDetector, median_disparity_px
 from vioframe.geometry import so3
+from vioframe.io.calibration import packaged_calibration
 from vioframe.simulation import simulated_sequence
 from vioframe.simulation.flights import ShapedFlight, levelled
-from vioframe.standstill import StandstillDetector, median_disparity_px
 from vioframe.types import DBA, DBG, DTHETA, DV, Estimate, FrameTracks, ImuNoise, ImuSegment, Status, g_W
 from vioframe_msckf.backend import Msckf
 from vioframe_msckf.standstill import hold_still

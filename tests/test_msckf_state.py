@@ -5,8 +5,8 @@ import pytest
 from filterpy.kalman import KalmanFilter
 from msckf_helpers import random_covariance, random_state
 
+from vioframe.estimation.recovery import DivergedError
 from vioframe.geometry import so3
-from vioframe.recovery import DivergedError
 from vioframe.types import DBA, DBG, DP, DTHETA, DV, NS_PER_S, Float, ImuNoise, ImuSegment
 from vioframe_msckf.state import CALIBRATION, CLONES, IMU, OFFSET, FilterState, compress
 
@@ -69,7 +69,7 @@ def test_a_clone_is_the_pose_when_the_image_was_taken():
 def test_propagation_is_the_dense_formula():
     state, rng = random_state(3), np.random.default_rng(3)
     P, imu = state.cov.copy(), segment(rng)
-    from vioframe.inertial.propagation import propagate
+    from vioframe.estimation.inertial.propagation import propagate
 
     step = propagate(imu, state.R_WB, state.p_WB, state.v_WB, state.bias_gyro_B, state.bias_accel_B, NOISE)
     before = mean(state)

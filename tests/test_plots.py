@@ -4,10 +4,12 @@ from click.testing import CliRunner
 from trajectory_helpers import disturbed, flight, write_run
 
 from vioframe.cli import main
+from vioframe.evaluation import evaluate
+from vioframe.geometry.trajectory import Trajectory
+from vioframe.io.trajectories import write_tum
 from vioframe.report import plot_cost, plot_errors, plot_paths
 from vioframe.report.evaluated import evaluate_path, evaluate_paths
 from vioframe.report.figures import write_figures
-from vioframe.trajectory import Trajectory, evaluate, write_tum
 
 EVERYTHING = {
     "path_3d",

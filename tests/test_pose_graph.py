@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from vioframe.trajectory.alignment import rotation_z
+from vioframe.geometry.so3 import rotation_z
 from vioframe_pose_graph.correction import carry
 from vioframe_pose_graph.drift import Odometry
 from vioframe_pose_graph.graph import Edges, residuals, root_of, solve, uncertainty

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
+from vioframe.estimation.inertial.imu_factors import ImuFactors, StateArrays
+from vioframe.estimation.inertial.preintegration import Preintegrated, join_segments, preintegrate
 from vioframe.geometry import so3
-from vioframe.inertial.imu_factors import ImuFactors, StateArrays
-from vioframe.inertial.preintegration import Preintegrated, join_segments, preintegrate
 from vioframe.types import DBA, DBG, DP, DTHETA, DV, Float, ImuNoise, ImuSegment, NavState, g_W
 
 NOISE = ImuNoise(gyro_density=1.7e-3, accel_density=2.0e-2, gyro_walk=4.0e-4, accel_walk=5.0e-3)

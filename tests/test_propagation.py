@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
+from vioframe.estimation.inertial.propagation import Propagation, propagate, yaw_consistent_transition
 from vioframe.geometry import so3
-from vioframe.inertial.propagation import Propagation, propagate, yaw_consistent_transition
 from vioframe.types import DBA, DBG, DP, DTHETA, DV, NS_PER_S, Float, ImuNoise, ImuSegment, g_W
 
 NOISE = ImuNoise(gyro_density=2e-4, accel_density=2e-3, gyro_walk=2e-5, accel_walk=3e-3, rate_hz=200.0)

@@ -22,12 +22,12 @@ from recordings import (
     write_bag,
 )
 
-from vioframe.calibration import packaged_calibration, sidecar_folder, write_calibration
-from vioframe.convert import convert
 from vioframe.errors import CalibrationError, DatasetError
 from vioframe.incidents import Incidents
 from vioframe.interfaces import Dataset
-from vioframe.synchronise import synchronise
+from vioframe.io.calibration import packaged_calibration, sidecar_folder, write_calibration
+from vioframe.io.convert import convert
+from vioframe.io.synchronise import synchronise
 from vioframe.types import Frame, ImuSample, Measurement, Unreadable
 from vioframe_euroc import EurocDataset
 from vioframe_rosbag import RosbagDataset

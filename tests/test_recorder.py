@@ -6,11 +6,12 @@ from time import perf_counter
 import numpy as np
 import pytest
 
-from vioframe import machine
 from vioframe.errors import PluginError, RunError
 from vioframe.geometry import so3
 from vioframe.incidents import Incidents
-from vioframe.recorder import (
+from vioframe.runs import machine
+from vioframe.runs.folder import RunFolder
+from vioframe.runs.recorder import (
     POSE_COV_COLUMNS,
     STATE_COLUMNS,
     Recorder,
@@ -18,7 +19,6 @@ from vioframe.recorder import (
     free_run_folder,
     new_run_folder,
 )
-from vioframe.report.run_folder import RunFolder
 from vioframe.types import Estimate, Frame, FrameTracks, NavState, Status, Step
 
 FIRST_NS = 1_403_636_579_763_555_584  # a float of seconds would lose the last digits

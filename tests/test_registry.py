@@ -10,9 +10,11 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import pytest
 from plugin_helpers import install
 
-from vioframe import hookspecs, registry
+import vioframe
 from vioframe.errors import ConfigError, DatasetError, PluginError
-from vioframe.options import REQUIRED, options_of, plugin_factory, validate_options
+from vioframe.parts import hooks as hookspecs
+from vioframe.parts import registry
+from vioframe.parts.options import REQUIRED, options_of, plugin_factory, validate_options
 
 if TYPE_CHECKING:
     from vioframe.types import Calibration
@@ -68,7 +70,7 @@ def test_every_hook_has_a_kind():
 
 
 def test_the_framework_imports_no_plugin():
-    root = Path(hookspecs.__file__).parent
+    root = Path(vioframe.__file__).parent
     sources = [path.read_text() for path in root.rglob("*.py")]
     assert len(sources) > 30
     assert not [s for s in sources if "import vioframe_" in s or "from vioframe_" in s]

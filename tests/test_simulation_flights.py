@@ -10,12 +10,12 @@ from click.testing import CliRunner
 from plugin_helpers import install
 from simulated_imu import dead_reckoning_error_m
 
-from vioframe import registry
 from vioframe.bench import run_backend
-from vioframe.calibration import packaged_calibration
 from vioframe.cli import main
 from vioframe.errors import ConfigError, PluginError
 from vioframe.geometry import so3
+from vioframe.io.calibration import packaged_calibration
+from vioframe.parts import registry
 from vioframe.simulation import simulated_sequence
 from vioframe.simulation.flights import ShapedFlight, flight, levelled
 from vioframe.testing import check_flight

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from simulation_helpers import small_calibration
 
-from vioframe.calibration import packaged_calibration
 from vioframe.errors import ConfigError
 from vioframe.geometry import so3
 from vioframe.geometry.cameras import Camera
+from vioframe.io.calibration import packaged_calibration
 from vioframe.simulation.camera import Shot, SimulatedCamera, Studio, take_pictures
 from vioframe.simulation.movers import draw_movers
 from vioframe.simulation.renderer import Renderer

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 from vioframe.errors import ConfigError
-from vioframe.inertial.allan import allan_deviation
-from vioframe.simulation.flights import Motion, flight
+from vioframe.estimation.inertial.allan import allan_deviation
+from vioframe.simulation.flights import flight
 from vioframe.simulation.imu import ImuErrors, read_imu
 from vioframe.simulation.vibration import ACCEL_RMS, GYRO_RMS, vibration
-from vioframe.types import GRAVITY_M_S2, ImuNoise
+from vioframe.types import GRAVITY_M_S2, ImuNoise, Motion
 
 NOISE = ImuNoise(gyro_density=1.7e-4, accel_density=2e-3, gyro_walk=1.9e-5, accel_walk=3e-3)
 RATES = (100.0, 200.0, 400.0)

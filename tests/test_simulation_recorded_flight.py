@@ -6,10 +6,11 @@ from simulated_imu import dead_reckoning_error_m
 
 from vioframe.errors import ConfigError, TrajectoryError
 from vioframe.geometry import so3
+from vioframe.geometry.trajectory import Trajectory
+from vioframe.io.trajectories import load_trajectory, write_tum
 from vioframe.simulation.flights import flight
 from vioframe.simulation.recorded_flight import fit_flight, flight_from_file
 from vioframe.testing import check_flight
-from vioframe.trajectory import Trajectory, load_trajectory, write_tum
 
 EUROC = {
     name: f"euroc_imu_gt/{name}/state_groundtruth_estimate0/data.csv.gz" for name in ("MH_05_difficult", "V1_02_medium")

@@ -12,17 +12,17 @@ from click.testing import CliRunner
 from rosbags.highlevel import AnyReader
 from simulation_helpers import INSTALLED, small_calibration, small_simulation
 
-from vioframe.calibration import sidecar_folder, write_calibration
 from vioframe.cli import main
 from vioframe.errors import ConfigError, DatasetError, TrajectoryError
 from vioframe.geometry import so3
+from vioframe.io.calibration import sidecar_folder, write_calibration
+from vioframe.io.trajectories import load_trajectory
+from vioframe.io.writers import Ros1Writer
 from vioframe.simulation.conditions import CONDITIONS, Conditions
 from vioframe.simulation.files import MANIFEST, TRUTH, WORLD, simulation_folder
 from vioframe.simulation.record import record
 from vioframe.simulation.world import MeshBuilder, write_mesh
-from vioframe.trajectory import load_trajectory
 from vioframe.types import Frame, ImuSample
-from vioframe.writers import Ros1Writer
 
 pytest.importorskip("open3d", exc_type=ImportError)
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from vioframe.calibration import packaged_calibration
+from vioframe.io.calibration import packaged_calibration
 from vioframe.simulation import simulated_sequence
 from vioframe.simulation.flights import flight
 from vioframe.simulation.tracks import TrackOptions, TrackSimulator

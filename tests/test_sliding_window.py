@@ -12,12 +12,12 @@ from msckf_helpers import after, drawn_start, pose_nees
 from scipy.stats import chi2
 from threadpoolctl import threadpool_limits
 
-from vioframe import registry
 from vioframe.bench import BackendRun, run_backend
-from vioframe.calibration import packaged_calibration
 from vioframe.errors import ConfigError
+from vioframe.estimation.inertial.preintegration import Preintegrated, join_segments, preintegrate
 from vioframe.geometry import so3
-from vioframe.inertial.preintegration import Preintegrated, join_segments, preintegrate
+from vioframe.io.calibration import packaged_calibration
+from vioframe.parts import registry
 from vioframe.simulation import TrackSequence, simulated_sequence
 from vioframe.simulation.flights import flight as named_flight
 from vioframe.simulation.tracks import TrackOptions, TrackSimulator

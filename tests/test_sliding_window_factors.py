@@ -20,10 +20,10 @@ from sliding_window_helpers import (
     without_sightings,
 )
 
+from vioframe.estimation.inertial.imu_factors import ImuFactors
 from vioframe.geometry import so3
 from vioframe.geometry.cameras import Camera
 from vioframe.geometry.kernels import intrinsics_of
-from vioframe.inertial.imu_factors import ImuFactors
 from vioframe.types import Float
 from vioframe_sliding_window import reprojection_kernels
 from vioframe_sliding_window.landmarks import camera_poses, positions

@@ -10,7 +10,7 @@ from msckf_helpers import after
 from sliding_window_helpers import flown_window, moved, natural, only, standing
 
 from vioframe.bench import run_backend
-from vioframe.inertial.imu_factors import ImuFactors, StateArrays
+from vioframe.estimation.inertial.imu_factors import ImuFactors, StateArrays
 from vioframe.simulation import simulated_sequence
 from vioframe.types import DP, DTHETA, DV, Float, NavState
 from vioframe_sliding_window import window as window_module

@@ -8,15 +8,15 @@ import pytest
 from click.testing import CliRunner
 from suite_recordings import record_toy
 
-from vioframe import registry
 from vioframe.bench.suites import sources
 from vioframe.bench.suites import suite as suites
 from vioframe.bench.suites.euroc import EUROC
 from vioframe.bench.suites.plan import plan
 from vioframe.bench.suites.suite import Suite
 from vioframe.cli import main
-from vioframe.convert import convert
 from vioframe.errors import ConfigError, DatasetError, VioframeError
+from vioframe.io.convert import convert
+from vioframe.parts import registry
 from vioframe.report.suite.results import Data
 from vioframe.simulation.config import SimulationConfig, complete
 from vioframe.simulation.record import record

@@ -13,15 +13,17 @@ from hypothesis import strategies as st
 from suite_helpers import MadeUp, comparison, key, labels, stress
 from trajectory_helpers import flight
 
+from vioframe.evaluation import evaluate
+from vioframe.geometry.trajectory import Trajectory
+from vioframe.io.trajectories import write_tum
 from vioframe.report.matched_truth import write_matched_truth
-from vioframe.report.run_folder import RunFolder
 from vioframe.report.suite.flights import Flight, Outcome
 from vioframe.report.suite.pooled import BAND_M, inside_band, pool_relative
 from vioframe.report.suite.results import Data, Kind, SuiteResults
 from vioframe.report.suite.statistics import Spread, averages, expected_tasks, groups, unplaced
 from vioframe.report.suite.stress import baseline_of, curves, duels, wilson
 from vioframe.report.suite.tables_about import evo_command
-from vioframe.trajectory import Trajectory, evaluate, write_tum
+from vioframe.runs.folder import RunFolder
 
 
 @pytest.fixture(scope="module")

@@ -12,12 +12,12 @@ import pytest
 from plugin_helpers import install
 from suite_recordings import install_parts, record_toy
 
-from vioframe import registry
 from vioframe.bench.suites import suite as suites
 from vioframe.bench.suites.plan import plan
 from vioframe.bench.suites.store import Store
 from vioframe.bench.suites.sweep import Event, Outcome, agenda, sweep
 from vioframe.errors import RunError
+from vioframe.parts import registry
 from vioframe.report.suite.results import Data, Kind, SuiteResults, load_results
 
 pytest.importorskip("distributed", reason="sweeps need the extra bench")

@@ -9,12 +9,12 @@ from pathlib import Path
 import pytest
 from suite_helpers import MadeUp, comparison, labels, stress
 
+from vioframe.evaluation import evaluate
 from vioframe.report.suite import tables_accuracy
 from vioframe.report.suite.results import Data, SuiteResults
 from vioframe.report.suite.statistics import groups
 from vioframe.report.suite.table import Column, Row, Table, number, text
 from vioframe.report.suite.tables import tables, write_tables
-from vioframe.trajectory import evaluate
 
 AWKWARD = Table(
     "awkward",

@@ -8,8 +8,8 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 torch = pytest.importorskip("torch", reason="superpoint needs PyTorch")
 
-from vioframe import registry  # noqa: E402
 from vioframe.errors import ConfigError, PluginError  # noqa: E402
+from vioframe.parts import registry  # noqa: E402
 from vioframe.testing import check_detector  # noqa: E402
 from vioframe_superpoint import superpoint  # noqa: E402
 from vioframe_superpoint.suppression import local_maxima  # noqa: E402

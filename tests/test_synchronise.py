@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from vioframe.incidents import Incidents
-from vioframe.synchronise import synchronise
+from vioframe.io.synchronise import synchronise
 from vioframe.types import Frame, ImuSample, ImuSegment, Measurement, Unreadable
 
 IMU_PERIOD_NS = 5_000_000

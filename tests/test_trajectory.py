@@ -5,8 +5,9 @@ import pytest
 from trajectory_helpers import BEGIN_NS, PERIOD_NS, flight
 
 from vioframe.errors import TrajectoryError
+from vioframe.evaluation import associate
 from vioframe.geometry import so3
-from vioframe.trajectory import Trajectory, associate
+from vioframe.geometry.trajectory import Trajectory
 
 
 def test_takes_copies_that_nobody_can_change():

@@ -4,9 +4,11 @@ from scipy.optimize import minimize
 from trajectory_helpers import disturbed, flight, moved
 
 from vioframe.errors import TrajectoryError
+from vioframe.evaluation import ALIGNMENTS, Alignment
+from vioframe.evaluation.alignment import align_posyaw, align_posyaw_by_attitude, align_se3
 from vioframe.geometry import so3
-from vioframe.trajectory import ALIGNMENTS, Alignment, Trajectory
-from vioframe.trajectory.alignment import align_posyaw, align_posyaw_by_attitude, align_se3, rotation_z, yaw_of
+from vioframe.geometry.so3 import rotation_z, yaw_of
+from vioframe.geometry.trajectory import Trajectory
 
 YAW = rotation_z(2.6)
 TURN = so3.exp([0.3, -1.1, 2.0])

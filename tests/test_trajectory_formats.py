@@ -7,7 +7,8 @@ from hypothesis import strategies as st
 from trajectory_helpers import PEERS, flight
 
 from vioframe.errors import TrajectoryError
-from vioframe.trajectory import Trajectory, load_trajectory, tum_line, write_tum
+from vioframe.geometry.trajectory import Trajectory
+from vioframe.io.trajectories import load_trajectory, tum_line, write_tum
 
 TUM = "1403636579.763555584 1 2 3 0 0 0 1\n1403636579.813555584 1 2 3 0 0 0 1\n"
 EUROC_HEADER = "#timestamp, p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m], q_RS_w [], q_RS_x [], q_RS_y [], q_RS_z []"

@@ -5,8 +5,8 @@ import pytest
 from trajectory_helpers import disturbed, flight, write_run
 
 from vioframe.errors import RunError
-from vioframe.report.run_folder import RunFolder, Timings
-from vioframe.trajectory import Trajectory
+from vioframe.geometry.trajectory import Trajectory
+from vioframe.runs.folder import RunFolder, Timings
 
 
 @pytest.fixture

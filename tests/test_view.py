@@ -10,12 +10,13 @@ from click.testing import CliRunner
 from map_helpers import box, write_ply_mesh
 from trajectory_helpers import disturbed, flight, moved, write_run
 
-from vioframe.calibration import packaged_calibration, write_calibration
 from vioframe.cli import main
+from vioframe.evaluation.landmarks import read_landmarks
 from vioframe.geometry import so3
-from vioframe.recorder import write_ply
+from vioframe.geometry.trajectory import Trajectory
+from vioframe.io.calibration import packaged_calibration, write_calibration
+from vioframe.io.trajectories import write_tum
 from vioframe.report.evaluated import evaluate_paths
-from vioframe.report.landmarks import read_landmarks
 from vioframe.report.scene import Flight, Scene, scene_of
 from vioframe.report.scene_drawing import TRUTH_RGB, cameras, draw, rgb
 from vioframe.report.scene_grid import ground_grid
@@ -23,7 +24,7 @@ from vioframe.report.scene_picture import render
 from vioframe.report.scene_shapes import balls, creases, dashes, facing, polyline, rods, thinned
 from vioframe.report.scene_view import best_azimuth_deg, view_of
 from vioframe.report.viewing import choose_view
-from vioframe.trajectory import Trajectory, write_tum
+from vioframe.runs.recorder import write_ply
 
 SIZE = (480, 320)
 YAW_M = so3.exp(np.array([0.0, 0.0, 0.7])), np.array([4.0, -3.0, 1.0])

@@ -5,9 +5,10 @@ from pathlib import Path
 import numpy as np
 
 from vioframe.geometry import so3
+from vioframe.geometry.trajectory import Trajectory
 from vioframe.incidents import Incidents
-from vioframe.recorder import Recorder, new_run_folder
-from vioframe.trajectory import Trajectory, write_tum
+from vioframe.io.trajectories import write_tum
+from vioframe.runs.recorder import Recorder, new_run_folder
 from vioframe.types import Estimate, Frame, FrameTracks, NavState, Status, Step
 
 BEGIN_NS = 1_403_636_579_763_555_584

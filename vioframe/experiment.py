@@ -13,16 +13,18 @@ from pathlib import Path
 from time import perf_counter
 from typing import Any
 
-from vioframe import config as configuration
-from vioframe import machine, pipeline
-from vioframe.calibration import write_calibration
-from vioframe.config import Config
+from vioframe import pipeline
 from vioframe.errors import DatasetError, PluginError, RunError, VioframeError
+from vioframe.geometry.trajectory import Trajectory
 from vioframe.incidents import Incidents
 from vioframe.interfaces import Backend, Dataset, Detector, LoopCloser
-from vioframe.recorder import Recorder, new_run_folder, write_json
-from vioframe.registry import BACKEND, DATASET, DETECTOR, LOOP_CLOSER, Registry, describe
-from vioframe.trajectory import Trajectory, load_trajectory, write_tum
+from vioframe.io.calibration import write_calibration
+from vioframe.io.trajectories import load_trajectory, write_tum
+from vioframe.parts import config as configuration
+from vioframe.parts.config import Config
+from vioframe.parts.registry import BACKEND, DATASET, DETECTOR, LOOP_CLOSER, Registry, describe
+from vioframe.runs import machine
+from vioframe.runs.recorder import Recorder, new_run_folder, write_json
 from vioframe.types import LoopClosure, Step
 
 # More threads than this gain nothing on images of this size, and cost on machines that have many.

@@ -16,14 +16,16 @@ from vioframe.types import (
     Keypoints,
     LoopClosure,
     Measurement,
+    Mesh,
+    Motion,
     Step,
     TrainingStep,
 )
 
 if TYPE_CHECKING:
-    from vioframe.simulation.flights import Motion
-    from vioframe.simulation.world import Mesh
-    from vioframe.trajectory import Comparison, Trajectory
+    from vioframe.evaluation import Comparison
+    from vioframe.geometry.trajectory import Trajectory
+    from vioframe.types import Mesh, Motion
 
 
 @runtime_checkable

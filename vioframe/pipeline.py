@@ -15,7 +15,7 @@ from vioframe.errors import PluginError
 from vioframe.frontend import Frontend, FrontendOptions
 from vioframe.incidents import Incidents
 from vioframe.interfaces import Backend, Dataset, Detector
-from vioframe.synchronise import synchronise
+from vioframe.io.synchronise import synchronise
 from vioframe.types import Estimate, Step
 
 

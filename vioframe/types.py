@@ -11,18 +11,15 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-if TYPE_CHECKING:
-    from vioframe.geometry.cameras import Camera
-    from vioframe.trajectory import Trajectory
+from vioframe.arrays import Float, Image, Int
+from vioframe.geometry.cameras import Camera
+from vioframe.geometry.trajectory import Trajectory
 
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
-Image = NDArray[np.uint8]
+Int32 = NDArray[np.int32]
 
 NS_PER_S = 1_000_000_000
 
@@ -249,6 +246,39 @@ class Calibration:
     p_BC: Float
     imu: ImuNoise
     time_offset_ns: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Motion:
+    """Where a body is and how it moves at N instants.
+
+    ``R_WB`` (N, 3, 3), ``p_WB`` (N, 3) m, ``v_WB`` (N, 3) m/s, ``a_WB`` (N, 3) m/s^2, ``omega_B`` (N, 3) rad/s.
+    """
+
+    R_WB: Float
+    p_WB: Float
+    v_WB: Float
+    a_WB: Float
+    omega_B: Float
+
+
+@dataclass(frozen=True)
+class Mesh:
+    """T triangles: ``corners`` (T, 3, 3) m in W, ``uv`` (T, 3, 2) in widths of the texture, which repeats.
+
+    ``texture`` (T,) numbers the image on each; ``surface`` (T,) tells faces apart, for anti-aliasing where they meet.
+    """
+
+    corners: Float
+    uv: Float
+    texture: Int32
+    surface: Int32
+
+    @property
+    def normals(self) -> Float:
+        """(T, 3) unit normals."""
+        n = np.cross(self.corners[:, 1] - self.corners[:, 0], self.corners[:, 2] - self.corners[:, 0])
+        return np.asarray(n / np.maximum(np.linalg.norm(n, axis=1, keepdims=True), 1e-12))
 
 
 @dataclass(frozen=True, slots=True)

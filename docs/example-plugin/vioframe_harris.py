@@ -4,7 +4,7 @@ from typing import Annotated
 
 import numpy as np
 
-from vioframe.hookspecs import hookimpl
+from vioframe.parts.hooks import hookimpl
 from vioframe.types import Image, Keypoints
 
 

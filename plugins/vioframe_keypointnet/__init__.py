@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from vioframe.hookspecs import hookimpl
 from vioframe.interfaces import Detector, DetectorFactory, Trainer, TrainerFactory
-from vioframe.options import plugin_factory
+from vioframe.parts.hooks import hookimpl
+from vioframe.parts.options import plugin_factory
 from vioframe.types import TrainingJob
 from vioframe_keypointnet.options import KeypointNetOptions
 from vioframe_keypointnet.training.options import TrainingOptions

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from vioframe.errors import ConfigError
-from vioframe.options import did_you_mean
+from vioframe.parts.options import did_you_mean
 from vioframe_keypointnet.architecture import ARCHITECTURES, Architecture
 from vioframe_keypointnet.optional import needs
 from vioframe_keypointnet.tensors import Tensors, ranged_layers, shapes, untrained

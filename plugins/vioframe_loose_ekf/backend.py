@@ -9,10 +9,10 @@ from __future__ import annotations
 import numpy as np
 from scipy.stats import chi2
 
+from vioframe.estimation.initialization import Starter
+from vioframe.estimation.recovery import DivergedError, check_plausible, noise_over
+from vioframe.estimation.standstill import StandstillDetector
 from vioframe.geometry import so3
-from vioframe.initialization import Starter
-from vioframe.recovery import DivergedError, check_plausible, noise_over
-from vioframe.standstill import StandstillDetector
 from vioframe.stopwatch import Stopwatch
 from vioframe.types import Calibration, Estimate, Float, FrameTracks, ImuSegment, NavState, Status
 from vioframe_loose_ekf.drifts import Drifts

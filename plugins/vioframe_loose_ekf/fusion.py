@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 from filterpy.kalman import ExtendedKalmanFilter
 
+from vioframe.estimation.inertial.propagation import propagate
+from vioframe.estimation.recovery import DivergedError
+from vioframe.estimation.standstill import STANDSTILL_GATE, Standstill
 from vioframe.geometry import so3
-from vioframe.inertial.propagation import propagate
-from vioframe.recovery import DivergedError
-from vioframe.standstill import STANDSTILL_GATE, Standstill
 from vioframe.types import DBA, DBG, DP, DTHETA, Calibration, Float, ImuNoise, ImuSegment, NavState
 from vioframe_loose_ekf import measurement
 from vioframe_loose_ekf.measurement import VisionPose

@@ -9,9 +9,9 @@ from __future__ import annotations
 import numpy as np
 from scipy.stats import chi2
 
-from vioframe.initialization import Starter
-from vioframe.recovery import DivergedError, check_plausible, noise_over
-from vioframe.standstill import StandstillDetector
+from vioframe.estimation.initialization import Starter
+from vioframe.estimation.recovery import DivergedError, check_plausible, noise_over
+from vioframe.estimation.standstill import StandstillDetector
 from vioframe.stopwatch import Stopwatch
 from vioframe.types import Calibration, Estimate, FrameTracks, ImuSegment, NavState, Status
 from vioframe_msckf.options import MsckfOptions

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from vioframe.standstill import STANDSTILL_GATE, Standstill
+from vioframe.estimation.standstill import STANDSTILL_GATE, Standstill
 from vioframe.types import ImuNoise, ImuSegment
 from vioframe_msckf.state import IMU, FilterState
 

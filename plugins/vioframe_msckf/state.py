@@ -14,9 +14,9 @@ from filterpy.kalman import KalmanFilter
 from numpy.typing import NDArray
 from scipy.linalg.lapack import dgeqrf, dpotrf, dtrtrs
 
+from vioframe.estimation.inertial.propagation import propagate, yaw_consistent_transition
+from vioframe.estimation.recovery import DivergedError
 from vioframe.geometry import kernels, so3
-from vioframe.inertial.propagation import propagate, yaw_consistent_transition
-from vioframe.recovery import DivergedError
 from vioframe.types import DBA, DBG, DP, DTHETA, DV, Calibration, Float, ImuNoise, ImuSegment, NavState
 
 IMU = 15

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from vioframe.inertial.preintegration import preintegrate
+from vioframe.estimation.inertial.preintegration import preintegrate
 from vioframe.types import NS_PER_S, Calibration, FrameTracks, ImuSegment, NavState, g_W
 from vioframe_msckf.backend import Msckf
 from vioframe_msckf.options import MsckfOptions

@@ -12,8 +12,8 @@ from time import perf_counter
 
 import numpy as np
 
-from vioframe.trajectory import Trajectory
-from vioframe.trajectory.alignment import rotation_z, yaw_of
+from vioframe.geometry.so3 import rotation_z, yaw_of
+from vioframe.geometry.trajectory import Trajectory
 from vioframe.types import Calibration, Float, Int, Loop, LoopClosure, NavState, Status, Step
 from vioframe_pose_graph.consistency import GATE, agreed, measured, within_drift
 from vioframe_pose_graph.correction import carry

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from vioframe.geometry import so3
-from vioframe.trajectory.alignment import rotation_z, yaw_of
+from vioframe.geometry.so3 import rotation_z, yaw_of
 from vioframe.types import Float, Int
 from vioframe_pose_graph.hamming import match
 from vioframe_pose_graph.place import Place

@@ -2,9 +2,9 @@
 
 from collections.abc import Mapping
 
-from vioframe.hookspecs import hookimpl
 from vioframe.interfaces import Backend, BackendFactory
-from vioframe.options import plugin_factory
+from vioframe.parts.hooks import hookimpl
+from vioframe.parts.options import plugin_factory
 from vioframe.types import Calibration
 from vioframe_sliding_window.options import SlidingWindowOptions
 

@@ -10,10 +10,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from vioframe.inertial.preintegration import join_segments, preintegrate
-from vioframe.initialization import Starter
-from vioframe.recovery import DivergedError, check_plausible, noise_over
-from vioframe.standstill import STANDSTILL_GATE, Standstill, StandstillDetector
+from vioframe.estimation.inertial.preintegration import join_segments, preintegrate
+from vioframe.estimation.initialization import Starter
+from vioframe.estimation.recovery import DivergedError, check_plausible, noise_over
+from vioframe.estimation.standstill import STANDSTILL_GATE, Standstill, StandstillDetector
 from vioframe.stopwatch import Stopwatch
 from vioframe.types import Calibration, Estimate, Float, FrameTracks, ImuSegment, NavState, Status
 from vioframe_sliding_window.options import SlidingWindowOptions

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from vioframe.estimation.inertial.imu_factors import StateArrays
 from vioframe.geometry.triangulation import MIN_DEPTH_M, triangulate
-from vioframe.inertial.imu_factors import StateArrays
 from vioframe.jit import kernel
 from vioframe.types import Float
 from vioframe_sliding_window.problem import Calibrated

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from vioframe.estimation.inertial.imu_factors import ImuFactors, StateArrays
+from vioframe.estimation.standstill import Standstill
 from vioframe.geometry import so3
-from vioframe.inertial.imu_factors import ImuFactors, StateArrays
-from vioframe.standstill import Standstill
 from vioframe.types import Float, NavState
 from vioframe_sliding_window.reprojection import Poses, Sightings
 from vioframe_sliding_window.reprojection_kernels import CALIBRATION_SIZE, eliminate

@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from vioframe.estimation.inertial.imu_factors import ImuFactors, StateArrays
+from vioframe.estimation.inertial.preintegration import Preintegrated, join_segments, preintegrate
+from vioframe.estimation.initialization.hand_eye import CameraRotation
+from vioframe.estimation.recovery import noise_over
+from vioframe.estimation.standstill import Standstill
 from vioframe.geometry.kernels import intrinsics_of
-from vioframe.inertial.imu_factors import ImuFactors, StateArrays
-from vioframe.inertial.preintegration import Preintegrated, join_segments, preintegrate
-from vioframe.initialization.hand_eye import CameraRotation
-from vioframe.recovery import noise_over
-from vioframe.standstill import Standstill
 from vioframe.types import NS_PER_S, Calibration, Float, FrameTracks, ImuSegment, Int, NavState
 from vioframe_sliding_window.keyframes import parallax
 from vioframe_sliding_window.landmarks import image_velocities, in_hosts, positions, triangulate_tracks

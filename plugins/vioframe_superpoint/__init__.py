@@ -7,8 +7,8 @@ from typing import Annotated, Literal
 from pydantic import NonNegativeInt
 
 from vioframe.errors import PluginError
-from vioframe.hookspecs import hookimpl
 from vioframe.interfaces import Detector, DetectorFactory
+from vioframe.parts.hooks import hookimpl
 
 
 def superpoint(

@@ -15,8 +15,8 @@ import numpy as np
 from pydantic import NonNegativeFloat, PositiveInt
 
 from vioframe.errors import PluginError
-from vioframe.hookspecs import hookimpl
 from vioframe.interfaces import DetectorFactory
+from vioframe.parts.hooks import hookimpl
 from vioframe.types import Float, Image, Keypoints
 from vioframe_surf.descriptors import describe
 

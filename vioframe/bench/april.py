@@ -12,13 +12,13 @@ from pathlib import Path
 import numpy as np
 
 from vioframe.bench.gravity import gravity_in_frame, rotation_to_vertical
-from vioframe.calibration import packaged_calibration
 from vioframe.errors import DatasetError
 from vioframe.geometry import so3
 from vioframe.geometry.cameras import Camera
+from vioframe.geometry.trajectory import Trajectory
+from vioframe.io.calibration import packaged_calibration
 from vioframe.simulation.segments import cut_segments
 from vioframe.simulation.sequence import TrackSequence
-from vioframe.trajectory import Trajectory
 from vioframe.types import Calibration, Float, FrameTracks, Int
 
 CORNERS_PER_TAG = 4

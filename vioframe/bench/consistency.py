@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from vioframe.trajectory.nees import band
+from vioframe.evaluation.nees import band
 from vioframe.types import Float, Int
 
 PARTS: Mapping[str, int] = {"orientation": 3, "position": 3, "pose": 6}

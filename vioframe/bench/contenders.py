@@ -6,10 +6,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from vioframe import config as configuration
-from vioframe.config import Config, PartConfig
 from vioframe.errors import ConfigError
-from vioframe.registry import BACKEND, Registry
+from vioframe.parts import config as configuration
+from vioframe.parts.config import Config, PartConfig
+from vioframe.parts.registry import BACKEND, Registry
 
 
 @dataclass(frozen=True, slots=True)

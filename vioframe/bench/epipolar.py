@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from vioframe.geometry.trajectory import Trajectory
 from vioframe.geometry.two_view import essential_matrix, sampson_distance
-from vioframe.trajectory import Trajectory
 from vioframe.types import Calibration, Float, FrameTracks
 
 

@@ -12,19 +12,19 @@ from itertools import product
 
 import numpy as np
 
-from vioframe import registry
 from vioframe.bench.consistency import PARTS, Outcome, Trial
 from vioframe.bench.contenders import Contender
 from vioframe.bench.processes import installed, map_in_processes
 from vioframe.bench.results import backend_row
 from vioframe.bench.run import BackendRun, run_backend
-from vioframe.calibration import packaged_calibration
 from vioframe.errors import ConfigError, TrajectoryError
+from vioframe.evaluation.alignment import align_first
+from vioframe.evaluation.nees import nees
+from vioframe.geometry.trajectory import Trajectory
+from vioframe.io.calibration import packaged_calibration
+from vioframe.parts import registry
 from vioframe.simulation import TrackSequence, simulated_sequence
 from vioframe.simulation.flights import flight as named_flight
-from vioframe.trajectory import Trajectory
-from vioframe.trajectory.alignment import align_first
-from vioframe.trajectory.nees import nees
 from vioframe.types import Float, Int
 
 SHORTEST_S = 10.0

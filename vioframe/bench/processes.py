@@ -13,9 +13,9 @@ from functools import cache
 from multiprocessing import active_children, get_context
 from typing import TypeVar
 
-from vioframe import registry
 from vioframe.errors import RunError
-from vioframe.registry import Registry
+from vioframe.parts import registry
+from vioframe.parts.registry import Registry
 
 JobT = TypeVar("JobT")
 ResultT = TypeVar("ResultT")

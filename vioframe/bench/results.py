@@ -8,10 +8,10 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from vioframe import machine
 from vioframe.bench.run import BackendRun
+from vioframe.evaluation import evaluate
+from vioframe.runs import machine
 from vioframe.simulation.sequence import TrackSequence
-from vioframe.trajectory import evaluate
 
 if TYPE_CHECKING:
     from rich.table import Table

@@ -11,9 +11,9 @@ from time import perf_counter, thread_time
 import numpy as np
 
 from vioframe.errors import TrajectoryError
+from vioframe.geometry.trajectory import Trajectory
 from vioframe.interfaces import Backend
 from vioframe.simulation.sequence import TrackSequence
-from vioframe.trajectory import Trajectory
 from vioframe.types import DP, Estimate, Float, NavState, Status
 
 _POSE = DP.stop  # [dtheta dp] come first in the error state

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
     from vioframe.bench.detectors.entrants import Entrant, LineUp
     from vioframe.bench.results import Row
-    from vioframe.registry import Registry
+    from vioframe.parts.registry import Registry
 
 _FILE = click.Path(path_type=Path)
 _WIDE = 1000
@@ -94,9 +94,9 @@ def command(
 
     docs/bench_detectors.md says what the figures mean.
     """
-    from vioframe import registry
     from vioframe.bench.detectors.entrants import everyone, parse_entrants
     from vioframe.bench.results import record
+    from vioframe.parts import registry
 
     if quality and frontend:
         raise ConfigError("--quality and --frontend are two questions; ask one at a time")

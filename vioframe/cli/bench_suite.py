@@ -61,11 +61,11 @@ def _run(
     quiet: bool,
     **narrowing: Any,
 ) -> None:
-    from vioframe import registry
     from vioframe.bench.suites import suite as suites
     from vioframe.bench.suites.plan import plan
     from vioframe.bench.suites.store import Store
     from vioframe.bench.suites.sweep import agenda, sweep
+    from vioframe.parts import registry
 
     whole = suites.read(suites.find(name))
     _check_used(whole, data=data, scheduler=scheduler, workers=workers, recordings=recordings, seeds=narrowing["seeds"])

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import click
 
-from vioframe import config, registry
-from vioframe.config import Config, PartConfig
+from vioframe.parts import config, registry
+from vioframe.parts.config import Config, PartConfig
 
 
 @click.command("config")

@@ -10,10 +10,10 @@ import click
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from vioframe import registry
-from vioframe.convert import FORMATS, convert, format_of
 from vioframe.errors import ConfigError
 from vioframe.interfaces import Dataset
+from vioframe.io.convert import FORMATS, convert, format_of
+from vioframe.parts import registry
 from vioframe.types import Frame, Measurement
 
 _FILE = click.Path(path_type=Path)

@@ -55,13 +55,13 @@ def command(
     own. The result is printed, and kept as `evaluation.json` (and
     `evaluation_loop.json`) in each run folder.
     """
-    from vioframe import registry
-    from vioframe.recorder import write_json
+    from vioframe.parts import registry
     from vioframe.report.evaluated import evaluate_paths
     from vioframe.report.map_quality import measure_maps
     from vioframe.report.metrics import create_metrics, measure_runs
     from vioframe.report.rows import notes
     from vioframe.report.tables import to_csv, to_json, to_markdown, to_rich
+    from vioframe.runs.recorder import write_json
 
     asked = create_metrics(metrics, registry.load()) if metrics else ()
     evaluated, on_maps = measure_maps(evaluate_paths(runs, ground_truth, alignment), world)

@@ -65,12 +65,12 @@ def command(
     Landmarks instead of images, EuRoC's camera and IMU noise, true calibration, the back-end's own initialisation. A
     trial that fails counts and is shown. docs/montecarlo.md says how to read the table and the plots.
     """
-    from vioframe import registry
     from vioframe.bench.contenders import parse_contenders
     from vioframe.bench.montecarlo import Setup, check_montecarlo, run_montecarlo
     from vioframe.bench.processes import usable_cores
-    from vioframe.recorder import check_run_folder, free_run_folder, new_run_folder
+    from vioframe.parts import registry
     from vioframe.report.montecarlo import MARKER, to_rich, write_files
+    from vioframe.runs.recorder import check_run_folder, free_run_folder, new_run_folder
 
     if out is not None:
         check_run_folder(out, overwrite=overwrite, marker=MARKER)

@@ -7,9 +7,9 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from vioframe import registry
 from vioframe.errors import PluginError
-from vioframe.options import REQUIRED, did_you_mean, summary_of
+from vioframe.parts import registry
+from vioframe.parts.options import REQUIRED, did_you_mean, summary_of
 
 
 @click.command("plugins")

@@ -9,15 +9,16 @@ from typing import Any
 
 import click
 
-from vioframe import config as configuration
-from vioframe import registry
 from vioframe.cli.progress import RunProgress
-from vioframe.config import Config
 from vioframe.errors import DatasetError, TrajectoryError
+from vioframe.evaluation import evaluate
 from vioframe.experiment import Experiment, prepare, record
-from vioframe.recorder import check_run_folder, free_run_folder
-from vioframe.report.run_folder import RunFolder
-from vioframe.trajectory import Trajectory, evaluate
+from vioframe.geometry.trajectory import Trajectory
+from vioframe.parts import config as configuration
+from vioframe.parts import registry
+from vioframe.parts.config import Config
+from vioframe.runs.folder import RunFolder
+from vioframe.runs.recorder import check_run_folder, free_run_folder
 from vioframe.types import Step
 
 _FILE = click.Path(path_type=Path)

@@ -13,10 +13,10 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 from rich.text import Text
 
-from vioframe import registry
-from vioframe.config import validate
 from vioframe.errors import ConfigError, DatasetError
-from vioframe.options import did_you_mean, summary_of
+from vioframe.parts import registry
+from vioframe.parts.config import validate
+from vioframe.parts.options import did_you_mean, summary_of
 from vioframe.simulation import config as configuration
 from vioframe.simulation.conditions import CONDITIONS, Conditions
 from vioframe.simulation.config import SimulationConfig

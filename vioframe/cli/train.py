@@ -9,9 +9,9 @@ import click
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from vioframe import config as configuration
-from vioframe import registry
 from vioframe.interfaces import Trainer
+from vioframe.parts import config as configuration
+from vioframe.parts import registry
 from vioframe.types import TrainingJob, TrainingStep
 
 _FILE = click.Path(path_type=Path)

@@ -13,8 +13,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from vioframe.arrays import Float
 from vioframe.errors import CalibrationError
-from vioframe.types import Float
 
 DistortionModel = Literal["radtan", "equidistant"]
 

@@ -7,9 +7,9 @@ import math
 
 import numpy as np
 
+from vioframe.arrays import Float
 from vioframe.geometry.cameras import Camera
 from vioframe.jit import kernel
-from vioframe.types import Float
 
 RADTAN, EQUIDISTANT = 0, 1
 

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from vioframe.arrays import Float
 from vioframe.errors import ConfigError
-from vioframe.types import Float
 
 
 def import_open3d(purpose: str) -> Any:

@@ -7,7 +7,7 @@ state estimation in robotics" (2018), equation numbers in brackets.
 import numpy as np
 from numpy.typing import ArrayLike
 
-from vioframe.types import Float
+from vioframe.arrays import Float
 
 # Below this angle the Taylor series, cut after two terms, is exact to double precision.
 _SMALL = 1e-4
@@ -126,3 +126,14 @@ def project(M: ArrayLike) -> Float:
     U[..., :, 2] *= np.linalg.det(U @ Vt)[..., None]
     out: Float = U @ Vt
     return out
+
+
+def yaw_of(R: Float) -> Float:
+    """The angle (...,) rad about z of the z-rotation nearest to ``R`` (..., 3, 3): its twist in R = R_z(yaw) swing."""
+    return np.asarray(np.arctan2(R[..., 1, 0] - R[..., 0, 1], R[..., 0, 0] + R[..., 1, 1]))
+
+
+def rotation_z(yaw: float) -> Float:
+    """(3, 3) rotation by ``yaw`` rad about z."""
+    c, s = np.cos(yaw), np.sin(yaw)
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])

@@ -4,8 +4,8 @@ import math
 
 import numpy as np
 
+from vioframe.arrays import Float
 from vioframe.jit import kernel
-from vioframe.types import Float
 
 MIN_DEPTH_M, MAX_DEPTH_M = 0.1, 60.0
 _ITERATIONS = 5

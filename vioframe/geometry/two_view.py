@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from vioframe.arrays import Float
 from vioframe.geometry import so3
-from vioframe.types import Float
 
 Mask = NDArray[np.bool_]
 

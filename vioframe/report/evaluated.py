@@ -11,10 +11,12 @@ from typing import Any
 import numpy as np
 
 from vioframe.errors import VioframeError
+from vioframe.evaluation import TrajectoryErrors, evaluate
+from vioframe.geometry.trajectory import Trajectory
+from vioframe.io.trajectories import load_trajectory
 from vioframe.report.map_quality import MapQuality
 from vioframe.report.metrics import Measured
-from vioframe.report.run_folder import RunFolder
-from vioframe.trajectory import Trajectory, TrajectoryErrors, evaluate, load_trajectory
+from vioframe.runs.folder import RunFolder
 from vioframe.types import NS_PER_S, Int
 
 _RUN_FIGURES = (

@@ -19,7 +19,7 @@ from vioframe.types import Float
 
 if TYPE_CHECKING:
     from vioframe.report.evaluated import Evaluated
-    from vioframe.report.run_folder import RunFolder
+    from vioframe.runs.folder import RunFolder
 
 WITHIN_M = (0.05, 0.10, 0.20)
 _NO_MAP = "no landmarks were recorded (map.ply)"

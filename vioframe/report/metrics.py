@@ -12,11 +12,11 @@ from dataclasses import dataclass, replace
 from numbers import Real
 from typing import TYPE_CHECKING, Any
 
-from vioframe.config import parse_part
 from vioframe.errors import PluginError, TrajectoryError, VioframeError
+from vioframe.evaluation import Comparison
 from vioframe.interfaces import Metric
-from vioframe.registry import METRIC, Part, Registry, describe
-from vioframe.trajectory import Comparison
+from vioframe.parts.config import parse_part
+from vioframe.parts.registry import METRIC, Part, Registry, describe
 
 if TYPE_CHECKING:
     from vioframe.report.evaluated import Evaluated

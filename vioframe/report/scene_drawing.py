@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from vioframe.geometry.trajectory import Trajectory
 from vioframe.report.scene import Flight, Scene
 from vioframe.report.scene_grid import Grid, axes_shape, grid_shape
 from vioframe.report.scene_shapes import (
@@ -21,7 +22,6 @@ from vioframe.report.scene_shapes import (
 )
 from vioframe.report.scene_view import View
 from vioframe.report.style import colour
-from vioframe.trajectory import Trajectory
 from vioframe.types import Calibration, Float
 
 TRUTH_RGB = (0.12, 0.12, 0.12)

@@ -9,7 +9,7 @@ import numpy as np
 
 from vioframe.errors import ConfigError
 from vioframe.geometry import so3
-from vioframe.options import did_you_mean, options_of
+from vioframe.parts.options import did_you_mean, options_of
 from vioframe.types import Calibration, Float
 
 _EXPOSURE_S = 0.040

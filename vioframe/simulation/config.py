@@ -8,9 +8,9 @@ from typing import Annotated, Any, Self
 
 from pydantic import Field, model_validator
 
-from vioframe.config import PartConfig, Section, parse_assignments, read_tree, to_yaml, validate
-from vioframe.options import Option, options_of, validate_options
-from vioframe.registry import FLIGHT, WORLD, Registry
+from vioframe.parts.config import PartConfig, Section, parse_assignments, read_tree, to_yaml, validate
+from vioframe.parts.options import Option, options_of, validate_options
+from vioframe.parts.registry import FLIGHT, WORLD, Registry
 from vioframe.simulation.conditions import Conditions
 from vioframe.simulation.imu import ImuErrors
 

@@ -13,10 +13,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vioframe import registry
 from vioframe.errors import ConfigError
 from vioframe.interfaces import Flight
-from vioframe.types import Float
+from vioframe.parts import registry
+from vioframe.types import Float, Motion
 
 if TYPE_CHECKING:
     from scipy.interpolate import BSpline
@@ -25,20 +25,6 @@ _DEGREE = 5
 
 Shape = Callable[[Float], Float]
 """Times (N,) s, also a little before zero, to (N, 3)."""
-
-
-@dataclass(frozen=True, slots=True)
-class Motion:
-    """Where a body is and how it moves at N instants.
-
-    ``R_WB`` (N, 3, 3), ``p_WB`` (N, 3) m, ``v_WB`` (N, 3) m/s, ``a_WB`` (N, 3) m/s^2, ``omega_B`` (N, 3) rad/s.
-    """
-
-    R_WB: Float
-    p_WB: Float
-    v_WB: Float
-    a_WB: Float
-    omega_B: Float
 
 
 def levelled(R_BC: Float) -> Float:

@@ -7,9 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from vioframe.errors import ConfigError
-from vioframe.simulation.flights import Motion
 from vioframe.simulation.vibration import ACCEL_RMS, GYRO_RMS, vibration
-from vioframe.types import Float, ImuNoise, g_W
+from vioframe.types import Float, ImuNoise, Motion, g_W
 
 Vector = tuple[float, float, float]
 Matrix = tuple[Vector, Vector, Vector]

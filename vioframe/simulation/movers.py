@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vioframe.simulation.world import Mesh, MeshBuilder
-from vioframe.types import Float, Int
+from vioframe.simulation.world import MeshBuilder
+from vioframe.types import Float, Int, Mesh
 
 _SIZE_M = (0.3, 1.1)
 _SWING_M = (0.4, 1.6)

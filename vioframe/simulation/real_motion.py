@@ -6,13 +6,13 @@ from pathlib import Path
 
 import numpy as np
 
-from vioframe.calibration import packaged_calibration
+from vioframe.geometry.trajectory import Trajectory
+from vioframe.io.calibration import packaged_calibration
 from vioframe.simulation.poses import interpolate_poses
 from vioframe.simulation.recorded_motion import RecordedMotion, load_recorded_motion
 from vioframe.simulation.segments import cut_segments
 from vioframe.simulation.sequence import TrackSequence
 from vioframe.simulation.tracks import TrackOptions, TrackSimulator
-from vioframe.trajectory import Trajectory
 from vioframe.types import Calibration, NavState
 
 REAL_MOTION_SEQUENCES = ("MH_02_easy", "MH_03_medium", "MH_05_difficult", "V1_01_easy", "V1_02_medium")

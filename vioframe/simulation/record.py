@@ -10,16 +10,16 @@ from pathlib import Path
 from typing import Any
 
 import vioframe
-from vioframe import machine
-from vioframe.calibration import write_calibration
-from vioframe.convert import FORMATS, appearing, format_of, write_sidecar
 from vioframe.errors import DatasetError
+from vioframe.io.calibration import write_calibration
+from vioframe.io.convert import FORMATS, appearing, format_of, write_sidecar
+from vioframe.io.writers import RecordingWriter, TruthFile
+from vioframe.runs import machine
 from vioframe.simulation import config as configuration
 from vioframe.simulation.files import MANIFEST, TRUTH, WORLD, simulation_folder
 from vioframe.simulation.recording import SimulatedRecording
 from vioframe.simulation.world import write_mesh
 from vioframe.types import Calibration, Frame, ImuSample, Measurement, NavState
-from vioframe.writers import RecordingWriter, TruthFile
 
 
 def record(
@@ -30,7 +30,7 @@ def record(
     overwrite: bool = False,
     on_frame: Callable[[Frame], None] = lambda frame: None,
 ) -> None:
-    """Write ``recording`` to every destination, whose name tells its format; see :func:`vioframe.convert.format_of`.
+    """Write ``recording`` to every destination, whose name tells its format; see :func:`vioframe.io.convert.format_of`.
 
     Beside a bag go ``<bag>.calib`` and ``<bag>.simulation``, the folder of the manifest, the ground truth in EuRoC's
     format and the mesh of the world; an ASL folder holds them itself. All appear once all are complete. Raises

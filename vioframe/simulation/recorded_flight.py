@@ -17,9 +17,9 @@ import numpy as np
 
 from vioframe.errors import ConfigError, TrajectoryError
 from vioframe.geometry import so3
-from vioframe.simulation.flights import Motion
-from vioframe.trajectory import Trajectory, load_trajectory
-from vioframe.types import NS_PER_S, Float
+from vioframe.geometry.trajectory import Trajectory
+from vioframe.io.trajectories import load_trajectory
+from vioframe.types import NS_PER_S, Float, Motion
 
 if TYPE_CHECKING:
     from scipy.interpolate import BSpline

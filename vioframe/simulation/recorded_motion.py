@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from vioframe.errors import DatasetError
-from vioframe.trajectory import Trajectory, load_trajectory
+from vioframe.geometry.trajectory import Trajectory
+from vioframe.io.trajectories import load_trajectory
 from vioframe.types import Float, Int
 
 _IMU_FILES = ("imu0/data.csv", "imu0/data.csv.gz")

@@ -8,9 +8,10 @@ from heapq import merge
 
 import numpy as np
 
-from vioframe.calibration import load_calibration, packaged_calibration
+from vioframe.geometry.trajectory import Trajectory
 from vioframe.interfaces import Flight
-from vioframe.registry import Registry
+from vioframe.io.calibration import load_calibration, packaged_calibration
+from vioframe.parts.registry import Registry
 from vioframe.simulation.brightness import wandering_gain
 from vioframe.simulation.camera import Shot, Studio, take_pictures
 from vioframe.simulation.conditions import Conditions
@@ -23,7 +24,6 @@ from vioframe.simulation.recorded_motion import load_recorded_motion
 from vioframe.simulation.scenario import Scenario, flown, replayed
 from vioframe.simulation.vibration import ACCEL_RMS, GYRO_RMS, vibration
 from vioframe.simulation.world import MeshWorld, check_clear
-from vioframe.trajectory import Trajectory
 from vioframe.types import NS_PER_S, Float, Frame, ImuSample, Int, Measurement, NavState
 
 DEFAULT_DURATION_S = 30.0

@@ -12,8 +12,7 @@ from vioframe.geometry.meshes import import_open3d, ray_scene
 from vioframe.interfaces import World
 from vioframe.simulation.movers import Movers
 from vioframe.simulation.shading import MISS, Float32, mip_pyramid, shade
-from vioframe.simulation.world import Mesh
-from vioframe.types import Float, Int
+from vioframe.types import Float, Int, Mesh
 
 # A pixel where surfaces meet is the mean over eight places in it, no two of which share a row or a column.
 _SAMPLES_PX = (np.array([[k, 3 * k % 8] for k in range(8)]) + 0.5) / 8.0 - 0.5

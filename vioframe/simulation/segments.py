@@ -7,14 +7,14 @@ import numpy as np
 
 from vioframe.errors import DatasetError
 from vioframe.incidents import Incidents
-from vioframe.synchronise import synchronise
+from vioframe.io.synchronise import synchronise
 from vioframe.types import Float, Frame, ImuSample, ImuSegment, Int, Measurement
 
 _NO_IMAGE = np.empty((0, 0), np.uint8)
 
 
 def cut_segments(t_ns: Int, gyro_B: Float, accel_B: Float, frames_ns: Int) -> list[ImuSegment]:
-    """One segment a frame, as :func:`vioframe.synchronise.synchronise` cuts them.
+    """One segment a frame, as :func:`vioframe.io.synchronise.synchronise` cuts them.
 
     ``t_ns`` (N,) ascending, ``gyro_B`` (N, 3) rad/s, ``accel_B`` (N, 3) m/s^2, ``frames_ns`` (M,) ascending and within
     the readings; raises :class:`DatasetError` where that is not so and a frame would be left without its segment.

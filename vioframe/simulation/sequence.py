@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from vioframe.trajectory import Trajectory
+from vioframe.geometry.trajectory import Trajectory
 from vioframe.types import Calibration, FrameTracks, ImuSegment, NavState
 
 Packet = tuple[ImuSegment, FrameTracks]

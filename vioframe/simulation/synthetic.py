@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from vioframe.calibration import packaged_calibration
+from vioframe.geometry.trajectory import Trajectory
 from vioframe.interfaces import Flight
+from vioframe.io.calibration import packaged_calibration
 from vioframe.simulation.flights import flight as named_flight
 from vioframe.simulation.imu import ImuErrors, Vector, read_imu
 from vioframe.simulation.segments import cut_segments
 from vioframe.simulation.sequence import TrackSequence
 from vioframe.simulation.tracks import TrackOptions, TrackSimulator
-from vioframe.trajectory import Trajectory
 from vioframe.types import NS_PER_S, Calibration, Float, ImuNoise, NavState
 
 EUROC_NOISE = ImuNoise(

@@ -6,33 +6,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from vioframe.errors import ConfigError
 from vioframe.geometry.meshes import import_open3d, ray_scene
 from vioframe.interfaces import World
-from vioframe.types import Float, Image, Int
-
-Int32 = NDArray[np.int32]
-
-
-@dataclass(frozen=True)
-class Mesh:
-    """T triangles: ``corners`` (T, 3, 3) m in W, ``uv`` (T, 3, 2) in widths of the texture, which repeats.
-
-    ``texture`` (T,) numbers the image on each; ``surface`` (T,) tells faces apart, for anti-aliasing where they meet.
-    """
-
-    corners: Float
-    uv: Float
-    texture: Int32
-    surface: Int32
-
-    @property
-    def normals(self) -> Float:
-        """(T, 3) unit normals."""
-        n = np.cross(self.corners[:, 1] - self.corners[:, 0], self.corners[:, 2] - self.corners[:, 0])
-        return np.asarray(n / np.maximum(np.linalg.norm(n, axis=1, keepdims=True), 1e-12))
+from vioframe.types import Float, Image, Int, Mesh
 
 
 @dataclass(frozen=True)

@@ -9,10 +9,11 @@ from typing import Any
 import numpy as np
 
 from vioframe.errors import TrajectoryError
+from vioframe.evaluation import evaluate
+from vioframe.geometry.trajectory import Trajectory
 from vioframe.interfaces import Backend, BackendFactory
 from vioframe.simulation import Packet, TrackSequence, simulated_sequence
 from vioframe.testing.require import fail, require
-from vioframe.trajectory import Trajectory, evaluate
 from vioframe.types import Estimate, Float, FrameTracks, NavState, Status
 
 _DURATION_S = 12.0

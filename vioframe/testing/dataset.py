@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 
 from vioframe.errors import DatasetError
+from vioframe.geometry.trajectory import Trajectory
 from vioframe.interfaces import Dataset, DatasetFactory
 from vioframe.testing.require import fail, require
-from vioframe.trajectory import Trajectory
 from vioframe.types import NS_PER_S, Calibration, Frame, ImuSample
 
 _MAX_DISORDER_NS = NS_PER_S

@@ -8,9 +8,8 @@ import numpy as np
 
 from vioframe.geometry import so3
 from vioframe.interfaces import FlightFactory
-from vioframe.simulation.flights import Motion
 from vioframe.testing.require import require
-from vioframe.types import Float
+from vioframe.types import Float, Motion
 
 _DURATION_S = 12.0
 _STEP_S = 1e-4

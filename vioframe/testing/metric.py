@@ -10,11 +10,12 @@ from typing import Any
 import numpy as np
 
 from vioframe.errors import TrajectoryError
+from vioframe.evaluation import Comparison
 from vioframe.geometry import so3
+from vioframe.geometry.so3 import rotation_z
+from vioframe.geometry.trajectory import Trajectory
 from vioframe.interfaces import Metric, MetricFactory
 from vioframe.testing.require import fail, require
-from vioframe.trajectory import Comparison, Trajectory
-from vioframe.trajectory.alignment import rotation_z
 from vioframe.types import NS_PER_S, Float
 
 _POSES, _DURATION_S = 600, 60.0

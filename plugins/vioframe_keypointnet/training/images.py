@@ -10,11 +10,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from vioframe import registry
 from vioframe.bench.detectors.images import frames_of
 from vioframe.errors import ConfigError, DatasetError
-from vioframe.images import decode_image, to_gray8
 from vioframe.interfaces import Dataset
+from vioframe.io.images import decode_image, to_gray8
+from vioframe.parts import registry
 
 _SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".ppm", ".pgm", ".tif", ".tiff", ".webp"})
 _SMALLEST_PX = 64

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vioframe.errors import ConfigError
-from vioframe.options import did_you_mean
+from vioframe.parts.options import did_you_mean
 from vioframe.simulation.sensor import digitise
 from vioframe.types import Float, Image
 

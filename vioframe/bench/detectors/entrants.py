@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from vioframe.config import parse_assignments, parse_part
 from vioframe.errors import ConfigError, PluginError, VioframeError
 from vioframe.interfaces import Detector
-from vioframe.registry import DETECTOR, Registry, describe
+from vioframe.parts.config import parse_assignments, parse_part
+from vioframe.parts.registry import DETECTOR, Registry, describe
 from vioframe.types import Image, Keypoints
 
 _DESCRIPTORS = "descriptors"

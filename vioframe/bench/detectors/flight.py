@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 
-from vioframe import registry
 from vioframe.bench.detectors.degradations import Circumstances, Degradation
 from vioframe.bench.detectors.entrants import Entrant
 from vioframe.bench.detectors.leads import BASELINE, lead_of_shares
@@ -19,11 +18,13 @@ from vioframe.bench.processes import map_in_processes, single_threaded
 from vioframe.bench.results import Row
 from vioframe.errors import ConfigError, DatasetError
 from vioframe.frontend import Frontend, FrontendOptions
+from vioframe.geometry.trajectory import Trajectory
 from vioframe.incidents import Incidents
 from vioframe.interfaces import Dataset
-from vioframe.registry import Registry
-from vioframe.synchronise import synchronise
-from vioframe.trajectory import Trajectory, load_trajectory
+from vioframe.io.synchronise import synchronise
+from vioframe.io.trajectories import load_trajectory
+from vioframe.parts import registry
+from vioframe.parts.registry import Registry
 from vioframe.types import NS_PER_S, Float, Frame, FrameTracks, ImuSegment
 
 SURVIVAL_FRAMES = (5, 10, 20)

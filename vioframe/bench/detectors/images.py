@@ -10,8 +10,8 @@ from typing import TypeVar
 import numpy as np
 
 from vioframe.errors import DatasetError
-from vioframe.images import decode_image, to_gray8
 from vioframe.interfaces import Dataset
+from vioframe.io.images import decode_image, to_gray8
 from vioframe.types import Float, Frame, Image
 
 ItemT = TypeVar("ItemT")

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 
-from vioframe import registry
 from vioframe.bench.detectors.degradations import Circumstances, Degradation
 from vioframe.bench.detectors.entrants import Entrant, detect
 from vioframe.bench.detectors.leads import BASELINE, lead_of_pairs
@@ -16,6 +15,7 @@ from vioframe.bench.detectors.metrics import CORNERS_WITHIN_PX, PairScore, score
 from vioframe.bench.detectors.pairs import Pair, Views
 from vioframe.bench.processes import map_in_processes, single_threaded
 from vioframe.bench.results import Row
+from vioframe.parts import registry
 from vioframe.types import Image
 
 RESOLUTION = (320, 240)

@@ -9,12 +9,12 @@ from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
-from vioframe import machine
 from vioframe.bench.detectors.entrants import Entrant, detect
 from vioframe.bench.detectors.quoted import TABLE_3_2
 from vioframe.bench.processes import usable_cores
 from vioframe.bench.results import Row
 from vioframe.interfaces import Detector
+from vioframe.runs import machine
 from vioframe.types import Float, Image, Int
 
 RESOLUTION = (640, 480)

@@ -9,8 +9,8 @@ from importlib.util import find_spec
 from pathlib import Path
 
 import vioframe
-from vioframe import machine
-from vioframe.registry import Registry
+from vioframe.parts.registry import Registry
+from vioframe.runs import machine
 
 # They read results and make none.
 _NO_PART = (("cli",), ("report", "suite"))

@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from vioframe.config import PartConfig
+from vioframe.parts.config import PartConfig
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,17 +10,17 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
-from vioframe import config as configuration
 from vioframe.bench.contenders import Contender as TrialContender
 from vioframe.bench.montecarlo import Setup
 from vioframe.bench.suites import sources
 from vioframe.bench.suites.code import code_version
 from vioframe.bench.suites.sources import Flown
 from vioframe.bench.suites.suite import SEED_SHIFT_S, BackendContender, Contender, Suite, montecarlo_setup
-from vioframe.calibration import packaged_calibration
-from vioframe.config import Config, DatasetConfig, PartConfig
 from vioframe.errors import ConfigError, DatasetError
-from vioframe.registry import BACKEND, DETECTOR, Registry
+from vioframe.io.calibration import packaged_calibration
+from vioframe.parts import config as configuration
+from vioframe.parts.config import Config, DatasetConfig, PartConfig
+from vioframe.parts.registry import BACKEND, DETECTOR, Registry
 from vioframe.report.metrics import create_metrics
 from vioframe.report.suite.results import Data, Kind, Labels
 from vioframe.simulation.config import SimulationConfig

@@ -8,11 +8,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from vioframe.bench.suites.euroc import EUROC
-from vioframe.calibration import sidecar_folder
-from vioframe.config import PartConfig
 from vioframe.errors import ConfigError, DatasetError
-from vioframe.options import did_you_mean
-from vioframe.registry import FLIGHT, Registry
+from vioframe.io.calibration import sidecar_folder
+from vioframe.parts.config import PartConfig
+from vioframe.parts.options import did_you_mean
+from vioframe.parts.registry import FLIGHT, Registry
 from vioframe.report.suite.results import Data
 from vioframe.simulation import config as simulation
 from vioframe.simulation.config import SimulationConfig

@@ -13,16 +13,16 @@ from typing import Any
 
 from pydantic_core import to_jsonable_python
 
-from vioframe import machine
 from vioframe.bench.suites.plan import AnyJob, Plan, RecordingJob
 from vioframe.bench.suites.suite import Suite, render
-from vioframe.calibration import sidecar_folder
-from vioframe.config import read_tree
-from vioframe.convert import appearing
 from vioframe.errors import RunError
-from vioframe.recorder import write_json, write_whole
-from vioframe.registry import describe
+from vioframe.io.calibration import sidecar_folder
+from vioframe.io.convert import appearing
+from vioframe.parts.config import read_tree
+from vioframe.parts.registry import describe
 from vioframe.report.suite.results import SUITE_FILE, TASK_FILE, TASKS_FOLDER
+from vioframe.runs import machine
+from vioframe.runs.recorder import write_json, write_whole
 from vioframe.simulation.files import simulation_folder
 
 Result = Mapping[str, Any]

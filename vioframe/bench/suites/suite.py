@@ -11,10 +11,10 @@ from pydantic import Field, model_validator
 
 import vioframe
 from vioframe.bench.montecarlo import Setup
-from vioframe.config import PartConfig, Section, read_tree, to_yaml, validate
 from vioframe.errors import ConfigError
 from vioframe.frontend import FrontendOptions
-from vioframe.options import did_you_mean, validate_options
+from vioframe.parts.config import PartConfig, Section, read_tree, to_yaml, validate
+from vioframe.parts.options import did_you_mean, validate_options
 from vioframe.simulation.conditions import Conditions
 
 Kind = Literal["flights", "detector_speed", "trials"]

@@ -17,7 +17,7 @@ from vioframe.bench.suites.cluster import connected
 from vioframe.bench.suites.plan import AnyJob, FlightJob, Plan, RecordingJob, SpeedJob
 from vioframe.bench.suites.store import Store
 from vioframe.errors import RunError, VioframeError
-from vioframe.registry import describe
+from vioframe.parts.registry import describe
 
 if TYPE_CHECKING:
     from distributed import Client, Future

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from vioframe.evaluation import RelativeErrors, TrajectoryErrors
+from vioframe.evaluation.alignment import align_sim3
+from vioframe.evaluation.metrics import position_error_W
 from vioframe.report.suite.flights import Flight
 from vioframe.report.suite.statistics import Group
-from vioframe.trajectory import RelativeErrors, TrajectoryErrors
-from vioframe.trajectory.alignment import align_sim3
-from vioframe.trajectory.metrics import position_error_W
 from vioframe.types import Float
 
 BAND_M = 0.2

@@ -15,10 +15,12 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, Self
 
-from vioframe.config import read_tree
 from vioframe.errors import RunError
-from vioframe.report.run_folder import RunFolder
-from vioframe.trajectory import Trajectory, TrajectoryErrors, evaluate, load_trajectory
+from vioframe.evaluation import TrajectoryErrors, evaluate
+from vioframe.geometry.trajectory import Trajectory
+from vioframe.io.trajectories import load_trajectory
+from vioframe.parts.config import read_tree
+from vioframe.runs.folder import RunFolder
 
 SUITE_FILE, TASKS_FOLDER, TASK_FILE, RUN_FOLDER = "suite.yaml", "tasks", "task.json", "run"
 MATCHED_TRUTH = "ground_truth_matched.tum"

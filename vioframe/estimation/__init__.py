@@ -1,0 +1,1 @@
+"""The mathematics that the back-ends share: inertial factors, initialisation, standstill, recovery."""

@@ -1,0 +1,178 @@
+"""The camera's rotation on the body from a chain of keyframes: in closed form first, then from all tracks at once.
+
+A rotation R_BiBj of the body is R_BC R_CiCj R_BC' seen by the camera, hence log R_BiBj = R_BC log R_CiCj: one axis, in
+two frames (Park, Martin, "Robot Sensor Calibration: Solving AX = XB on the Euclidean Group", T-RA 1994). Derivation:
+``docs/derivations/initialization.md``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from vioframe.estimation.inertial.preintegration import Preintegrated
+from vioframe.estimation.initialization.epipolar_pairs import BearingPairs, relative_rotations
+from vioframe.estimation.initialization.estimate import RefusalError
+from vioframe.geometry import so3
+from vioframe.types import Float, FrameTracks, Int
+
+_FEWEST_COMMON, _MOST_COMMON = 15, 80
+# Keyframes from the first of a pair to the second. One of two fifths of a second turns enough and keeps most tracks.
+_STEPS, _COARSE_STEP = (1, 2, 4, 8), 2
+# Iterations and Cauchy's scale (standard deviations) of each stage for a pair on its own ...
+_PAIR_STAGES = ((6, 20.0), (6, 5.0), (6, 2.0))
+_PAIR_PRIOR, _LARGEST_PAIR_STEP = 0.5, 0.2  # rad
+# ... and for all: iterations, the longest step used, Cauchy's scale.
+_STAGES = ((6, 2, 50.0), (6, 4, 20.0), (8, 8, 5.0), (15, 8, 2.0))
+_CONVERGED = 1e-5  # rad and rad/s
+_ALIGNMENT_ITERATIONS, _ALIGNMENT_SIGMA = 10, np.deg2rad(1.0)
+_UNOBSERVED = 1e-6  # information, 1/rad^2, far below what any pair of frames brings
+# The median of |x| for x ~ N(0, 1).
+_MEDIAN = 0.6745
+
+
+@dataclass(frozen=True, slots=True)
+class Chain:
+    """K keyframes ``tracks`` and the K - 1 measurements ``imu`` between them, integrated without bias."""
+
+    tracks: Sequence[FrameTracks]
+    imu: Sequence[Preintegrated]
+
+    def pairs(self, steps: Sequence[int]) -> Pairs:
+        """All pairs that are one of ``steps`` apart and share enough tracks; of very many tracks, some."""
+        first, second, points = [], [], []
+        for step in steps:
+            for i, (a, b) in enumerate(zip(self.tracks, self.tracks[step:], strict=False)):
+                _, in_a, in_b = np.intersect1d(a.ids, b.ids, return_indices=True)
+                if len(in_a) >= _FEWEST_COMMON:
+                    some = np.linspace(0, len(in_a) - 1, min(len(in_a), _MOST_COMMON)).astype(np.int64)
+                    first.append(i)
+                    second.append(i + step)
+                    points.append((a.xy_normalised[in_a[some]], b.xy_normalised[in_b[some]]))
+        xy = np.zeros((2, len(points), _MOST_COMMON, 2))
+        common = np.zeros((len(points), _MOST_COMMON), bool)
+        for k, (xy_1, xy_2) in enumerate(points):
+            xy[0, k, : len(xy_1)], xy[1, k, : len(xy_2)], common[k, : len(xy_1)] = xy_1, xy_2, True
+        return Pairs(np.array(first, np.int64), np.array(second, np.int64), BearingPairs.of(xy[0], xy[1], common))
+
+
+@dataclass(frozen=True, slots=True)
+class Pairs:
+    """P pairs of keyframes, ``first`` and ``second`` (P,), and their tracks."""
+
+    first: Int
+    second: Int
+    bearings: BearingPairs
+
+    def up_to(self, step: int) -> Pairs:
+        """Those at most ``step`` keyframes apart."""
+        near = self.second - self.first <= step
+        b = self.bearings
+        return Pairs(self.first[near], self.second[near], BearingPairs(b.f[near], b.g[near], b.common[near]))
+
+
+@dataclass(frozen=True, slots=True)
+class Solution:
+    """``R_BC`` (3, 3) and ``bias_gyro_B`` (3,) rad/s; ``information`` (3, 3) about R_BC's right perturbation, 1/rad^2.
+
+    ``misfit`` is the typical distance of a track from its epipolar lines over the noise that was assumed. The iteration
+    may not have ``settled``.
+    """
+
+    R_BC: Float
+    bias_gyro_B: Float
+    information: Float
+    misfit: float
+    settled: bool
+
+
+def second_turn(chain: Chain) -> float:
+    """How much the body turned about other axes than its main one, rad: without that R_BC cannot be known.
+
+    To first order the second-smallest singular value of the quaternion equations q_B q_BC = q_BC q_C, by which
+    VINS-Mono decides (Qin, Li, Shen, T-RO 2018). A steady turn does not count: it could be the gyroscope's bias.
+    """
+    k = np.arange(len(chain.tracks) - _COARSE_STEP)
+    turns = so3.log(relative_rotations(chain.imu, np.zeros(3), k, k + _COARSE_STEP)[0])
+    return float(np.linalg.norm(np.linalg.svd(turns - turns.mean(axis=0), compute_uv=False)[1:]))
+
+
+def solve(chain: Chain, sigma: float, bias_sigma: float) -> Solution:
+    """From tracks with noise ``sigma`` on the z = 1 plane; ``bias_sigma`` is the bias's prior about zero, rad/s.
+
+    Raises :class:`RefusalError` where there are too few tracks.
+    """
+    pairs = chain.pairs(_STEPS)
+    if len(pairs.first) < len(chain.tracks):
+        raise RefusalError("too few tracks from one keyframe to the next")
+    R_BC, bias = _align_axes(chain, sigma, bias_sigma)
+    for iterations, longest, cauchy in _STAGES:
+        used = pairs.up_to(longest)
+        weight = used.bearings.common.astype(np.float64)
+        for _ in range(iterations):
+            R_B1B2, by_bias = relative_rotations(chain.imu, bias, used.first, used.second)
+            R_C1C2 = R_BC.T @ R_B1B2 @ R_BC
+            equations = used.bearings.linearise(R_C1C2, weight, sigma, cauchy)
+            # R_CB R_B1B2 Exp(dtheta_B) R_BC = R_C1C2 Exp(R_CB dtheta_B), and turning R_BC on the right by d turns
+            # R_C1C2 into Exp(-d) R_C1C2 Exp(d) = R_C1C2 Exp((I - R_C2C1) d).
+            A = np.concatenate([R_BC.T @ by_bias, np.eye(3) - np.swapaxes(R_C1C2, -1, -2)], axis=2)
+            transposed = np.swapaxes(A, -1, -2)
+            H = (transposed @ equations.H @ A).sum(axis=0)
+            b = (transposed @ equations.b[..., None]).sum(axis=0)[:, 0]
+            H[:3, :3] += np.eye(3) / bias_sigma**2
+            H[3:, 3:] += np.eye(3) * _UNOBSERVED
+            b[:3] += bias / bias_sigma**2
+            step = np.linalg.solve(H, -b)
+            bias, R_BC, weight = bias + step[:3], R_BC @ so3.exp(step[3:]), equations.weight
+            if np.linalg.norm(step) < _CONVERGED:
+                break
+    settled = bool(np.linalg.norm(step) < 100.0 * _CONVERGED)
+    information = H[3:, 3:] - H[3:, :3] @ np.linalg.solve(H[:3, :3], H[:3, 3:])
+    common = used.bearings.common
+    misfit = float(np.median(equations.distance[common])) / _MEDIAN
+    return Solution(R_BC, bias, information * _independent_share(chain, int(common.sum())), misfit, settled)
+
+
+def _align_axes(chain: Chain, sigma: float, bias_sigma: float) -> tuple[Float, Float]:
+    """R_BC (3, 3) and the bias (3,) from the turns of pairs: argmin sum w |beta - R_BC gamma - bias dt|^2.
+
+    ``beta`` and ``gamma`` (P, 3) are the rotation vectors of body and camera. The bias is eliminated, which leaves an
+    orthogonal Procrustes problem. An angle is the same in both frames: where they differ, the pair counts little.
+    """
+    pairs = chain.pairs([_COARSE_STEP])
+    dt = np.array([sum(m.dt_s for m in chain.imu[i : i + _COARSE_STEP]) for i in pairs.first])
+    beta = so3.log(relative_rotations(chain.imu, np.zeros(3), pairs.first, pairs.second)[0])
+    gamma = so3.log(_turns_of_camera(pairs.bearings, sigma))
+    off = np.abs(np.linalg.norm(beta, axis=1) - np.linalg.norm(gamma, axis=1))
+    for _ in range(_ALIGNMENT_ITERATIONS):
+        scale = max(_ALIGNMENT_SIGMA, 1.5 * float(np.median(off)))
+        weight = 1.0 / (1.0 + (off / scale) ** 2)
+        total = (weight * dt**2).sum() + (_ALIGNMENT_SIGMA / bias_sigma) ** 2
+        beta_dt, gamma_dt = (weight * dt) @ beta, (weight * dt) @ gamma
+        R_BC = so3.project((beta * weight[:, None]).T @ gamma - np.outer(beta_dt, gamma_dt) / total)
+        bias = (beta_dt - R_BC @ gamma_dt) / total
+        off = np.linalg.norm(beta - gamma @ R_BC.T - dt[:, None] * bias, axis=1)
+    return R_BC, bias
+
+
+def _turns_of_camera(bearings: BearingPairs, sigma: float) -> Float:
+    """R_C1C2 (P, 3, 3) of each pair by itself, beginning with the rotation that explains it best without moving."""
+    f, g = (v / np.maximum(np.linalg.norm(v, axis=-1, keepdims=True), 1.0) for v in (bearings.f, bearings.g))
+    R = so3.project(np.swapaxes(f, -1, -2) @ g)
+    weight = bearings.common.astype(np.float64)
+    for iterations, cauchy in _PAIR_STAGES:
+        for _ in range(iterations):
+            equations = bearings.linearise(R, weight, sigma, cauchy)
+            step = -np.linalg.solve(equations.H + np.eye(3) / _PAIR_PRIOR**2, equations.b[..., None])[..., 0]
+            length = np.linalg.norm(step, axis=1, keepdims=True)
+            R = R @ so3.exp(step * np.minimum(1.0, _LARGEST_PAIR_STEP / np.maximum(length, 1e-12)))
+            weight = equations.weight
+    return R
+
+
+def _independent_share(chain: Chain, rows: int) -> float:
+    """Pairs overlap: of ``rows`` equations, a track with V views brings 2 V - 3 that are independent."""
+    _, views = np.unique(np.concatenate([t.ids for t in chain.tracks]), return_counts=True)
+    return min(1.0, float(np.maximum(2 * views - 3, 0).sum()) / rows)

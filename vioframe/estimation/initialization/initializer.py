@@ -1,0 +1,128 @@
+"""Finds where an estimator may begin, one frame at a time."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import replace
+
+import numpy as np
+
+from vioframe.estimation.initialization import dynamic, static
+from vioframe.estimation.initialization.estimate import InitialEstimate, RefusalError
+from vioframe.estimation.initialization.hand_eye import CameraRotation, RotationCalibrator
+from vioframe.estimation.initialization.options import InitializationOptions
+from vioframe.estimation.initialization.window import Packet, finite_tracks
+from vioframe.types import Calibration, FrameTracks, ImuNoise, ImuSegment
+
+_log = logging.getLogger("vioframe.estimation.initialization")
+
+
+class Initializer:
+    """Tries the static method at every frame, and the dynamic one every so often, until one is sure of itself.
+
+    With ``options.unknown_camera_rotation`` both wait for the hand-eye calibration of the camera's rotation, which is
+    done once. Every attempt is logged to ``vioframe.estimation.initialization``.
+    """
+
+    def __init__(self, calibration: Calibration, options: InitializationOptions | None = None) -> None:
+        options = options or InitializationOptions()
+        self._calibration = calibration
+        self._in_flight = replace(calibration, imu=_inflated(calibration.imu, options.imu_noise_factor))
+        self._options = options
+        self._calibrator = RotationCalibrator(calibration, options) if options.unknown_camera_rotation else None
+        self._camera_rotation: CameraRotation | None = None
+        self._refusals: dict[str, str] = {}
+        self._packets: list[Packet] = []
+        self._last_attempt_ns: int | None = None
+
+    @property
+    def calibration(self) -> Calibration:
+        """That of the sensors, with the camera's rotation that was found in place of the unknown one."""
+        return self._calibration
+
+    @property
+    def camera_rotation(self) -> CameraRotation | None:
+        """What the hand-eye calibration found; None where it has not, or was not asked for."""
+        return self._camera_rotation
+
+    @property
+    def refusal(self) -> str:
+        """Why the last attempt of each method came to nothing, in one line; "" before the first and after a success."""
+        return "; ".join(f"{method}: {reason}" for method, reason in self._refusals.items())
+
+    def reset(self) -> None:
+        """Forget everything seen, but not how the camera is turned on the body."""
+        if self._calibrator is not None:
+            self._calibrator.reset()
+        self._packets.clear()
+        self._last_attempt_ns = None
+        self._refusals.clear()
+
+    def add(self, imu: ImuSegment, tracks: FrameTracks) -> InitialEstimate | None:
+        """Take one frame; an estimate whose newest state is at this frame, or None as long as none can be trusted."""
+        if imu.largest_gap_s > self._options.largest_imu_gap_s:
+            self.reset()
+            _log.info("no readings for %.2f s: begun anew", imu.largest_gap_s)
+        self._packets.append((imu, finite_tracks(tracks)))
+        self._packets = self._last(self._options.longest_window_s)
+        if self._calibrator is not None and not self._find_camera_rotation(self._calibrator, imu, tracks):
+            return None
+        for method, attempt in (("static", self._static), ("dynamic", self._dynamic)):
+            try:
+                estimate = attempt()
+            except (RefusalError, np.linalg.LinAlgError) as refusal:
+                self._refusals[method] = str(refusal)
+                _log.debug("%d %s refused: %s", tracks.t_ns, method, refusal)
+                continue
+            if estimate is not None:
+                _log.info("%d %s initialisation accepted", tracks.t_ns, method)
+                self._refusals.clear()
+                return estimate
+        return None
+
+    def _find_camera_rotation(self, calibrator: RotationCalibrator, imu: ImuSegment, tracks: FrameTracks) -> bool:
+        found = calibrator.add(imu, tracks)
+        if found is None:
+            if calibrator.refusal:
+                self._refusals["hand-eye"] = calibrator.refusal
+            return False
+        self._refusals.clear()
+        self._calibrator, self._camera_rotation = None, found
+        self._calibration = replace(self._calibration, R_BC=found.R_BC)
+        self._in_flight = replace(self._in_flight, R_BC=found.R_BC)
+        return True
+
+    def _static(self) -> InitialEstimate | None:
+        packets = self._last(self._options.static_window_s)
+        if _duration_s(packets) < 0.95 * self._options.static_window_s:
+            return None
+        return static.initialise(packets, self._calibration, self._options)
+
+    def _dynamic(self) -> InitialEstimate | None:
+        newest_ns = self._packets[-1][1].t_ns
+        last_ns = self._last_attempt_ns
+        if last_ns is not None and newest_ns - last_ns < self._options.attempt_interval_s * 1e9:
+            return None
+        if _duration_s(self._packets) < self._options.shortest_window_s:
+            return None
+        self._last_attempt_ns = newest_ns
+        return dynamic.initialise(self._packets, self._in_flight, self._options)
+
+    def _last(self, seconds: float) -> list[Packet]:
+        """The frames of the last ``seconds``."""
+        oldest_ns = self._packets[-1][1].t_ns - seconds * 1e9
+        return [packet for packet in self._packets if packet[1].t_ns >= oldest_ns]
+
+
+def _duration_s(packets: list[Packet]) -> float:
+    return (packets[-1][1].t_ns - packets[0][1].t_ns) * 1e-9
+
+
+def _inflated(noise: ImuNoise, factor: float) -> ImuNoise:
+    return ImuNoise(
+        noise.gyro_density * factor,
+        noise.accel_density * factor,
+        noise.gyro_walk * factor,
+        noise.accel_walk * factor,
+        noise.rate_hz,
+    )

@@ -1,0 +1,189 @@
+"""The one function that turns an estimate and its ground truth into numbers."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vioframe.errors import TrajectoryError
+from vioframe.evaluation.alignment import ALIGNMENTS, Alignment, align_posyaw_by_attitude, align_se3, align_sim3
+from vioframe.evaluation.association import Association, associate
+from vioframe.evaluation.metrics import (
+    RelativeErrors,
+    Stats,
+    position_error_W,
+    relative_errors,
+    rotation_error_deg,
+    rotation_error_rpy_deg,
+)
+from vioframe.evaluation.nees import Nees, nees
+from vioframe.geometry import so3
+from vioframe.geometry.so3 import yaw_of
+from vioframe.geometry.trajectory import Trajectory
+from vioframe.types import Float
+
+LENGTHS_M = (8.0, 16.0, 24.0, 32.0, 40.0, 48.0)
+"""Stretches for relative errors as OpenVINS reports them."""
+FRACTIONS = (0.1, 0.2, 0.3, 0.4, 0.5)
+"""Stretches as parts of the whole path, as rpg_trajectory_evaluation reports them."""
+
+_AT_REST_M = 0.05
+_SUSPICIOUS_ANGLE_DEG = 10.0
+
+
+@dataclass(frozen=True, eq=False)
+class TrajectoryErrors:
+    """What separates an estimate from the truth; N associated poses in the ground truth's world.
+
+    ``position_m`` (N, 3) estimate minus truth, ``rotation_rpy_deg`` (N, 3) about the world's axes. ``ate_se3_m`` and
+    ``scale``, the factor the estimate would have to be multiplied by, come from alignments of their own and are None
+    where the body did not move enough to tell. ``relative`` is by length in metres, ``relative_by_fraction`` by the
+    fraction of the whole path. NEES is taken in the gauge of the first pose in any case. ``coverage`` is the part of
+    the ground truth's time between the first and the last associated pose.
+    """
+
+    alignment_name: str
+    alignment: Alignment
+    estimate: Trajectory
+    truth: Trajectory
+    position_m: Float
+    rotation_rpy_deg: Float
+    ate_m: Stats
+    orientation_deg: Stats
+    yaw_deg: Stats
+    ate_se3_m: float | None
+    scale: float | None
+    relative: Mapping[float, RelativeErrors]
+    relative_by_fraction: Mapping[float, RelativeErrors]
+    nees: tuple[Nees, ...]
+    coverage: float
+    notes: tuple[str, ...]
+
+    @property
+    def at_rest(self) -> bool:
+        """Whether the body stayed in one place, so that its path tells neither heading, scale nor drift by length."""
+        return _spread_m(self.truth) < _AT_REST_M
+
+    @property
+    def max_position_m(self) -> Float:
+        """(3,) largest absolute position error along x, y, z."""
+        return np.asarray(np.abs(self.position_m).max(axis=0))
+
+    @property
+    def max_rotation_deg(self) -> Float:
+        """(3,) largest absolute rotation error in roll, pitch, yaw."""
+        return np.asarray(np.abs(self.rotation_rpy_deg).max(axis=0))
+
+    def to_dict(self) -> dict[str, object]:
+        """The summary without time series, ready for JSON."""
+        return {
+            "alignment": self.alignment_name,
+            "poses": len(self.estimate),
+            "duration_s": self.estimate.duration_s,
+            "path_length_m": self.truth.path_length_m,
+            "coverage": self.coverage,
+            "ate_m": self.ate_m.to_dict(),
+            "ate_se3_m": self.ate_se3_m,
+            "scale": self.scale,
+            "orientation_deg": self.orientation_deg.to_dict(),
+            "yaw_deg": self.yaw_deg.to_dict(),
+            "max_position_m": dict(zip("xyz", self.max_position_m.tolist(), strict=True)),
+            "max_rotation_deg": dict(zip(("roll", "pitch", "yaw"), self.max_rotation_deg.tolist(), strict=True)),
+            "relative": {f"{length:g}m": errors.to_dict() for length, errors in self.relative.items()},
+            "relative_by_fraction": {
+                f"{100 * f:g}%": errors.to_dict() for f, errors in self.relative_by_fraction.items()
+            },
+            "nees": {n.part: n.to_dict() for n in self.nees},
+            "notes": list(self.notes),
+        }
+
+
+def evaluate(
+    estimate: Trajectory,
+    ground_truth: Trajectory,
+    *,
+    alignment: str = "posyaw",
+    association: Association = "interpolate",
+    max_gap_s: float = 0.1,
+    max_dt_s: float = 0.01,
+    lengths_m: Sequence[float] = LENGTHS_M,
+) -> TrajectoryErrors:
+    """Associate, align and measure. The estimate is moved, never the truth; neither is changed.
+
+    ``alignment`` is one of :data:`ALIGNMENTS`; ``association`` and its limits are those of :func:`associate`. Raises
+    :class:`TrajectoryError` where the two cannot be compared.
+    """
+    if alignment not in ALIGNMENTS:
+        raise TrajectoryError(f"unknown alignment {alignment!r}; use one of {', '.join(ALIGNMENTS)}")
+    raw, truth = associate(estimate, ground_truth, association, max_gap_s=max_gap_s, max_dt_s=max_dt_s)
+    at_rest = _spread_m(truth) < _AT_REST_M
+    fit = align_posyaw_by_attitude if at_rest and alignment == "posyaw" else ALIGNMENTS[alignment]
+    transform = fit(raw, truth)
+    aligned = transform.apply(raw)
+    rotation_rpy_deg = rotation_error_rpy_deg(aligned, truth)
+    position_m = position_error_W(aligned, truth)
+    path_m = truth.path_length_m
+    by_length = {} if at_rest else relative_errors(aligned, truth, {length: length for length in lengths_m})
+    by_fraction = {} if at_rest else relative_errors(aligned, truth, {part: part * path_m for part in FRACTIONS})
+    ate_se3_m, scale = (None, None) if at_rest else _se3_ate_and_scale(raw, truth)
+    return TrajectoryErrors(
+        alignment_name=alignment,
+        alignment=transform,
+        estimate=aligned,
+        truth=truth,
+        position_m=position_m,
+        rotation_rpy_deg=rotation_rpy_deg,
+        ate_m=Stats.of(np.linalg.norm(position_m, axis=1)),
+        orientation_deg=Stats.of(rotation_error_deg(aligned, truth)),
+        yaw_deg=Stats.of(rotation_rpy_deg[:, 2]),
+        ate_se3_m=ate_se3_m,
+        scale=scale,
+        relative=by_length,
+        relative_by_fraction=by_fraction,
+        nees=nees(ALIGNMENTS["first"](raw, truth).apply(raw), truth),
+        coverage=min(1.0, raw.duration_s / ground_truth.duration_s) if len(ground_truth) > 1 else 1.0,
+        notes=tuple(_notes(estimate, raw, aligned, truth, at_rest)),
+    )
+
+
+def _spread_m(trajectory: Trajectory) -> float:
+    """Root mean square distance from the mean position."""
+    return float(np.sqrt(trajectory.p_WB.var(axis=0).sum()))
+
+
+def _se3_ate_and_scale(raw: Trajectory, truth: Trajectory) -> tuple[float | None, float | None]:
+    try:
+        se3, sim3 = align_se3(raw, truth), align_sim3(raw, truth)
+    except TrajectoryError:
+        # A straight path leaves a rotation open.
+        return None, None
+    error = np.linalg.norm(position_error_W(se3.apply(raw), truth), axis=1)
+    return Stats.of(error).rmse, sim3.scale
+
+
+def _notes(estimate: Trajectory, raw: Trajectory, aligned: Trajectory, truth: Trajectory, at_rest: bool) -> list[str]:
+    """What a reader of the numbers should know: one line each."""
+    notes = []
+    if at_rest:
+        notes.append("body at rest: yaw aligned by attitude; SE(3), scale and relative errors left out")
+    placeholders = int(np.logical_and.accumulate(_is_identity(estimate)).sum())
+    if placeholders:
+        poses = "pose of the estimate is" if placeholders == 1 else f"{placeholders} poses of the estimate are"
+        notes.append(f"the first {poses} the identity: written before initialisation?")
+    E = aligned.R_WB @ truth.R_WB.transpose(0, 2, 1)
+    in_body = so3.project((truth.R_WB.transpose(0, 2, 1) @ aligned.R_WB).mean(axis=0))
+    offset = float(np.degrees(np.linalg.norm(so3.log(in_body))))
+    if offset > _SUSPICIOUS_ANGLE_DEG:
+        notes.append(
+            f"the estimate's body is turned by {offset:.0f} deg: not the IMU's frame, or quaternions not in x y z w?"
+        )
+    elif abs(float(np.degrees(yaw_of(E.mean(axis=0))))) > _SUSPICIOUS_ANGLE_DEG:
+        notes.append("attitude and path disagree about the yaw that aligns the estimate")
+    return notes
+
+
+def _is_identity(trajectory: Trajectory) -> NDArray[np.bool_]:
+    return np.asarray((np.eye(3) == trajectory.R_WB).all(axis=(1, 2)) & (trajectory.p_WB == 0.0).all(axis=1))

@@ -1,0 +1,1 @@
+"""Files in and out: calibrations, recordings, trajectories; and measurements put in order."""

@@ -1,0 +1,134 @@
+"""One recording format into another: ASL folder, ROS 1 bag, ROS 2 bag, MCAP; stamps, pixels and readings stay exact.
+
+A converted recording holds one camera and one IMU under EuRoC's names (``cam0``, ``imu0``; ``/cam0/image_raw``,
+``/imu0``) and its calibration: as ``sensor.yaml`` in an ASL folder, beside any other in the folder ``<name>.calib``.
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from vioframe.errors import DatasetError
+from vioframe.io.calibration import sidecar_folder, write_calibration
+from vioframe.io.writers import AslWriter, McapWriter, RecordingWriter, Ros1Writer, Ros2Writer
+from vioframe.types import Calibration, Frame, ImuSample, Measurement
+
+
+@dataclass(frozen=True, slots=True)
+class Format:
+    """A recording format that can be written: ``open(path, compression)`` begins one."""
+
+    description: str
+    open: Callable[[Path, str | None], RecordingWriter]
+    compressions: tuple[str, ...] = ()
+
+
+FORMATS = {
+    "asl": Format("ASL folder, as EuRoC's", lambda path, _: AslWriter(path)),
+    "ros1": Format("ROS 1 bag", Ros1Writer, ("bz2", "lz4")),
+    "ros2": Format("ROS 2 bag, a folder with sqlite3 storage", Ros2Writer, ("zstd",)),
+    "mcap": Format("MCAP file with ROS 2 messages", McapWriter, ("zstd",)),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Conversion:
+    """What was written, and how much of the source could not be read."""
+
+    frames: int
+    imu_samples: int
+    unreadable: int
+
+
+def format_of(destination: Path) -> str:
+    """The format a destination's name asks for: ``.bag`` is ROS 1, ``.mcap`` MCAP, ``.ros2`` or ``rosbag2...`` a ROS 2
+    folder, and no extension an ASL folder. Raises :class:`~vioframe.errors.DatasetError` for any other."""
+    if destination.suffix == ".ros2" or destination.name.startswith("rosbag2"):
+        return "ros2"
+    by_suffix = {".bag": "ros1", ".mcap": "mcap", "": "asl"}
+    if destination.suffix not in by_suffix:
+        raise DatasetError(
+            f"the name {destination.name} tells no format; use NAME.bag (ROS 1), NAME.mcap, NAME.ros2 (ROS 2 folder) "
+            "or NAME without extension (ASL folder), or state the format"
+        )
+    return by_suffix[destination.suffix]
+
+
+def convert(
+    measurements: Iterable[Measurement],
+    calibration: Calibration,
+    destination: Path,
+    *,
+    format: str | None = None,
+    compression: str | None = None,
+) -> Conversion:
+    """Write a data set's measurements and calibration to ``destination``, which appears only once it is complete.
+
+    ``format`` is a key of :data:`FORMATS`, by default told by the name (:func:`format_of`); ``compression`` is one that
+    the format offers. Raises :class:`~vioframe.errors.DatasetError`, also where the destination exists.
+    """
+    format = format or format_of(destination)
+    if format not in FORMATS:
+        raise DatasetError(f"there is no format {format!r}; choose one of: {', '.join(FORMATS)}")
+    offered = FORMATS[format].compressions
+    if compression is not None and compression not in offered:
+        raise DatasetError(f"{format} offers no compression {compression!r}; it has: {', '.join(offered) or 'none'}")
+    with appearing(destination) as unfinished:
+        counts = _write(measurements, FORMATS[format].open(unfinished, compression))
+        if not counts.frames or not counts.imu_samples:
+            raise DatasetError(f"nothing to write to {destination}: the source has no readable frame or no IMU sample")
+        if format == "asl":
+            write_calibration(calibration, unfinished / "mav0")
+        else:
+            write_sidecar(calibration, destination)
+    return counts
+
+
+def _write(measurements: Iterable[Measurement], writer: RecordingWriter) -> Conversion:
+    frames = imu_samples = unreadable = 0
+    with writer:
+        for measurement in measurements:
+            if isinstance(measurement, Frame):
+                writer.write_frame(measurement)
+                frames += 1
+            elif isinstance(measurement, ImuSample):
+                writer.write_imu(measurement)
+                imu_samples += 1
+            else:
+                unreadable += 1
+    return Conversion(frames, imu_samples, unreadable)
+
+
+@contextmanager
+def appearing(destination: Path, *, replace: bool = False) -> Iterator[Path]:
+    """A place of the same name to write to, moved to ``destination`` if all goes well and removed if not.
+
+    Raises :class:`~vioframe.errors.DatasetError` where it cannot be written, or exists and is not to be replaced.
+    """
+    if destination.exists() and not replace:
+        raise DatasetError(f"{destination} exists already; remove it or choose another name")
+    workspace = destination.with_name(f".{destination.name}.unfinished")
+    try:
+        shutil.rmtree(workspace, ignore_errors=True)
+        workspace.mkdir(parents=True)
+        yield workspace / destination.name
+        if destination.is_dir():
+            shutil.rmtree(destination)
+        (workspace / destination.name).replace(destination)
+    except OSError as err:
+        raise DatasetError(f"cannot write {destination}: {err.strerror or err}") from err
+    finally:
+        shutil.rmtree(workspace, ignore_errors=True)
+
+
+def write_sidecar(calibration: Calibration, recording: Path) -> None:
+    """Calibration files beside ``recording``, in place of any there.
+
+    To be written before the recording appears, so that none ever stands without its calibration.
+    """
+    with appearing(sidecar_folder(recording), replace=True) as unfinished:
+        write_calibration(calibration, unfinished)

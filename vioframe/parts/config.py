@@ -1,0 +1,287 @@
+"""What a run is made of: YAML in, a frozen and validated :class:`Config` out; an unknown key is an error.
+
+The options of the parts are checked against the signatures of the parts themselves, so that a plug-in's options need no
+second description. :func:`complete` fills in every default: the configuration kept with a run says everything.
+"""
+
+from __future__ import annotations
+
+import re
+import textwrap
+from collections.abc import Iterable, Iterator, Mapping
+from io import StringIO
+from pathlib import Path
+from typing import Any, TypeVar
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic_core import to_jsonable_python
+from ruamel.yaml import YAML
+from ruamel.yaml.error import YAMLError
+
+from vioframe.errors import ConfigError
+from vioframe.frontend import FrontendOptions
+from vioframe.parts.options import Option, did_you_mean, options_of, validate_options
+from vioframe.parts.registry import BACKEND, DETECTOR, LOOP_CLOSER, Kind, Registry
+
+SectionT = TypeVar("SectionT", bound="Section")
+
+
+class Section(BaseModel):
+    """A part of a configuration: frozen, and an unknown key is an error."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class DatasetConfig(Section):
+    """What to read. ``reader`` None means: the one that accepts the path."""
+
+    path: Path | None = None
+    reader: str | None = None
+    options: dict[str, Any] = {}
+
+
+class PartConfig(Section):
+    """A detector, back-end or loop closer by name, and its options."""
+
+    name: str
+    options: dict[str, Any] = {}
+
+
+class Config(Section):
+    """Everything that determines a run."""
+
+    dataset: DatasetConfig = DatasetConfig()
+    detector: PartConfig = PartConfig(name="shi_tomasi")
+    backend: PartConfig = PartConfig(name="msckf")
+    loop_closure: PartConfig | None = Field(default=None, description="loop closer (name, options); null: none")
+    frontend: dict[str, Any] = {}
+    ground_truth: Path | None = Field(default=None, description="trajectory file (TUM, or EuRoC csv) to compare with")
+    start_s: float = Field(default=0.0, ge=0.0, allow_inf_nan=False, description="seconds skipped at the start")
+    duration_s: float | None = Field(default=None, gt=0.0, allow_inf_nan=False, description="null: run to the end")
+
+    @property
+    def frontend_options(self) -> FrontendOptions:
+        return FrontendOptions(**validate_options("the front-end", FrontendOptions, self.frontend))
+
+
+def read(path: str | Path) -> Config:
+    """Read a configuration file; raises :class:`ConfigError` naming the key that is wrong."""
+    return parse(read_tree(path), str(path))
+
+
+def read_tree(path: str | Path) -> dict[str, Any]:
+    """The keys and values of a YAML file; raises :class:`ConfigError` where it holds none."""
+    try:
+        tree = YAML(typ="safe", pure=True).load(Path(path).read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"cannot read the configuration {path}: {error}") from error
+    except YAMLError as error:
+        raise ConfigError(f"{path} is not valid YAML: {' '.join(str(error).split())}") from error
+    if not isinstance(tree, dict | None):
+        raise ConfigError(f"{path} must hold keys and values; `vioframe config` prints an example")
+    return tree or {}
+
+
+def parse(tree: Mapping[str, Any], origin: str = "configuration") -> Config:
+    """Validate a tree of plain values; ``origin`` names it in errors."""
+    return validate(Config, tree, origin)
+
+
+def validate(model: type[SectionT], tree: Mapping[str, Any], origin: str) -> SectionT:
+    """``tree`` as a ``model``; raises :class:`ConfigError` naming the key that is wrong, and ``origin``."""
+    try:
+        return model.model_validate(tree)
+    except ValidationError as error:
+        # A misspelt key first: what is missing because of it is found when that is put right.
+        first = min(error.errors(), key=lambda one: one["type"] != "extra_forbidden")
+        where = ".".join(map(str, first["loc"]))
+        if first["type"] == "extra_forbidden":
+            known = _keys_beside(model, first["loc"])
+            hint = did_you_mean(str(first["loc"][-1]), known)
+            raise ConfigError(f"{origin}: unknown key {where!r}{hint}; keys here: {', '.join(known)}") from error
+        problem = first["msg"].removeprefix("Value error, ")
+        if not first["loc"]:  # values that do not go together
+            raise ConfigError(f"{origin}: {problem}") from error
+        raise ConfigError(f"{origin}: {where}: {problem}, got {first['input']!r}") from error
+
+
+def to_yaml(section: Section) -> str:
+    """``section`` as YAML without comments, its keys in the order of their definition."""
+    yaml, stream = YAML(typ="safe", pure=True), StringIO()
+    yaml.default_flow_style, yaml.width, yaml.sort_base_mapping_type_on_output = False, 110, False  # type: ignore[assignment]
+    yaml.dump(to_jsonable_python(section.model_dump()), stream)
+    return stream.getvalue()
+
+
+def override(config: Config, registry: Registry, assignments: Iterable[str]) -> Config:
+    """``config`` with options set from ``key=value`` texts, as the command line's ``-o`` gives them.
+
+    A key is qualified (``backend.max_clones``) or bare, which goes to the one part that has such an option.
+    """
+    options = _options_by_section(config, registry)
+    tree = config.model_dump()
+    for section, name, value in parse_assignments(assignments, options):
+        values = tree[section] if section == "frontend" else tree[section]["options"]
+        values[name] = value
+    return parse(tree)
+
+
+def parse_assignments(
+    assignments: Iterable[str], options: Mapping[str, list[Option]]
+) -> Iterator[tuple[str, str, Any]]:
+    """Section, option and value of each ``key=value``, for the ``options`` by section; see :func:`override`."""
+    for assignment in assignments:
+        key, equals, text = assignment.partition("=")
+        if not key or not equals:
+            raise ConfigError(f"-o takes key=value, got {assignment!r}")
+        section, option = _find_option(key.strip(), options)
+        yield section, option.name, _parse_value(option, text.strip())
+
+
+def parse_part(spec: str, kind: Kind, registry: Registry) -> PartConfig:
+    """The part that ``NAME`` or ``NAME:KEY=VALUE,...`` asks for; a value may be a list, as in ``lengths_m=[8,16]``.
+
+    Raises :class:`PluginError` where there is no such part; its options are checked where it is created.
+    """
+    name, _, own = spec.partition(":")
+    known = {option.name: option for option in registry.find(kind, name).options}
+    options: dict[str, Any] = {}
+    # Commas within brackets belong to a value.
+    for assignment in re.split(r",(?![^\[]*\])", own) if own else []:
+        key, equals, text = (word.strip() for word in assignment.partition("="))
+        if not key or not equals:
+            raise ConfigError(f"{spec!r}: options are given as {name}:KEY=VALUE,..., got {assignment!r}")
+        options[key] = _parse_value(known[key], text) if key in known else text
+    return PartConfig(name=name, options=options)
+
+
+def complete(config: Config, registry: Registry) -> Config:
+    """``config`` with every option of every part checked, coerced and its default filled in."""
+    parts: dict[str, Any] = {
+        "detector": PartConfig(
+            name=config.detector.name,
+            options=registry.find(DETECTOR, config.detector.name).validate(config.detector.options),
+        ),
+        "backend": PartConfig(
+            name=config.backend.name,
+            options=registry.find(BACKEND, config.backend.name).validate(config.backend.options),
+        ),
+        "frontend": validate_options("the front-end", FrontendOptions, config.frontend),
+    }
+    if config.loop_closure is not None:
+        parts["loop_closure"] = PartConfig(
+            name=config.loop_closure.name,
+            options=registry.find(LOOP_CLOSER, config.loop_closure.name).validate(config.loop_closure.options),
+        )
+    FrontendOptions(**parts["frontend"])  # raises on a value out of range
+    if config.dataset.path is not None:
+        reader = registry.find_reader(config.dataset.path, config.dataset.reader)
+        parts["dataset"] = DatasetConfig(
+            path=config.dataset.path.absolute(),
+            reader=reader.name,
+            options=reader.validate(config.dataset.options),
+        )
+    if config.ground_truth is not None:
+        parts["ground_truth"] = config.ground_truth.absolute()
+    return config.model_copy(update=parts)
+
+
+def render(config: Config, registry: Registry) -> str:
+    """``config`` as YAML, each option with its help as a comment; :func:`read` returns the same configuration."""
+    options = _options_by_section(config, registry)
+    dataset, lines = config.dataset, ["# A vioframe configuration: use it with `vioframe run --config FILE`."]
+    lines += ["dataset:", *_entry("path", dataset.path, "bag or folder to read", 1)]
+    lines += _entry("reader", dataset.reader, "null: the one that accepts the path", 1)
+    lines += _options("options", dataset.options, options.get("dataset", []), 1)
+    for section in ("detector", "backend", "loop_closure"):
+        part = getattr(config, section)
+        if part is None:
+            lines += _entry(section, None, Config.model_fields[section].description or "", 0)
+            continue
+        lines += [f"{section}:", *_entry("name", part.name, "", 1)]
+        lines += _options("options", part.options, options[section], 1)
+    lines += _options("frontend", config.frontend, options["frontend"], 0)
+    for name in ("ground_truth", "start_s", "duration_s"):
+        lines += _entry(name, getattr(config, name), Config.model_fields[name].description or "", 0)
+    return "\n".join(lines) + "\n"
+
+
+def _options_by_section(config: Config, registry: Registry) -> dict[str, list[Option]]:
+    sections = {
+        "detector": registry.find(DETECTOR, config.detector.name).options,
+        "backend": registry.find(BACKEND, config.backend.name).options,
+        "frontend": options_of(FrontendOptions),
+    }
+    if config.loop_closure is not None:
+        sections["loop_closure"] = registry.find(LOOP_CLOSER, config.loop_closure.name).options
+    if config.dataset.path is not None:
+        sections["dataset"] = registry.find_reader(config.dataset.path, config.dataset.reader).options
+    return sections
+
+
+def _find_option(key: str, sections: Mapping[str, list[Option]]) -> tuple[str, Option]:
+    """The section and the option that ``key`` means; raises :class:`ConfigError` where it is none or several."""
+    every = {
+        f"{section}.{option.name}": (section, option) for section, options in sections.items() for option in options
+    }
+    if key in every:
+        return every[key]
+    matches = [full for full, (_, option) in every.items() if option.name == key]
+    if len(matches) == 1:
+        return every[matches[0]]
+    if matches:
+        raise ConfigError(f"-o {key} is ambiguous: write one of {', '.join(matches)}")
+    section, dot, _ = key.partition(".")
+    if dot and section not in sections:
+        hint = did_you_mean(section, sections)
+        raise ConfigError(f"-o {key}: there is no section {section!r}{hint}; sections: {', '.join(sections)}")
+    candidates = every if dot else {option.name for _, option in every.values()}
+    hint = did_you_mean(key, candidates) or f"; options: {', '.join(every)}"
+    raise ConfigError(f"-o {key}: no part has such an option{hint}")
+
+
+def _parse_value(option: Option, text: str) -> Any:
+    """``text`` as YAML where that suits the option (numbers, null, lists), else as it is.
+
+    Where neither suits it is as YAML, which says better what is wrong with it.
+    """
+    try:
+        parsed = YAML(typ="safe", pure=True).load(text)
+    except YAMLError:
+        return text
+    for value in (parsed, text):
+        try:
+            option.coerce(value)
+        except ValidationError:
+            continue
+        return value
+    return parsed
+
+
+def _keys_beside(model: Any, location: tuple[int | str, ...]) -> list[str]:
+    for key in location[:-1]:
+        model = model.model_fields[key].annotation
+    return list(model.model_fields)
+
+
+def _options(title: str, values: Mapping[str, Any], options: list[Option], depth: int) -> list[str]:
+    if not values:
+        return [f"{'  ' * depth}{title}: {{}}"]
+    docs = {option.name: option.doc for option in options}
+    lines = [f"{'  ' * depth}{title}:"]
+    for name, value in values.items():
+        lines += _entry(name, value, docs.get(name, ""), depth + 1)
+    return lines
+
+
+def _entry(name: str, value: Any, comment: str, depth: int) -> list[str]:
+    indent = "  " * depth
+    comment_lines = textwrap.wrap(comment, 110, initial_indent=f"{indent}# ", subsequent_indent=f"{indent}# ")
+    return [*comment_lines, f"{indent}{name}: {_scalar(value)}"]
+
+
+def _scalar(value: Any) -> str:
+    yaml, stream = YAML(typ="safe", pure=True), StringIO()
+    yaml.default_flow_style, yaml.width = True, 100_000
+    yaml.dump(to_jsonable_python(value), stream)
+    return stream.getvalue().removesuffix("...\n").strip()

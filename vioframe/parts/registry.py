@@ -1,0 +1,288 @@
+"""Finds the parts: detectors, back-ends, readers and the others come in by name through ``vioframe`` entry points.
+
+pluggy finds the parts once and checks the hooks; after that the names are looked up in plain tables and the parts are
+called directly. A plug-in that cannot be loaded never takes the others down: it is skipped with a warning and listed
+with the reason.
+"""
+
+from __future__ import annotations
+
+import inspect
+import logging
+from collections.abc import Iterable, Mapping
+from dataclasses import astuple, dataclass, field
+from importlib.metadata import EntryPoint, entry_points
+from pathlib import Path
+from types import TracebackType
+from typing import Any, cast
+
+import numpy as np
+import pluggy
+
+from vioframe.errors import DatasetError, PluginError, VioframeError
+from vioframe.interfaces import Backend, Dataset, Detector, Flight, LoopCloser, Metric, Trainer, World
+from vioframe.parts import hooks as hookspecs
+from vioframe.parts.options import Option, did_you_mean, options_of, plugin_factory, validate_options
+from vioframe.types import Calibration, Float
+
+__all__ = ["KINDS", "Failure", "Kind", "Option", "Part", "Registry", "load", "options_of", "plugin_factory"]
+
+_LOG = logging.getLogger(__name__)
+
+_ABSENT = object()
+
+
+@dataclass(frozen=True, slots=True)
+class Kind:
+    """A kind of part: its hook, its interface, and how many leading arguments of a factory the framework fills in."""
+
+    name: str
+    hook: str
+    interface: type
+    given: int
+
+
+DETECTOR = Kind("detector", "vioframe_detectors", Detector, 0)
+BACKEND = Kind("backend", "vioframe_backends", Backend, 1)
+LOOP_CLOSER = Kind("loop closer", "vioframe_loop_closers", LoopCloser, 1)
+DATASET = Kind("dataset", "vioframe_datasets", Dataset, 1)
+FLIGHT = Kind("flight", "vioframe_flights", Flight, 2)
+WORLD = Kind("world", "vioframe_worlds", World, 2)
+METRIC = Kind("metric", "vioframe_metrics", Metric, 0)
+TRAINER = Kind("trainer", "vioframe_trainers", Trainer, 1)
+KINDS = (DETECTOR, BACKEND, LOOP_CLOSER, DATASET, FLIGHT, WORLD, METRIC, TRAINER)
+
+
+@dataclass(frozen=True, slots=True)
+class Source:
+    """Where a plug-in comes from: its entry point and the distribution that declares it."""
+
+    entry_point: str
+    module: str
+    distribution: str
+    version: str
+
+    def __str__(self) -> str:
+        return f"{self.distribution} {self.version}"
+
+
+@dataclass(frozen=True, slots=True)
+class Part:
+    """A named part, and where it comes from."""
+
+    kind: Kind
+    name: str
+    factory: Any
+    source: Source
+
+    def __str__(self) -> str:
+        return f"{self.kind.name} {self.name!r} ({self.source})"
+
+    @property
+    def options(self) -> list[Option]:
+        return options_of(self.factory, self.kind.given)
+
+    def validate(self, options: Mapping[str, Any]) -> dict[str, Any]:
+        """``options`` checked, coerced and completed with the defaults."""
+        return validate_options(f"{self.kind.name} {self.name!r}", self.factory, options, self.kind.given)
+
+    def create(self, *given: Any, options: Mapping[str, Any]) -> Any:
+        """Build the part; raises :class:`PluginError` where its factory fails or makes something else."""
+        complete = self.validate(options)
+        try:
+            part = self.factory(*given, **complete)
+        except VioframeError:
+            raise
+        except Exception as error:
+            raise PluginError(f"{self} could not be created: {describe(error)}") from error
+        missing = [
+            name
+            for name in vars(self.kind.interface)
+            # Statically: looking at a property of a data set would already read from it.
+            if not name.startswith("_") and inspect.getattr_static(part, name, _ABSENT) is _ABSENT
+        ]
+        if missing:
+            raise PluginError(f"{self} made a {type(part).__name__}, which has no {', '.join(missing)}")
+        return part
+
+
+@dataclass(frozen=True, slots=True)
+class Failure:
+    """A plug-in that was skipped, and why."""
+
+    source: Source
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
+class Registry:
+    """The tables of all installed parts, by kind and name, and the plug-ins that failed to load."""
+
+    parts: Mapping[str, Mapping[str, Part]] = field(default_factory=dict)
+    failures: tuple[Failure, ...] = ()
+
+    def names(self, kind: Kind) -> list[str]:
+        return sorted(self.parts.get(kind.name, {}))
+
+    def find(self, kind: Kind, name: str) -> Part:
+        """The part of that name; raises :class:`PluginError` listing what is installed."""
+        table = self.parts.get(kind.name, {})
+        if name in table:
+            return table[name]
+        raise PluginError(
+            f"no {kind.name} is called {name!r}{did_you_mean(name, table)}; "
+            f"installed: {', '.join(sorted(table)) or 'none'}{self._failure_hint()}"
+        )
+
+    def create_detector(self, name: str, options: Mapping[str, Any] | None = None) -> Detector:
+        return cast(Detector, self.find(DETECTOR, name).create(options=options or {}))
+
+    def create_backend(self, name: str, calibration: Calibration, options: Mapping[str, Any] | None = None) -> Backend:
+        return cast(Backend, self.find(BACKEND, name).create(calibration, options=options or {}))
+
+    def create_loop_closer(
+        self, name: str, calibration: Calibration, options: Mapping[str, Any] | None = None
+    ) -> LoopCloser:
+        return cast(LoopCloser, self.find(LOOP_CLOSER, name).create(calibration, options=options or {}))
+
+    def create_flight(
+        self, name: str, duration_s: float, R_LB: Float, options: Mapping[str, Any] | None = None
+    ) -> Flight:
+        return cast(Flight, self.find(FLIGHT, name).create(duration_s, R_LB, options=options or {}))
+
+    def create_world(
+        self, name: str, p_WB: Float, rng: np.random.Generator, options: Mapping[str, Any] | None = None
+    ) -> World:
+        return cast(World, self.find(WORLD, name).create(p_WB, rng, options=options or {}))
+
+    def create_metric(self, name: str, options: Mapping[str, Any] | None = None) -> Metric:
+        return cast(Metric, self.find(METRIC, name).create(options=options or {}))
+
+    def open_dataset(
+        self, path: str | Path, reader: str | None = None, options: Mapping[str, Any] | None = None
+    ) -> Dataset:
+        """Open the recording at ``path`` with the reader of that name, or with the one that accepts it."""
+        part = self.find_reader(path, reader)
+        return cast(Dataset, part.create(Path(path), options=options or {}))
+
+    def find_reader(self, path: str | Path, reader: str | None = None) -> Part:
+        """The reader to open ``path`` with; raises :class:`DatasetError` saying what is wrong with the path."""
+        path = Path(path)
+        if not path.exists():
+            raise DatasetError(f"{path} does not exist")
+        if reader is not None:
+            return self.find(DATASET, reader)
+        accepting = [part for part in self.parts.get(DATASET.name, {}).values() if _accepts(part, path)]
+        if len(accepting) == 1:
+            return accepting[0]
+        if accepting:
+            names = ", ".join(sorted(part.name for part in accepting))
+            raise DatasetError(f"several readers accept {path}: {names}; choose one with --reader")
+        readers = ", ".join(self.names(DATASET)) or "none"
+        raise DatasetError(f"{path} {_what_is_wrong(path)}; readers: {readers}{self._failure_hint()}")
+
+    def blame(self, trace: TracebackType | None) -> Source | None:
+        """The plug-in in whose code an exception was last under way, or None where no plug-in was involved."""
+        modules = {part.source.module: part.source for table in self.parts.values() for part in table.values()}
+        culprit = None
+        while trace is not None:
+            name = str(trace.tb_frame.f_globals.get("__name__", ""))
+            culprit = next((s for m, s in modules.items() if name == m or name.startswith(f"{m}.")), culprit)
+            trace = trace.tb_next
+        return culprit
+
+    def _failure_hint(self) -> str:
+        if not self.failures:
+            return ""
+        broken = ", ".join(sorted(failure.source.entry_point for failure in self.failures))
+        return f" (failed to load: {broken}; `vioframe plugins` says why)"
+
+
+def load(found: Iterable[EntryPoint] | None = None) -> Registry:
+    """Load every plug-in of the ``vioframe`` entry-point group.
+
+    Raises :class:`PluginError` where two plug-ins give the same name to parts of one kind.
+    """
+    manager = pluggy.PluginManager(hookspecs.PROJECT)
+    manager.add_hookspecs(hookspecs)
+    parts: dict[str, dict[str, Part]] = {kind.name: {} for kind in KINDS}
+    failures = []
+    chosen = entry_points(group=hookspecs.PROJECT) if found is None else found
+    # One at a time: pluggy's own loader gives up on all of them at the first ImportError.
+    for source, entry in sorted(((_source(entry), entry) for entry in chosen), key=lambda pair: astuple(pair[0])):
+        try:
+            new = _parts_of(manager, source, entry.load())
+        except Exception as error:
+            failures.append(Failure(source, describe(error)))
+            _LOG.warning("plug-in %s (%s) is skipped: %s", source.entry_point, source, failures[-1].reason)
+            continue
+        for part in new:
+            other = parts[part.kind.name].setdefault(part.name, part)
+            if other is not part:
+                raise PluginError(
+                    f"two plug-ins provide a {part.kind.name} called {part.name!r}: {other.source.entry_point} of "
+                    f"{other.source} and {source.entry_point} of {source}; uninstall one of them"
+                )
+    return Registry(parts, tuple(failures))
+
+
+def describe(error: BaseException) -> str:
+    """An exception in one line."""
+    return " ".join(f"{type(error).__name__}: {error}".split())
+
+
+def _parts_of(manager: pluggy.PluginManager, source: Source, plugin: Any) -> list[Part]:
+    """Register one plug-in and ask its hooks for its parts; raises :class:`PluginError` where it is not in order."""
+    identity = f"{source.distribution}:{source.entry_point}"
+    manager.register(plugin, identity)
+    try:
+        manager.check_pending()
+        hooks = [caller.name for caller in manager.get_hookcallers(plugin) or []]
+        if not hooks:
+            raise PluginError("it implements no hook; decorate its functions with @vioframe.parts.hooks.hookimpl")
+        return [
+            Part(kind, name, _checked(kind, name, factory), source)
+            for kind in KINDS
+            if kind.hook in hooks
+            for name, factory in getattr(plugin, kind.hook)().items()
+        ]
+    except pluggy.PluginValidationError as error:
+        known = [kind.hook for kind in KINDS]
+        unknown = next(n for n in dir(plugin) if manager.parse_hookimpl_opts(plugin, n) and n not in known)
+        hint = did_you_mean(unknown, known)
+        raise PluginError(f"there is no hook {unknown!r}{hint}; hooks: {', '.join(known)}") from error
+    finally:
+        # What it offers is known now; a broken one must not trip the check of the next.
+        manager.unregister(name=identity)
+
+
+def _checked(kind: Kind, name: object, factory: Any) -> Any:
+    if not isinstance(name, str) or not name or not callable(factory):
+        raise PluginError(f"{kind.hook} must map names to callables, got {name!r}: {factory!r}")
+    if kind is DATASET and not callable(getattr(factory, "accepts", None)):
+        raise PluginError(f"the reader {name!r} has no accepts(path)")
+    inspect.signature(factory)  # raises ValueError for the few callables that have none, hence no options to read
+    return factory
+
+
+def _source(entry: EntryPoint) -> Source:
+    name, version = (entry.dist.name, entry.dist.version) if entry.dist else ("unknown", "?")
+    return Source(entry.name, entry.module, name, version)
+
+
+def _accepts(part: Part, path: Path) -> bool:
+    try:
+        return bool(part.factory.accepts(path))
+    except Exception as error:
+        _LOG.warning("%s failed to look at %s: %s", part, path, describe(error))
+        return False
+
+
+def _what_is_wrong(path: Path) -> str:
+    if path.is_dir():
+        if not any(path.iterdir()):
+            return "is an empty folder"
+        return "is a folder without mav0/ (an ASL data set) or metadata.yaml (a ROS 2 bag)"
+    if path.stat().st_size == 0:
+        return "is an empty file"
+    return f"is not a recording any reader knows (its extension is {path.suffix or 'missing'!r})"

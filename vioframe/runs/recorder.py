@@ -1,0 +1,244 @@
+"""The run folder: everything about a run, in plain files that say it all. Evaluation and reports read nothing else.
+
+    trajectory.tum   pose of the body at every tracked frame       config.yaml      the complete configuration
+    states.csv       velocity, biases, covariance diagonal         machine.json     versions, revision, cpu, threads
+    pose_cov.csv     pose covariance, upper triangle               summary.json     how the run went
+    tracks.csv       every feature observation                     ground_truth.tum where there is one
+    timings.csv      seconds, a column a stage                     map.ply          landmarks, written at the end
+    calibration/     as it was given, in EuRoC's format
+    trajectory_loop.tum, loops.csv  poses corrected by loop closure, and the loops, where a run has it
+
+Each frame is flushed as it comes, so an interrupted run leaves what it had, with ``finished: false`` in its summary.
+All but the timings, the machine and the summary's clock-dependent figures are the same byte for byte in every run.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections import Counter
+from collections.abc import Mapping
+from itertools import count, pairwise
+from pathlib import Path
+from time import perf_counter
+from types import TracebackType
+from typing import Any, Self, TextIO
+
+import numpy as np
+
+from vioframe.errors import PluginError, RunError
+from vioframe.incidents import Incidents
+from vioframe.io.trajectories import tum_line, write_tum
+from vioframe.types import NS_PER_S, Float, LoopClosure, NavState, Status, Step
+
+STATE_COLUMNS = (
+    "t_ns",
+    *(f"{name}_{axis}" for name in ("v", "bg", "ba") for axis in "xyz"),
+    *(f"cov_{i}" for i in range(15)),
+)
+POSE_COV_COLUMNS = ("t_ns", *(f"c{i}{j}" for i in range(6) for j in range(i, 6)))
+LOOP_COLUMNS = ("earlier_t_ns", "later_t_ns", "x_m", "y_m", "z_m", "yaw_rad", "inliers", "accepted")
+_UPPER = np.triu_indices(6)
+
+
+def check_run_folder(path: Path, *, overwrite: bool = False, marker: str = "summary.json") -> None:
+    """Raise :class:`RunError` where no run may be written to ``path``: only a run is ever replaced, and on request.
+
+    ``marker`` is the file by which a folder of that kind is known.
+    """
+    if not path.exists() or (path.is_dir() and not any(path.iterdir())):
+        return
+    if not overwrite:
+        raise RunError(f"{path} exists already; choose another --out or pass --overwrite")
+    if not (path / marker).is_file():
+        raise RunError(f"{path} holds no {marker}, is not a run folder and is not overwritten; choose another --out")
+
+
+def new_run_folder(path: Path, *, overwrite: bool = False, marker: str = "summary.json") -> None:
+    """Create the folder ``path``, in place of the run that is there if ``overwrite``."""
+    check_run_folder(path, overwrite=overwrite, marker=marker)
+    try:
+        if path.exists():
+            shutil.rmtree(path)
+        path.mkdir(parents=True)
+    except OSError as error:
+        raise RunError(f"cannot create the run folder {path}: {error.strerror}") from error
+
+
+def free_run_folder(parent: Path, name: str) -> Path:
+    """``parent/name``, or with the first free number after it."""
+    candidates = (parent / (name if i == 1 else f"{name}_{i}") for i in count(1))
+    return next(path for path in candidates if not path.exists())
+
+
+class Recorder:
+    """Writes one run, step by step; a context manager that completes the folder however the run ends.
+
+    ``about`` opens the summary, ``incidents`` close it. Wall-clock time counts from ``begin_s`` of ``perf_counter``.
+    """
+
+    def __init__(self, folder: Path, about: Mapping[str, Any], incidents: Incidents, begin_s: float) -> None:
+        self.folder = folder
+        self._incidents = incidents
+        self._begin_s = begin_s
+        self.summary: dict[str, Any] = {**about, "finished": False}
+        self._write_summary()
+        self._files: dict[str, TextIO] = {}
+        self._append("trajectory.tum", "# timestamp tx ty tz qx qy qz qw\n")
+        self._append("states.csv", ",".join(STATE_COLUMNS) + "\n")
+        self._append("pose_cov.csv", ",".join(POSE_COV_COLUMNS) + "\n")
+        self._append("tracks.csv", "t_ns,id,x_px,y_px\n")
+        self._stages: list[str] = []
+        self._timings: list[tuple[int, Mapping[str, float]]] = []
+        self._landmarks: dict[int, Float] = {}
+        self._statuses: list[Status] = []
+        self._segments: list[dict[str, int]] = []
+        self._events: list[dict[str, Any]] = []
+        self._stage_totals: Counter[str] = Counter()
+        self._frame_seconds = 0.0
+        self._points = 0
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        for file in self._files.values():
+            file.close()
+        write_ply(self.folder / "map.ply", self._landmarks)
+        self.summary |= {
+            **self._figures(),
+            "events": self._events,
+            "incidents": dict(sorted(self._incidents.counts.items())),
+            "incident_notes": self._incidents.notes,
+        }
+        if error is not None:
+            self.summary["stopped_by"] = " ".join(f"{type(error).__name__}: {error}".split())
+        self.summary["finished"] = error is None
+        self._write_summary()
+
+    def add(self, step: Step) -> None:
+        """Write one frame; raises :class:`PluginError` where the back-end's state is not finite."""
+        t_ns, estimate = step.frame.t_ns, step.estimate
+        observations = zip(step.tracks.ids, step.tracks.xy.tolist(), strict=True)
+        self._append("tracks.csv", "".join(f"{t_ns},{i},{x:.3f},{y:.3f}\n" for i, (x, y) in observations))
+        self._points += len(step.tracks.ids)
+        self._add_timings(t_ns, step.stage_seconds)
+        self._frame_seconds += sum(seconds for stage, seconds in step.stage_seconds.items() if "." not in stage)
+        self._events += [{"t_ns": t_ns, "event": event} for event in estimate.events]
+        tracked_before = bool(self._statuses) and self._statuses[-1] is Status.TRACKING
+        if tracked_before and estimate.status is not Status.TRACKING:
+            self._landmarks.clear()  # a new start is a new world: old landmarks do not belong to it
+        self._statuses.append(estimate.status)
+        if estimate.status is Status.TRACKING and estimate.state is not None:
+            if not (tracked_before and self._segments):
+                self._segments.append({"first_t_ns": t_ns, "last_t_ns": t_ns, "poses": 0})
+            self._segments[-1]["last_t_ns"] = t_ns
+            self._segments[-1]["poses"] += 1
+            self._add_state(t_ns, estimate.state)
+            self._landmarks.update(zip(estimate.landmark_ids.tolist(), estimate.p_WF, strict=True))
+
+    def add_loop_closure(self, result: LoopClosure) -> None:
+        """Write what a loop closer made of the run."""
+        if result.trajectory is not None:
+            write_tum(result.trajectory, self.folder / "trajectory_loop.tum")
+        self._append("loops.csv", ",".join(LOOP_COLUMNS) + "\n")
+        for loop in result.loops:
+            pose = ",".join(f"{x:.9g}" for x in (*loop.p_L, loop.yaw))
+            row = f"{loop.earlier_t_ns},{loop.later_t_ns},{pose},{loop.inliers},{int(loop.accepted)}\n"
+            self._append("loops.csv", row)
+        accepted = sum(loop.accepted for loop in result.loops)
+        self.summary["loop_closure"] = {
+            "keyframes": len(result.keyframe_t_ns),
+            "loops": accepted,
+            "rejected": len(result.loops) - accepted,
+            "seconds_beside": dict(result.stage_seconds),
+        }
+
+    def _add_state(self, t_ns: int, state: NavState) -> None:
+        cov = np.full((15, 15), np.nan) if state.cov is None else state.cov
+        values = np.concatenate([state.v_WB, state.bias_gyro_B, state.bias_accel_B])
+        if not all(np.isfinite(array).all() for array in (state.R_WB, state.p_WB, values)):
+            raise PluginError(f"the back-end's state at {t_ns} ns is not finite")
+        self._append("trajectory.tum", tum_line(t_ns, state.R_WB, state.p_WB))
+        self._append("states.csv", _csv_line(t_ns, np.concatenate([values, np.diag(cov)])))
+        self._append("pose_cov.csv", _csv_line(t_ns, cov[:6, :6][_UPPER]))
+
+    def _add_timings(self, t_ns: int, stage_seconds: Mapping[str, float]) -> None:
+        self._timings.append((t_ns, stage_seconds))
+        self._stage_totals.update(stage_seconds)
+        new = [stage for stage in stage_seconds if stage not in self._stages]
+        if new:
+            # A stage seen for the first time is a new column for every row: the file starts anew.
+            self._stages += new
+            if file := self._files.pop("timings.csv", None):
+                file.close()
+            self._append("timings.csv", ",".join(["t_ns", *self._stages]) + "\n")
+            rows = self._timings
+        else:
+            rows = self._timings[-1:]
+        self._append("timings.csv", "".join(self._timing_line(*row) for row in rows))
+
+    def _timing_line(self, t_ns: int, stage_seconds: Mapping[str, float]) -> str:
+        return ",".join([str(t_ns), *(f"{stage_seconds.get(stage, 0.0):.6f}" for stage in self._stages)]) + "\n"
+
+    def _append(self, name: str, text: str) -> None:
+        file = self._files.get(name)
+        if file is None:
+            file = self._files[name] = (self.folder / name).open("w", encoding="utf-8", newline="\n")
+        file.write(text)
+        file.flush()
+
+    def _figures(self) -> dict[str, Any]:
+        frames = len(self._statuses)
+        if frames == 0:
+            return {"frames": 0}
+        stamps = [t_ns for t_ns, _ in self._timings]
+        tracking = [status is Status.TRACKING for status in self._statuses]
+        wall_s = perf_counter() - self._begin_s
+        begin = tracking.index(True) if any(tracking) else None
+        return {
+            "frames": frames,
+            "first_frame_t_ns": stamps[0],
+            "last_frame_t_ns": stamps[-1],
+            "initialised_t_ns": None if begin is None else stamps[begin],
+            "initialised_after_s": None if begin is None else (stamps[begin] - stamps[0]) / NS_PER_S,
+            "completion": 0.0 if begin is None else sum(tracking[begin:]) / (frames - begin),
+            "resets": sum(before and not now for before, now in pairwise(tracking)),
+            "segments": self._segments,
+            "tracked_points_mean": self._points / frames,
+            "mean_ms": {stage: 1e3 * self._stage_totals[stage] / frames for stage in self._stages},
+            "mean_frame_ms": 1e3 * self._frame_seconds / frames,
+            "wall_s": wall_s,
+            "real_time_factor": (stamps[-1] - stamps[0]) / NS_PER_S / wall_s,
+        }
+
+    def _write_summary(self) -> None:
+        write_json(self.folder / "summary.json", self.summary)
+
+
+def write_json(path: Path, tree: Mapping[str, Any]) -> None:
+    """Replace ``path`` as a whole."""
+    write_whole(path, json.dumps(tree, indent=2, default=str) + "\n")
+
+
+def write_whole(path: Path, text: str) -> None:
+    """Replace ``path`` as a whole, so that a reader never sees half of it."""
+    partial = path.with_suffix(".partial")
+    partial.write_text(text, encoding="utf-8")
+    partial.replace(path)
+
+
+def write_ply(path: Path, landmarks: Mapping[int, Float]) -> None:
+    """Landmarks ``p_WF`` (3,) m by id as an ASCII PLY point cloud with an ``id`` property, in order of id."""
+    header = (
+        f"ply\nformat ascii 1.0\nelement vertex {len(landmarks)}\n"
+        "property float x\nproperty float y\nproperty float z\nproperty int id\nend_header\n"
+    )
+    rows = (f"{p[0]:.6f} {p[1]:.6f} {p[2]:.6f} {i}\n" for i, p in sorted(landmarks.items()))
+    path.write_text(header + "".join(rows), encoding="utf-8")
+
+
+def _csv_line(t_ns: int, values: Float) -> str:
+    return f"{t_ns}," + ",".join(f"{value:.9g}" for value in values) + "\n"
