@@ -42,7 +42,7 @@ def write_calibration(calibration: Calibration, folder: Path) -> None:
         f"resolution: {list(camera.resolution)}",
         "camera_model: pinhole",
         f"intrinsics: {_list([camera.fx, camera.fy, camera.cx, camera.cy])}  # fu, fv, cu, cv",
-        f"distortion_model: {'radial-tangential' if camera.model == 'radtan' else camera.model}",
+        f"distortion_model: {'radial-tangential' if camera.distortion_model == 'radtan' else camera.distortion_model}",
         f"distortion_coefficients: {_list(camera.distortion)}",
         f"timeshift_cam_imu: {calibration.time_offset_ns / NS_PER_S!r}  # [s] t_imu = t_cam + shift",
     )
