@@ -163,15 +163,16 @@ class ImuNoise:
 class CameraOnBody:
     """A camera and how it sits on the body: ``p_B = R_BC @ p_C + p_BC`` and ``t_imu = t_cam + time_offset_ns``.
 
-    ``R_BC`` (3, 3) is None where nobody knows how the camera is turned: it is then found while initialising. ``name``
-    is that of its folder or topic, such as ``cam0``.
+    Where nobody knows how the camera is turned, ``rotation_known`` is False and ``R_BC`` (3, 3) means nothing: it is then
+    found while initialising. ``name`` is that of its folder or topic, such as ``cam0``.
     """
 
     name: str
     model: Camera
-    R_BC: Float | None
+    R_BC: Float
     p_BC: Float
     time_offset_ns: int = 0
+    rotation_known: bool = True
 
 
 @dataclass(frozen=True, slots=True)
@@ -255,6 +256,7 @@ class Estimate:
     ``landmark_ids`` (M,) and ``p_WF`` (M, 3) m are the landmarks estimated or refined at this frame. ``events`` are
     one-line notes worth keeping (an initialisation refused and why, a reset); ``stage_seconds`` is the back-end's own
     breakdown of its time. ``calibration`` is what it has learned of the rig, None where it learns nothing.
+    ``corrected`` says whether what was seen had a part in it, or the readings alone led here.
     """
 
     status: Status
@@ -262,6 +264,7 @@ class Estimate:
     landmark_ids: Int = field(default_factory=_no_ids)
     p_WF: Float = field(default_factory=_no_points)
     is_keyframe: bool = False
+    corrected: bool = True
     calibration: CalibrationEstimate | None = None
     events: tuple[str, ...] = ()
     stage_seconds: Mapping[str, float] = field(default_factory=dict)
