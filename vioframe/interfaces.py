@@ -18,6 +18,7 @@ from vioframe.types import (
     Measurement,
     Mesh,
     Motion,
+    Start,
     Step,
     TrainingStep,
 )
@@ -25,7 +26,6 @@ from vioframe.types import (
 if TYPE_CHECKING:
     from vioframe.evaluation import Comparison
     from vioframe.geometry.trajectory import Trajectory
-    from vioframe.types import Mesh, Motion
 
 
 @runtime_checkable
@@ -39,10 +39,22 @@ class Detector(Protocol):
 
 @runtime_checkable
 class Backend(Protocol):
-    """Estimates motion from inertial segments and feature tracks, one frame at a time."""
+    """Estimates motion from inertial segments and feature tracks, one frame at a time.
 
-    def process(self, imu: ImuSegment, tracks: FrameTracks) -> Estimate:
-        """Take the readings since the last frame and the tracks of this one; say what is known now."""
+    Its life is the core's (:mod:`vioframe.estimation.lifecycle`): when it begins, is lost and begins anew.
+    """
+
+    def begin(self, start: Start) -> None:
+        """Forget all that was before, and begin at ``start``."""
+        ...
+
+    def process(self, imu: ImuSegment, tracks: FrameTracks, still: bool) -> Estimate:
+        """Take the readings since the last frame and the tracks of this one; say what is known now.
+
+        ``still`` says that the images show a body at rest; the readings may yet contradict it. Raises
+        :class:`~vioframe.errors.DivergedError`, saying why, where the estimate can no longer be believed: it is begun
+        anew then.
+        """
         ...
 
 

@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vioframe.arrays import Float, Image, Int
-from vioframe.errors import CalibrationError
+from vioframe.arrays import Bool, Float, Image, Int
+from vioframe.errors import CalibrationError, ConfigError
 from vioframe.geometry.cameras import Camera
 from vioframe.geometry.trajectory import Trajectory
 
@@ -163,7 +163,7 @@ class ImuNoise:
 class CameraOnBody:
     """A camera and how it sits on the body: ``p_B = R_BC @ p_C + p_BC`` and ``t_imu = t_cam + time_offset_ns``.
 
-    Where nobody knows how the camera is turned, ``rotation_known`` is False and ``R_BC`` (3, 3) means nothing: it is then
+    Where nobody knows how the camera is turned, ``rotation_known`` is False and ``R_BC`` (3, 3) means nothing: it is
     found while initialising. ``name`` is that of its folder or topic, such as ``cam0``.
     """
 
@@ -186,6 +186,15 @@ class Calibration:
         names = [camera.name for camera in self.cameras]
         if not names or len(set(names)) < len(names):
             raise CalibrationError(f"a rig needs cameras with names of their own, got {names}")
+
+    def single(self, user: str) -> CameraOnBody:
+        """The only camera; raises :class:`ConfigError` naming ``user``, who takes one, where there are more."""
+        if len(self.cameras) > 1:
+            names = ", ".join(camera.name for camera in self.cameras)
+            raise ConfigError(
+                f"{user} takes one camera for now, the calibration has {names}; choose one of them"
+            )
+        return self.cameras[0]
 
     def with_camera(self, index: int, **changes: Any) -> Calibration:
         """The same rig with fields of one camera changed."""
@@ -231,6 +240,21 @@ class NavState:
     bias_gyro_B: Float
     bias_accel_B: Float
     cov: Float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Start:
+    """Where a back-end begins: ``state``, with covariance, at the frame that shows ``tracks`` and ends ``imu``.
+
+    ``calibration`` is the prior of what may be calibrated on the way; its noise is that of the IMU in flight, and
+    ``noise_at_rest`` that of a body that stands still.
+    """
+
+    state: NavState
+    calibration: CalibrationEstimate
+    noise_at_rest: ImuNoise
+    imu: ImuSegment
+    tracks: FrameTracks
 
 
 class Status(StrEnum):

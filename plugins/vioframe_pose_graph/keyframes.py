@@ -27,8 +27,8 @@ class KeyframeSelector:
     """Thins the frames of any back-end by how much the picture has moved, turning left out."""
 
     def __init__(self, calibration: Calibration, parallax_px: float) -> None:
-        self._R_BC = calibration.R_BC
-        self._parallax = parallax_px / calibration.camera.focal_px
+        self._R_BC = calibration.cameras[0].R_BC
+        self._parallax = parallax_px / calibration.cameras[0].model.focal_px
         self._pending: deque[_Pending] = deque()
         self._last: _Pending | None = None
         self._p_WF: dict[int, Float] = {}

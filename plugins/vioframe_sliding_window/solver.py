@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg.lapack import dpotrf, dpotrs
 
-from vioframe.estimation.recovery import DivergedError
+from vioframe.errors import DivergedError
 from vioframe.types import Float
 from vioframe_sliding_window.problem import Problem, Variables
 

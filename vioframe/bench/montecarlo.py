@@ -112,7 +112,7 @@ def check_montecarlo(setups: Sequence[Setup], contenders: Sequence[Contender], s
         raise ConfigError(f"needs at least one seed and one worker, got {seeds} and {workers}")
     calibration = packaged_calibration("euroc")
     for setup in setups:
-        named_flight(setup.flight, setup.duration_s, calibration.R_BC)
+        named_flight(setup.flight, setup.duration_s, calibration.cameras[0].R_BC)
     for contender in contenders:
         # Creating one also compiles its kernels, which the workers would do all at once.
         installed().create_backend(contender.backend, calibration, contender.options)

@@ -92,15 +92,15 @@ def _truth(truth: Trajectory, px: float) -> Shape:
 
 def cameras(flight: Flight, calibration: Calibration, px: float) -> Shape:
     """The edges of what the camera saw, at poses evenly along the path."""
-    estimate, camera = flight.estimate, calibration.camera
+    estimate, camera = flight.estimate, calibration.cameras[0].model
     spacing = max(estimate.path_length_m / _FRUSTA, 1.5 * _FRUSTUM * px)
     poses = estimate.select(np.unique(np.searchsorted(estimate.travelled_m, _steps(estimate.path_length_m, spacing))))
     width, height = camera.resolution
     corners_px = np.array([[0.0, 0.0], [width, 0.0], [width, height], [0.0, height]]) - 0.5
     rays_C = np.concatenate([corners_px, np.ones((4, 1))], axis=1) @ np.linalg.inv(camera.K).T
     base_C = rays_C * (_FRUSTUM * px * camera.fx / width)
-    R_WC = poses.R_WB @ calibration.R_BC
-    apex_W = poses.p_WB + poses.R_WB @ calibration.p_BC
+    R_WC = poses.R_WB @ calibration.cameras[0].R_BC
+    apex_W = poses.p_WB + poses.R_WB @ calibration.cameras[0].p_BC
     base_W = apex_W[:, None] + base_C @ R_WC.transpose(0, 2, 1)
     pale = 0.35 + 0.65 * np.array(rgb(flight.number))
     return rods(*pyramid_edges(apex_W, base_W), 0.5 * _EDGE * px, pale)

@@ -39,7 +39,7 @@ def check_loop_closer(factory: LoopCloserFactory, **options: Any) -> None:
 def _steps(sequence: TrackSequence) -> list[Step]:
     """The true poses as an estimate, lost for a while; every picture is noise of its own, so that none is alike."""
     rng = np.random.default_rng(0)
-    width, height = sequence.calibration.camera.resolution
+    width, height = sequence.calibration.cameras[0].model.resolution
     truth = sequence.ground_truth
     steps = []
     for k, (_, tracks) in enumerate(sequence.packets[::_EVERY]):
@@ -52,8 +52,8 @@ def _steps(sequence: TrackSequence) -> list[Step]:
         if k not in _LOST:
             state = NavState(tracks.t_ns, pose.R_WB[0], pose.p_WB[0], zero, zero, zero)
             ahead_C = np.column_stack([tracks.xy_normalised, np.ones(len(tracks.ids))]) * 4.0
-            R_WC = state.R_WB @ sequence.calibration.R_BC
-            p_WC = state.p_WB + state.R_WB @ sequence.calibration.p_BC
+            R_WC = state.R_WB @ sequence.calibration.cameras[0].R_BC
+            p_WC = state.p_WB + state.R_WB @ sequence.calibration.cameras[0].p_BC
             estimate = Estimate(Status.TRACKING, state, tracks.ids, ahead_C @ R_WC.T + p_WC, is_keyframe=True)
         steps.append(Step(Frame(tracks.t_ns, image), tracks, estimate, {}))
     return steps

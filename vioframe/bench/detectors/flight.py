@@ -91,7 +91,7 @@ def _fly(job: _Job) -> list[Row]:
     frontends = {
         entrant.label: Frontend(
             installed.create_detector(entrant.name, entrant.options),
-            dataset.calibration.camera,
+            dataset.calibration.cameras[0].model,
             options,
             incidents[entrant.label],
         )
@@ -101,7 +101,7 @@ def _fly(job: _Job) -> list[Row]:
     with single_threaded():
         for imu, frame in degraded(dataset, job.stretch, job.degradation, job.seed):
             for label, frontend in frontends.items():
-                steps[label].append(frontend.track(imu, frame, dataset.calibration.R_BC))
+                steps[label].append(frontend.track(imu, frame, dataset.calibration.cameras[0].R_BC))
     rows: list[Row] = [
         {
             "detector": label,
@@ -138,7 +138,7 @@ def degraded(
     """
     packets = synchronise(
         dataset.measurements(),
-        time_offset_ns=dataset.calibration.time_offset_ns,
+        time_offset_ns=dataset.calibration.cameras[0].time_offset_ns,
         start_s=stretch.start_s,
         duration_s=stretch.duration_s,
         incidents=Incidents(),
@@ -173,7 +173,7 @@ def track_figures(
         "median_life": life.median,
         "epipolar_inliers": float(np.mean(errors_px <= INLIER_PX)) if len(errors_px) else None,
         "epipolar_median_px": float(np.median(errors_px)) if len(errors_px) else None,
-        "coverage": coverage(steps, dataset.calibration.camera.resolution, grid),
+        "coverage": coverage(steps, dataset.calibration.cameras[0].model.resolution, grid),
     }
 
 

@@ -4,6 +4,5 @@ from vioframe.estimation.initialization.estimate import InitialEstimate
 from vioframe.estimation.initialization.hand_eye import CameraRotation, RotationCalibrator
 from vioframe.estimation.initialization.initializer import Initializer
 from vioframe.estimation.initialization.options import InitializationOptions
-from vioframe.estimation.initialization.starter import Starter
 
-__all__ = ["CameraRotation", "InitialEstimate", "InitializationOptions", "Initializer", "RotationCalibrator", "Starter"]
+__all__ = ["CameraRotation", "InitialEstimate", "InitializationOptions", "Initializer", "RotationCalibrator"]

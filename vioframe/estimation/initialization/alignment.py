@@ -48,7 +48,7 @@ def align(camera: Float, imu: Sequence[Preintegrated], calibration: Calibration,
     """``camera`` (K, 3) positions from the first camera in the axes of B0, in any unit; ``bias_sigma`` prior, m/s^2."""
     R = rotations(imu)
     t, p_imu, v_imu, p_by_bias, v_by_bias = _cumulate(imu, R)
-    arm = R @ calibration.p_BC
+    arm = R @ calibration.cameras[0].p_BC
     # scale camera_k = v t + g t^2 / 2 + p_imu + p_by_bias bias + arm_k - arm_0, unknown x = [v g bias scale].
     eye = np.eye(3)
     A = np.concatenate(

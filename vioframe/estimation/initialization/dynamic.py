@@ -39,7 +39,7 @@ def initialise(packets: Sequence[Packet], calibration: Calibration, options: Ini
     t_ns = np.array([tracks.t_ns for _, tracks in packets])
     held_out = int((t_ns > t_ns[-1] - options.lookahead_s * 1e9).sum())
     chosen = spread_indices(t_ns[:-held_out], options.keyframes)
-    sigma = options.pixel_sigma / calibration.camera.focal_px
+    sigma = options.pixel_sigma / calibration.cameras[0].model.focal_px
 
     window = build_window(packets, [*chosen, len(packets) - 1], _MIN_VIEWS, options.max_landmarks)
     _require(window, "tracks are long enough", options)
@@ -48,7 +48,7 @@ def initialise(packets: Sequence[Packet], calibration: Calibration, options: Ini
     R_B0B = rotations(imu)
     check_parallax(window, R_B0B, calibration, options)
 
-    window, structure = _structure(window, R_B0B @ calibration.R_BC, sigma, options)
+    window, structure = _structure(window, R_B0B @ calibration.cameras[0].R_BC, sigma, options)
     alignment = align(structure.position, imu[:-1], calibration, options.bias_accel_sigma)
     if alignment.scale <= 0.0:
         raise RefusalError("the readings contradict the direction of the motion in the images")
@@ -93,7 +93,7 @@ def _with_gyro_bias(
 ) -> tuple[Window, Float]:
     """The tracks that lie on their epipolar lines, and the gyroscope's bias (3,) that puts them there."""
     imu = _preintegrate(window, np.zeros(3), np.zeros(3), calibration)
-    bias, distance = estimate_gyro_bias(window, imu, calibration.R_BC, sigma, options.bias_gyro_sigma)
+    bias, distance = estimate_gyro_bias(window, imu, calibration.cameras[0].R_BC, sigma, options.bias_gyro_sigma)
     if np.linalg.norm(bias) > 3.0 * options.bias_gyro_sigma:
         raise RefusalError(f"gyroscope bias of {np.linalg.norm(bias):.2f} rad/s is not plausible")
     window = window.only(distance < _EPIPOLAR_LIMIT)

@@ -115,7 +115,7 @@ class RotationCalibrator:
                 f"turned by {turned:.2f} rad about a second axis, {options.min_second_turn_rad:.2f} are needed; "
                 "turn the vehicle about two axes"
             )
-        sigma = options.pixel_sigma / self._calibration.camera.focal_px
+        sigma = options.pixel_sigma / self._calibration.cameras[0].model.focal_px
         return self._judge(solve(chain, sigma, options.bias_gyro_sigma))
 
     def _judge(self, solution: Solution) -> CameraRotation:

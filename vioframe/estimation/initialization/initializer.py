@@ -20,8 +20,7 @@ _log = logging.getLogger("vioframe.estimation.initialization")
 class Initializer:
     """Tries the static method at every frame, and the dynamic one every so often, until one is sure of itself.
 
-    With ``options.unknown_camera_rotation`` both wait for the hand-eye calibration of the camera's rotation, which is
-    done once. Every attempt is logged to ``vioframe.estimation.initialization``.
+    Where the camera's rotation on the body is not known both wait for its hand-eye calibration, which is done once. Every attempt is logged to ``vioframe.estimation.initialization``.
     """
 
     def __init__(self, calibration: Calibration, options: InitializationOptions | None = None) -> None:
@@ -29,7 +28,8 @@ class Initializer:
         self._calibration = calibration
         self._in_flight = replace(calibration, imu=_inflated(calibration.imu, options.imu_noise_factor))
         self._options = options
-        self._calibrator = RotationCalibrator(calibration, options) if options.unknown_camera_rotation else None
+        known = calibration.cameras[0].rotation_known
+        self._calibrator = None if known else RotationCalibrator(calibration, options)
         self._camera_rotation: CameraRotation | None = None
         self._refusals: dict[str, str] = {}
         self._packets: list[Packet] = []
@@ -88,8 +88,8 @@ class Initializer:
             return False
         self._refusals.clear()
         self._calibrator, self._camera_rotation = None, found
-        self._calibration = replace(self._calibration, R_BC=found.R_BC)
-        self._in_flight = replace(self._in_flight, R_BC=found.R_BC)
+        self._calibration = self._calibration.with_camera(0, R_BC=found.R_BC, rotation_known=True)
+        self._in_flight = self._in_flight.with_camera(0, R_BC=found.R_BC, rotation_known=True)
         return True
 
     def _static(self) -> InitialEstimate | None:

@@ -25,11 +25,11 @@ _MIN_COMMON = 8
 def check_parallax(window: Window, R_B0B: Float, calibration: Calibration, options: InitializationOptions) -> None:
     """The median track must move by enough pixels that the rotations ``R_B0B`` (K, 3, 3) do not explain."""
     rays = np.concatenate([window.xy, np.ones((*window.xy.shape[:2], 1))], axis=2)
-    rays_B0 = rays @ np.swapaxes(R_B0B @ calibration.R_BC, -1, -2)
+    rays_B0 = rays @ np.swapaxes(R_B0B @ calibration.cameras[0].R_BC, -1, -2)
     rays_B0 /= np.linalg.norm(rays_B0, axis=2, keepdims=True)
     first = rays_B0[window.seen.argmax(axis=0), np.arange(len(window.ids))]
     angle = np.nanmax(np.linalg.norm(rays_B0 - first, axis=2), axis=0)
-    parallax = float(np.median(angle)) * calibration.camera.focal_px
+    parallax = float(np.median(angle)) * calibration.cameras[0].model.focal_px
     if not parallax >= options.min_parallax_px:
         raise RefusalError(f"parallax of {parallax:.1f} px, {options.min_parallax_px:.1f} px are needed")
 
@@ -39,7 +39,7 @@ def check_fit(problem: Problem, solution: Solution, options: InitializationOptio
     if not solution.converged:
         raise RefusalError("the bundle adjustment did not converge")
     r, _ = lm.project(solution.states, solution.landmarks, problem.observations, problem.calibration)
-    rms = float(np.sqrt((r**2).mean())) * problem.calibration.camera.focal_px
+    rms = float(np.sqrt((r**2).mean())) * problem.calibration.cameras[0].model.focal_px
     if not rms <= options.max_reprojection_px:
         raise RefusalError(f"reprojection error of {rms:.1f} px RMS, {options.max_reprojection_px:.1f} px are allowed")
     factors, states = problem.factors, solution.states
@@ -65,9 +65,9 @@ def check_lookahead(
         _, a, b = np.intersect1d(ids, tracks.ids, return_indices=True)
         if len(a) < _MIN_COMMON:
             raise RefusalError(f"only {len(a)} landmarks were still tracked in the frames held back")
-        p_C = ((p_WF[a] - state.p_WB) @ state.R_WB - calibration.p_BC) @ calibration.R_BC
+        p_C = ((p_WF[a] - state.p_WB) @ state.R_WB - calibration.cameras[0].p_BC) @ calibration.cameras[0].R_BC
         error = np.linalg.norm(p_C[:, :2] / p_C[:, 2:] - tracks.xy_normalised[b], axis=1)
-        px = float(np.median(np.where(p_C[:, 2] > 0.0, error, np.inf))) * calibration.camera.focal_px
+        px = float(np.median(np.where(p_C[:, 2] > 0.0, error, np.inf))) * calibration.cameras[0].model.focal_px
         if not px <= options.max_lookahead_px:
             raise RefusalError(f"the prediction misses a later frame by {px:.1f} px")
 

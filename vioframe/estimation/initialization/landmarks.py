@@ -63,13 +63,14 @@ def linearise(
     D[:, :, 2] = np.where((X[:, 2] > _LEAST_DEPTH_RATIO)[:, None], -xy / depth[:, None], 0.0)
 
     rho = landmarks[observations.landmark, 2, None, None]
-    R_CB = calibration.R_BC.T
+    R_BC, p_BC = calibration.cameras[0].R_BC, calibration.cameras[0].p_BC
+    R_CB = R_BC.T
     between = states.p_WB[observations.host] - states.p_WB[observations.frame]
     by_position = D @ R_CW * rho
     J_frame = np.concatenate([D @ R_CB @ so3.hat(b), -by_position], axis=2)
     J_host = np.concatenate([-D @ R_CW @ R_host @ so3.hat(q_host), by_position], axis=2)
-    by_rho = R_CW @ ((R_host @ calibration.p_BC) + between)[..., None] - (R_CB @ calibration.p_BC)[:, None]
-    J_landmark = D @ np.concatenate([R_CW @ R_host @ calibration.R_BC[:, :2], by_rho], axis=2)
+    by_rho = R_CW @ ((R_host @ p_BC) + between)[..., None] - (R_CB @ p_BC)[:, None]
+    J_landmark = D @ np.concatenate([R_CW @ R_host @ R_BC[:, :2], by_rho], axis=2)
     own = observations.frame == observations.host
     J_frame[own] = J_host[own] = 0.0
     return xy - observations.xy, J_frame, J_host, J_landmark
@@ -79,20 +80,21 @@ def _transform(
     states: StateArrays, landmarks: Float, observations: Observations, calibration: Calibration
 ) -> tuple[Float, Float, Float, Float, Float]:
     """Landmarks times inverse depth (M, 3) in the observing camera, the host's and the frame's body; R_CW; R_host."""
+    R_BC, p_BC = calibration.cameras[0].R_BC, calibration.cameras[0].p_BC
     m = landmarks[observations.landmark]
     rho = m[:, 2:]
     R_host, R_frame = states.R_WB[observations.host], states.R_WB[observations.frame]
-    q_host = np.column_stack([m[:, :2], np.ones(len(m))]) @ calibration.R_BC.T + rho * calibration.p_BC
+    q_host = np.column_stack([m[:, :2], np.ones(len(m))]) @ R_BC.T + rho * p_BC
     between = states.p_WB[observations.host] - states.p_WB[observations.frame]
     w = (R_host @ q_host[..., None])[..., 0] + rho * between
     b = (np.swapaxes(R_frame, -1, -2) @ w[..., None])[..., 0]
-    X = (b - rho * calibration.p_BC) @ calibration.R_BC
-    return X, q_host, b, calibration.R_BC.T @ np.swapaxes(R_frame, -1, -2), R_host
+    X = (b - rho * p_BC) @ R_BC
+    return X, q_host, b, R_BC.T @ np.swapaxes(R_frame, -1, -2), R_host
 
 
 def positions(states: StateArrays, landmarks: Float, observations: Observations, calibration: Calibration) -> Float:
     """The landmarks in the world, (L, 3) m."""
     host = observations.frame[observations.start]
     p_C = np.column_stack([landmarks[:, :2], np.ones(len(landmarks))]) / landmarks[:, 2:]
-    p_B = p_C @ calibration.R_BC.T + calibration.p_BC
+    p_B = p_C @ calibration.cameras[0].R_BC.T + calibration.cameras[0].p_BC
     return (states.R_WB[host] @ p_B[..., None])[..., 0] + states.p_WB[host]

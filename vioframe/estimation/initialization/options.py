@@ -21,9 +21,6 @@ class InitializationOptions:
     largest_imu_gap_s: float = 0.1
     """A longer stretch without readings begins the window anew."""
 
-    unknown_camera_rotation: bool = False
-    """Find how the camera is turned on the body first, by hand-eye calibration; what the calibration says of that is
-    not used. The body must turn about two axes before anything else can begin."""
     min_second_turn_rad: float = 0.15
     """Turns about other axes than the main one (root of their sum of squares) that the hand-eye calibration needs."""
     max_camera_rotation_sigma_deg: float = 0.4

@@ -57,8 +57,7 @@ def build_window(packets: Sequence[Packet], chosen: Sequence[int], min_views: in
 
 def finite_tracks(tracks: FrameTracks) -> FrameTracks:
     """Without the points that could not be undistorted."""
-    good = np.isfinite(tracks.xy_normalised).all(axis=1)
-    return FrameTracks(tracks.t_ns, tracks.ids[good], tracks.xy[good], tracks.xy_normalised[good])
+    return tracks.finite()
 
 
 def spread_indices(t_ns: Int, count: int) -> list[int]:
