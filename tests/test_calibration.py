@@ -255,9 +255,9 @@ def test_cameras_are_matched_with_the_images_of_a_recording(tmp_path: Path) -> N
     assert matched("/cam0/a", "/cam0/b", cameras=["/cam0/b"]) == [("cam0", "/cam0/b")]
     assert matched("/a", "/b", cameras=["cam1:/a", "cam0:/b"]) == [("cam1", "/a"), ("cam0", "/b")]
     assert matched("/only", cameras=["cam1"]) == [("cam1", "/only")]
-    for wanted in (None, ["cam0"]):
-        with pytest.raises(CalibrationError, match=r"which images are those of cam0: .* cameras=cam0:/a"):
-            matched("/a", "/b", cameras=wanted)
+    for sources, wanted in ((("/a", "/b"), None), (("/a", "/b"), ["cam0"]), (("/cam1/a",), ["cam0"])):
+        with pytest.raises(CalibrationError, match=rf"which images are those of cam0: .* cameras=cam0:{sources[0]}"):
+            matched(*sources, cameras=wanted)
     chain.write_text("cam0:" + kalibr_camera(f"T_imu_cam: {rows(T_BC)}"))
     assert matched("/a", "/b") == matched("/a", "/b", cameras=["cam0"]) == [("cam0", "/a")]
 

@@ -18,8 +18,8 @@ PACKAGED = Path(__file__).parent / "data"
 def load_calibration(*paths: str | Path, cameras: Sequence[str] | None = None) -> Calibration:
     """A rig from calibration files, or from folders holding them.
 
-    Understood are EuRoC's ``sensor.yaml`` (of each sensor, a sequence or its ``mav0``), Kalibr's camchain-imucam with its
-    imu file, OpenVINS' ``estimator_config.yaml`` or the two chains it names, and VINS-Mono's single file.
+    Understood are EuRoC's ``sensor.yaml`` (of each sensor, a sequence or its ``mav0``), Kalibr's camchain-imucam with
+    its imu file, OpenVINS' ``estimator_config.yaml`` or the two chains it names, and VINS-Mono's single file.
 
     ``cameras`` are names such as ``cam1`` or image topics such as ``/cam1/image_raw``, in the order wanted; without it
     there are all, in the order of their names. Raises :class:`~vioframe.errors.CalibrationError`.
@@ -41,25 +41,27 @@ def match_cameras(
     """The rig whose images a recording holds, and the source of each of its cameras.
 
     ``sources`` are the image topics, or folders, of the recording. A camera's is the topic that its calibration names,
-    or else the first that bears the camera's name, or else the only one there can be. ``cameras`` are those wanted: each
-    by name, by source, or as ``NAME:SOURCE`` where neither tells the other; None stands for all that have images.
+    or else the first that bears the camera's name, or else the only one there can be. ``cameras`` are those wanted,
+    each by name, by source, or as ``NAME:SOURCE`` where neither tells the other; None is all that have images. Raises
+    :class:`~vioframe.errors.CalibrationError`.
     """
     where = ", ".join(map(str, paths))
     found, imu = _read(paths, where)
-    pairs: list[tuple[CameraPart, str]] = []
-    if cameras is None:
-        pairs = [(part, source) for part in found if (source := _source_of(part, sources))]
-        if not pairs and len(found) == 1:
-            pairs = [(found[0], sources[0])]
-        if not pairs:
+    pairs = [(part, source) for part in found if (source := _source_of(part, sources))]
+    lone = len(found) == 1 or (len(sources) == 1 and not pairs)
+    if cameras is not None:
+        pairs = []
+        for wanted in cameras:
+            name, _, source = wanted.partition(":")
+            part = _select(found, name, where)
+            source = source or (name if name in sources else _source_of(part, sources) or "")
+            if not source and not lone:
+                raise _no_images(part.name, sources)
+            pairs.append((part, source or sources[0]))
+    elif not pairs:
+        if len(found) > 1:
             raise _no_images(found[0].name, sources)
-    for wanted in cameras or ():
-        name, _, source = wanted.partition(":")
-        part = _select(found, name, where)
-        source = source or (name if name in sources else _source_of(part, sources))
-        if not source and len(sources) > 1 and len(found) > 1:
-            raise _no_images(part.name, sources)
-        pairs.append((part, source or sources[0]))
+        pairs = [(found[0], sources[0])]
     return _rig([part for part, _ in pairs], imu), tuple(source for _, source in pairs)
 
 

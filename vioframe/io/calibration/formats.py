@@ -2,13 +2,13 @@
 
 EuRoC / ASL (Burri et al., IJRR 2016): a ``sensor.yaml`` for each sensor, ``T_BS`` mapping sensor to body.
 
-Kalibr's camchain-imucam and imu files, and OpenVINS' variants: ``T_cam_imu`` maps IMU to camera, OpenVINS' ``T_imu_cam``
-is its inverse; ``timeshift_cam_imu`` has ``t_imu = t_cam + shift``.
+Kalibr's camchain-imucam and imu files, and OpenVINS' variants: ``T_cam_imu`` maps IMU to camera, OpenVINS'
+``T_imu_cam`` is its inverse; ``timeshift_cam_imu`` has ``t_imu = t_cam + shift``.
 
-VINS-Mono's single file (Qin, Li, Shen, T-RO 2018): ``extrinsicRotation`` and ``extrinsicTranslation`` map camera to IMU,
-``td`` is ``t_imu - t_cam``. Its ``acc_n, gyr_n, acc_w, gyr_w`` are *not* densities: the covariance is propagated with
-``(G dt) Q (G dt)^T`` (section IV-B), Q holding their squares, which a density sigma would enter as ``sigma^2 dt``. So
-``density = value * sqrt(dt)``.
+VINS-Mono's single file (Qin, Li, Shen, T-RO 2018): ``extrinsicRotation`` and ``extrinsicTranslation`` map camera to
+IMU, ``td`` is ``t_imu - t_cam``. Its ``acc_n, gyr_n, acc_w, gyr_w`` are *not* densities: the covariance is propagated
+with ``(G dt) Q (G dt)^T`` (section IV-B), Q holding their squares, which a density sigma would enter as ``sigma^2 dt``.
+So ``density = value * sqrt(dt)``.
 
 Two keys are additions of this project. ``timeshift_cam_imu`` in EuRoC's files keeps a written calibration whole.
 ``camera_rotation: unknown``, in EuRoC's and Kalibr's, says that nobody knows how the camera is turned on the body, as
