@@ -195,8 +195,10 @@ def test_written_calibrations_read_back_to_the_last_bit(tmp_path: Path, model: D
     cameras = (
         CameraOnBody("cam0", odd, np.eye(3), np.array([1 / 3, -1e-20, 7.0]), -123_456_789_012),
         CameraOnBody("cam1", CAMERA, np.eye(3), P_BC, OFFSET_NS, rotation_known=False),
-        CameraOnBody("thermal", CAMERA, np.eye(3), P_BC),
+        CameraOnBody("thermal", CAMERA, R_BC, P_BC),
+        *packaged_calibration("euroc").with_camera(0, name="cam2").with_camera(1, name="cam3").cameras,
     )
+    cameras = tuple(sorted(cameras, key=lambda camera: camera.name))
     write_calibration(Calibration(cameras, NOISE), tmp_path)
     back = load_calibration(tmp_path)
     assert_same_rig(back, Calibration(cameras, NOISE))

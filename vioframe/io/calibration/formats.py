@@ -40,6 +40,8 @@ _DISTORTION: dict[str, DistortionModel] = {
     "equidistant": "equidistant",
     "equi": "equidistant",
 }
+# Projection moves the last bits of any rotation: one that is exact but for these is kept, so as to read back equal.
+_ROUNDING = 1e-14
 _CHAIN_CAMERA = re.compile(r"cam\d+")
 # OpenVINS' IMU intrinsics: scale and misalignment matrices, identity where they were not calibrated.
 _IMU_INTRINSICS = ("Tw", "Ta", "R_IMUtoGYRO", "R_IMUtoACC")
@@ -284,10 +286,11 @@ def _rigid_transform(fields: Fields, key: str) -> Float:
 
 
 def _rotation(fields: Fields, key: str, R: Float) -> Float:
-    """The rotation nearest to ``R`` (3, 3), which must be close to one."""
-    if np.abs(R @ R.T - np.eye(3)).max() > 1e-3 or np.linalg.det(R) < 0.0:
+    """The rotation nearest to ``R`` (3, 3), which must be close to one; ``R`` itself where it is one already."""
+    off = np.abs(R @ R.T - np.eye(3)).max()
+    if off > 1e-3 or np.linalg.det(R) < 0.0:
         raise fields.fail(f"{key!r} holds no rotation: its rows are not orthonormal and right-handed")
-    return so3.project(R)
+    return R if off < _ROUNDING else so3.project(R)
 
 
 def _translation(p_BC: Float) -> Float:
