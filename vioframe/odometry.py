@@ -18,7 +18,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from vioframe.errors import DatasetError
-from vioframe.estimation.lifecycle import EstimationOptions, LifeCycle, warm_up
+from vioframe.estimation.lifecycle import LifeCycle, warm_up
+from vioframe.estimation.options import EstimationOptions
 from vioframe.frontend import Frontend, FrontendOptions
 from vioframe.incidents import Incidents
 from vioframe.interfaces import Backend, Detector

@@ -36,13 +36,13 @@ class RunProgress:
 
     def __call__(self, step: Step) -> None:
         if self._first_t_ns is None:
-            self._first_t_ns = step.frame.t_ns
+            self._first_t_ns = step.frames.t_ns
             # Not before: an error ahead of the first frame is then one line and nothing else.
             self._progress.start()
             self._progress.reset(self._task)
         task = self._progress.tasks[self._task]
         wall_s = max(task.elapsed or 0.0, 1e-3)
-        data_s = (step.frame.t_ns - self._first_t_ns) / NS_PER_S
+        data_s = (step.frames.t_ns - self._first_t_ns) / NS_PER_S
         figures = (
             f"{(task.completed + 1) / wall_s:.1f} frames/s, {data_s / wall_s:.2f}x real time, "
             f"{len(step.tracks.ids)} points, {step.estimate.status}"

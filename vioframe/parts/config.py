@@ -20,7 +20,7 @@ from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
 
 from vioframe.errors import ConfigError
-from vioframe.estimation.lifecycle import EstimationOptions
+from vioframe.estimation.options import EstimationOptions
 from vioframe.frontend import FrontendOptions
 from vioframe.parts.options import Option, did_you_mean, options_of, validate_options
 from vioframe.parts.registry import BACKEND, DETECTOR, LOOP_CLOSER, Kind, Registry
