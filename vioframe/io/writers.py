@@ -89,7 +89,9 @@ class TruthFile(_TruthWriter):
     def write_true_values(self, t_ns: int, values: Sequence[float]) -> None:
         if not self._columns:
             self._columns = 1 + len(values)
-            self._file.write(",".join(_TRUTH_HEADING[: self._columns]) + "\n")
+            heading = ",".join(_TRUTH_HEADING[: self._columns])
+            # Poses alone under EuRoC's names are its raw motion capture, which no reader takes for the truth.
+            self._file.write((heading.replace("RS_R", "WB") if self._columns == 8 else heading) + "\n")
         self._file.write(_row(t_ns, values[: self._columns - 1]))
 
     def close(self) -> None:
