@@ -85,21 +85,27 @@ class Dataset(Protocol):
 
     @property
     def calibration(self) -> Calibration:
-        """Calibration of the camera and IMU that are read."""
+        """The cameras that are read, in the order of the images in a frame set, and the IMU."""
         ...
 
     @property
     def frame_count(self) -> int | None:
-        """Number of images, for progress bars; None where it is not known."""
+        """Number of frame sets, for progress bars; None where it is not known."""
         ...
 
     @property
     def ground_truth(self) -> Trajectory | None:
-        """The body's true trajectory where the data set itself brings one in the body frame, else None."""
+        """The body's true trajectory where the data set itself brings one in the body frame, else None.
+
+        Where velocity and biases are known too, it may be a :class:`vioframe.io.trajectories.TrueTrajectory`.
+        """
         ...
 
     def measurements(self) -> Iterator[Measurement]:
-        """IMU samples and frames in roughly ascending order of their header stamps, and what could not be read."""
+        """IMU samples and frame sets in roughly ascending order of their stamps, and what could not be read.
+
+        Images of one stamp come in one set, those with stamps of their own in sets of their own.
+        """
         ...
 
 

@@ -10,7 +10,14 @@ from vioframe.io.calibration.fields import Fields, read_yaml
 from vioframe.io.calibration.formats import CameraPart, ImuPart, is_calibration, parts_of, write_calibration
 from vioframe.types import Calibration
 
-__all__ = ["load_calibration", "match_cameras", "packaged_calibration", "sidecar_folder", "write_calibration"]
+__all__ = [
+    "PACKAGED",
+    "load_calibration",
+    "match_cameras",
+    "packaged_calibration",
+    "sidecar_folder",
+    "write_calibration",
+]
 
 PACKAGED = Path(__file__).parent / "data"
 
