@@ -40,7 +40,7 @@ _STENCIL = np.array([-1, 0, 1, 2])
 
 @dataclass(frozen=True)
 class Scenario:
-    """Readings ``gyro_B`` rad/s, ``accel_B`` m/s^2 (N, 3) at ``imu_ns`` (N,), frames' stamps (M,), ``truth`` of K poses.
+    """Readings ``gyro_B`` rad/s, ``accel_B`` m/s^2 (N, 3) at ``imu_ns`` (N,), stamps (M,) of frames, a truth of K poses.
 
     Stamps are those of the first camera's clock, but ``imu_ns`` is of the IMU's. ``v_WB`` (K, 3) m/s and the biases
     (K, 3) belong to the truth, and are NaN where nobody knows them. ``motion`` gives ``R_WB`` (Q, 3, 3), ``p_WB`` and

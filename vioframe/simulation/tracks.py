@@ -101,7 +101,7 @@ def simulated_sequence(
     arguments give the same sequence to the last bit. Readings at the frames' stamps are interpolated as those of a
     recording would be, unless the frame rate divides the IMU's.
     """
-    calibration = calibration or packaged_calibration("euroc")
+    calibration = calibration or packaged_calibration("euroc", cameras=["cam0"])
     imu_rng, track_rng = _generators(seed)
     rate_hz = (noise or calibration.imu).rate_hz
     path, duration_s = _path(flight, duration_s, calibration)
@@ -137,7 +137,7 @@ def real_motion_sequence(
     too, are those of :func:`~vioframe.simulation.scenario.load_euroc`. ``calibration`` is EuRoC's as published unless
     given.
     """
-    calibration = calibration or packaged_calibration("euroc")
+    calibration = calibration or packaged_calibration("euroc", cameras=["cam0"])
     scenario = load_euroc(folder, start_s=start_s, duration_s=duration_s, remove_jumps=remove_jumps)
     options = TrackOptions(max_points, pixel_sigma)
     return _sequence(scenario, calibration, TrackSimulator(calibration, options, np.random.default_rng(seed)))
@@ -156,10 +156,10 @@ def simulated_stream(
 ) -> Iterator[ImuSample | FrameTracks]:
     """As :func:`simulated_sequence`, but made as it is taken, in pieces of ``piece_s`` seconds: for flights of hours.
 
-    Readings and frames come in the order of their stamps, all on the first camera's clock; a reading comes before the
-    frame of the same stamp. The noise is not that of the sequence with the same seed.
+    Readings, with stamps of the IMU's clock, and frames come in the order of their stamps. The noise is not that of the
+    sequence with the same seed.
     """
-    calibration = calibration or packaged_calibration("euroc")
+    calibration = calibration or packaged_calibration("euroc", cameras=["cam0"])
     imu_rng, track_rng = _generators(seed)
     simulator = TrackSimulator(calibration, options or TrackOptions(), track_rng)
     rate_hz = (noise or calibration.imu).rate_hz
@@ -173,7 +173,15 @@ def simulated_stream(
         imu_s = readings[max(first - 1, 0) : last]
         frames_s = frames[(frames >= begin_s) & (frames < end_s)]
         piece = fly(
-            path, "", imu_rng, frames_s=frames_s, imu_s=imu_s, imu_rate_hz=rate_hz, noise=noise, errors=errors
+            path,
+            "",
+            imu_rng,
+            frames_s=frames_s,
+            imu_s=imu_s,
+            imu_rate_hz=rate_hz,
+            noise=noise,
+            errors=errors,
+            time_offset_ns=calibration.cameras[0].time_offset_ns,
         )
         errors = _starting_at(piece.bias_gyro_B[-1], piece.bias_accel_B[-1])
         new = slice(1 if first else 0, None)
@@ -220,9 +228,10 @@ class TrackSimulator:
             if missing > 0:
                 born_xy, p_WF = self._add_landmarks(c, missing, *poses[c])
                 for other, (xy, seen) in enumerate(views):
-                    # Where it is born a landmark is seen at the very pixel that was drawn.
-                    born = (born_xy, np.ones(missing, bool)) if other == c else self._project(other, *poses[other], p_WF)
-                    views[other] = np.concatenate([xy, born[0]]), np.concatenate([seen, born[1]])
+                    new_xy, new_seen = self._project(other, *poses[other], p_WF)
+                    if other == c:  # the very pixels that were drawn
+                        new_xy, new_seen = born_xy, np.ones(missing, bool)
+                    views[other] = np.concatenate([xy, new_xy]), np.concatenate([seen, new_seen])
         ids, camera, xy, xy_normalised = [], [], [], []
         for c, (ideal_xy, seen) in enumerate(views):
             ids.append(self._ids[seen])
