@@ -1,4 +1,4 @@
-"""What is to be simulated: YAML in, a frozen and validated :class:`SimulationConfig` out; and the manifest it goes into.
+"""What is to be simulated: YAML in, a frozen and validated :class:`SimulationConfig` out.
 
 A recording comes with the folder of what it was made of: ``flight.bag.simulation`` beside ``flight.bag``, or
 ``simulation`` in an ASL folder.

@@ -125,8 +125,9 @@ class RecordedFlight:
 
     Both are B-splines of degree five, fitted by least squares; a rotation is the quaternion spline, normalised. With
     ``q`` a curve in R^4 and ``*`` the conjugate, the body turns at ``omega_B = 2 Im(q* dq/dt) / |q|^2``: the part of
-    ``dq/dt`` along ``q`` changes nothing but the norm and drops out, for its product with ``q*`` is real. Where the norm
-    is one, this is the rate of a quaternion as in Solà, "Quaternion kinematics for the error-state Kalman filter" (2017).
+    ``dq/dt`` along ``q`` changes nothing but the norm and drops out, for its product with ``q*`` is real. Where the
+    norm is one, this is the rate of a quaternion as in Solà, "Quaternion kinematics for the error-state Kalman filter"
+    (2017).
     """
 
     duration_s: float

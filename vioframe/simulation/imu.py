@@ -1,8 +1,8 @@
 """What an IMU reads along a flight: exact, or with the errors that a calibration knows and those that it does not.
 
-Among the latter is what rotors shake into it: tones at their speeds and harmonics, and noise over a band. Every part is
-a sine in continuous time, so that the same generator gives the same vibration at any rate of sampling. A tone above half
-that rate folds back, as it does in a sensor without a filter against it.
+Among the latter is what rotors shake into it: tones at their speeds and harmonics, and noise over a band. Every part
+is a sine in continuous time, so that the same generator gives the same vibration at any rate of sampling. A tone above
+half that rate folds back, as it does in a sensor without a filter against it.
 """
 
 from __future__ import annotations

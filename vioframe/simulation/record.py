@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
 from heapq import merge
 from pathlib import Path
@@ -19,7 +19,7 @@ from vioframe.runs import machine
 from vioframe.simulation.config import MANIFEST, MESH, TRUTH, simulation_folder
 from vioframe.simulation.recording import SimulatedRecording
 from vioframe.simulation.world import write_mesh
-from vioframe.types import FrameSet, ImuSample, Measurement, NavState
+from vioframe.types import FrameSet, ImuSample, Measurement
 
 
 def record(
@@ -75,15 +75,18 @@ def check_destinations(destinations: Sequence[Path], compression: str | None, *,
 def _write(
     recording: SimulatedRecording, writers: Sequence[RecordingWriter], on_frame: Callable[[FrameSet], None]
 ) -> None:
-    measurements: Iterable[Measurement | NavState] = recording.measurements()
-    for item in merge(measurements, recording.truth, key=lambda item: item.t_ns):
+    truth = zip(recording.ground_truth.t_ns.tolist(), recording.ground_truth.values.tolist(), strict=True)
+    items: Iterator[Measurement | tuple[int, list[float]]] = merge(
+        recording.measurements(), truth, key=lambda item: item[0] if isinstance(item, tuple) else item.t_ns
+    )
+    for item in items:
         for writer in writers:
-            if isinstance(item, FrameSet):
+            if isinstance(item, tuple):
+                writer.write_true_values(*item)
+            elif isinstance(item, FrameSet):
                 writer.write_frame(item)
             elif isinstance(item, ImuSample):
                 writer.write_imu(item)
-            elif isinstance(item, NavState):
-                writer.write_truth(item)
         if isinstance(item, FrameSet):
             on_frame(item)
 
@@ -107,6 +110,6 @@ def _describe(recording: SimulatedRecording, folder: Path) -> None:
     (folder / MANIFEST).write_text(manifest, encoding="utf-8")
     write_mesh(recording.world.mesh, folder / MESH)
     truth = TruthFile(folder / TRUTH)
-    for state in recording.truth:
-        truth.write_truth(state)
+    for t_ns, values in zip(recording.ground_truth.t_ns.tolist(), recording.ground_truth.values.tolist(), strict=True):
+        truth.write_true_values(t_ns, values)
     truth.close()

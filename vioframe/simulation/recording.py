@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from functools import cached_property
 from heapq import merge
 
 import numpy as np
 
 from vioframe.arrays import Float, Int
 from vioframe.errors import ConfigError
-from vioframe.geometry.trajectory import Trajectory
 from vioframe.interfaces import Flight
 from vioframe.io.calibration import load_calibration, packaged_calibration
 from vioframe.parts.registry import Registry
@@ -21,7 +19,7 @@ from vioframe.simulation.flights import flight_from_file, levelled
 from vioframe.simulation.imu import ImuErrors, vibration
 from vioframe.simulation.scenario import Scenario, fly, load_euroc
 from vioframe.simulation.world import MeshWorld, check_clear, draw_movers
-from vioframe.types import NS_PER_S, FrameSet, ImuSample, Measurement, NavState
+from vioframe.types import NS_PER_S, FrameSet, ImuSample, Measurement
 
 DEFAULT_DURATION_S = 30.0
 # Within an exposure the image moves by this between two instants that are rendered, unless that were too many.
@@ -38,8 +36,8 @@ class SimulatedRecording:
     """A data set that is made as it is read, by ``workers`` processes; the same whatever their number.
 
     ``config`` is complete. ``true_calibration`` is that of the rig which the images are rendered with, all its cameras
-    triggered together; ``calibration`` is what an estimator is told. ``truth`` holds a state for every reading of the
-    IMU, and ``ground_truth`` their poses. Raises :class:`ConfigError` where the flight leads through a wall.
+    triggered together; ``calibration`` is what an estimator is told. ``ground_truth`` holds a state for every reading
+    of the IMU. Raises :class:`ConfigError` where the flight leads through a wall.
     """
 
     def __init__(self, config: SimulationConfig, registry: Registry, workers: int = 1) -> None:
@@ -60,7 +58,7 @@ class SimulatedRecording:
         self.calibration = self.conditions.mislead(self.true_calibration, misled_rng)
         self._scenario = self._fly(registry, imu_rng)
         self.name = self._scenario.name
-        self.ground_truth: Trajectory = self._scenario.truth
+        self.ground_truth = self._scenario.truth
         self._imu = self._read(shaken_rng)
         self._frames_ns = self._kept(drops_rng)
         self._gains = np.ones(len(self._frames_ns))
@@ -120,10 +118,6 @@ class SimulatedRecording:
         kept = rng.random(len(frames_ns)) >= self.conditions.dropped_part
         kept[[0, -1]] = True
         return frames_ns[kept]
-
-    @cached_property
-    def truth(self) -> tuple[NavState, ...]:
-        return self._scenario.states()
 
     @property
     def frame_count(self) -> int:

@@ -6,7 +6,7 @@ A :class:`Scenario` comes of a flight, whose readings are simulated, or of a rea
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +16,7 @@ from vioframe.errors import DatasetError, TrajectoryError
 from vioframe.geometry import so3
 from vioframe.geometry.trajectory import Trajectory
 from vioframe.interfaces import Flight
-from vioframe.io.trajectories import load_trajectory
+from vioframe.io.trajectories import TrueTrajectory, load_trajectory, true_values
 from vioframe.simulation.imu import ImuErrors, read_imu
 from vioframe.types import NS_PER_S, Calibration, ImuNoise, NavState
 
@@ -40,11 +40,11 @@ _STENCIL = np.array([-1, 0, 1, 2])
 
 @dataclass(frozen=True)
 class Scenario:
-    """Readings ``gyro_B`` rad/s, ``accel_B`` m/s^2 (N, 3) at ``imu_ns`` (N,), stamps (M,) of frames, a truth of K poses.
+    """Readings ``gyro_B`` rad/s, ``accel_B`` m/s^2 (N, 3) at ``imu_ns`` (N,), and frames at ``frames_ns`` (M,).
 
-    Stamps are those of the first camera's clock, but ``imu_ns`` is of the IMU's. ``v_WB`` (K, 3) m/s and the biases
-    (K, 3) belong to the truth, and are NaN where nobody knows them. ``motion`` gives ``R_WB`` (Q, 3, 3), ``p_WB`` and
-    ``v_WB`` (Q, 3) at any stamps (Q,), from before its beginning and after its end those there.
+    Stamps are those of the first camera's clock, but ``imu_ns`` is of the IMU's. The ``truth`` has K poses, velocity
+    and biases too where they are known. ``motion`` gives ``R_WB`` (Q, 3, 3), ``p_WB`` (Q, 3) m and ``v_WB`` (Q, 3) m/s
+    (NaN where it is not known) at any stamps (Q,), from before its beginning and after its end those there.
     """
 
     name: str
@@ -52,21 +52,16 @@ class Scenario:
     imu_ns: Int
     gyro_B: Float
     accel_B: Float
-    truth: Trajectory
-    v_WB: Float
-    bias_gyro_B: Float
-    bias_accel_B: Float
+    truth: TrueTrajectory
     motion: Callable[[Int], tuple[Float, Float, Float]]
 
-    def states(self) -> tuple[NavState, ...]:
-        """The states of the truth."""
-        truth = self.truth
-        return _states(truth.t_ns, truth.R_WB, truth.p_WB, self.v_WB, self.bias_gyro_B, self.bias_accel_B)
-
     def states_at(self, t_ns: Int) -> tuple[NavState, ...]:
-        """The states at stamps ``t_ns`` (M,), with the biases between two states of the truth taken as linear."""
-        biases = (_linear(self.truth.t_ns, bias, t_ns) for bias in (self.bias_gyro_B, self.bias_accel_B))
-        return _states(t_ns, *self.motion(t_ns), *biases)
+        """The states at stamps (M,), biases linear between two of the truth; none where that is not known."""
+        if self.truth.values.shape[1] < 16:
+            return ()
+        biases = _linear(self.truth.t_ns, self.truth.values[:, 10:], t_ns)
+        columns = zip(t_ns.tolist(), *self.motion(t_ns), biases[:, :3], biases[:, 3:], strict=True)
+        return tuple(NavState(*state) for state in columns)
 
     def body_poses(self, calibration: Calibration, camera: int, t_ns: Int) -> tuple[Float, Float]:
         """``R_WB`` (M, 3, 3) and ``p_WB`` (M, 3) m at the instants at which a rig's camera stamps frames ``t_ns`` (M,).
@@ -102,18 +97,10 @@ def fly(
         at = flight.at(np.clip((t_ns - _START_NS) / NS_PER_S, 0.0, end_s))
         return at.R_WB, at.p_WB, at.v_WB
 
-    return Scenario(
-        name,
-        frames_ns,
-        imu_ns + time_offset_ns,
-        readings.gyro_B,
-        readings.accel_B,
-        Trajectory(imu_ns, at_readings.R_WB, at_readings.p_WB),
-        at_readings.v_WB,
-        readings.bias_gyro_B,
-        readings.bias_accel_B,
-        motion,
-    )
+    poses = Trajectory(imu_ns, at_readings.R_WB, at_readings.p_WB)
+    values = np.hstack([true_values(poses), at_readings.v_WB, readings.bias_gyro_B, readings.bias_accel_B])
+    truth = TrueTrajectory(imu_ns, poses.R_WB, poses.p_WB, values=values)
+    return Scenario(name, frames_ns, imu_ns + time_offset_ns, readings.gyro_B, readings.accel_B, truth, motion)
 
 
 def load_euroc(
@@ -138,17 +125,20 @@ def load_euroc(
     frames_ns = frames_ns[(elapsed_s >= start_s) & (elapsed_s <= end_s)]
     if not len(frames_ns):
         raise DatasetError(f"{path}: no frame lies in the time asked for; start earlier or take longer")
-    published = np.full((len(truth), 9), np.nan)
-    if ".csv" in truth_file.suffixes:
-        values = np.loadtxt(truth_file, delimiter=",", ndmin=2)[:, 8:]
-        published[:, : values.shape[1]] = values
-    v_WB, bias_gyro_B, bias_accel_B = published[:, :3], published[:, 3:6], published[:, 6:]
+    values = true_values(truth)
+    v_WB = values[:, 7:10] if values.shape[1] > 7 else np.full((len(truth), 3), np.nan)
+    p_WB = truth.p_WB
     if remove_jumps:
-        truth = _without_jumps(truth, v_WB)
+        dt = np.diff(truth.t_ns)[:, None] * 1e-9
+        step = np.diff(p_WB, axis=0) - 0.5 * (v_WB[1:] + v_WB[:-1]) * dt
+        # Without published velocities there is nothing to tell a jump by, and none is found.
+        step[~(np.linalg.norm(step, axis=1) >= _JUMP_M)] = 0.0
+        p_WB = p_WB - np.vstack([np.zeros(3), np.cumsum(step, axis=0)])
+        values = np.hstack([p_WB, values[:, 3:]])
 
     def motion(t_ns: Int) -> tuple[Float, Float, Float]:
         t_ns = np.clip(t_ns, truth.t_ns[0], truth.t_ns[-1])
-        return *interpolate_poses(truth.t_ns, truth.R_WB, truth.p_WB, t_ns), _linear(truth.t_ns, v_WB, t_ns)
+        return *interpolate_poses(truth.t_ns, truth.R_WB, p_WB, t_ns), _linear(truth.t_ns, v_WB, t_ns)
 
     # A reading to spare on either side, so that no frame is left without its segment.
     near, known = (
@@ -160,10 +150,7 @@ def load_euroc(
         imu_ns[near],
         imu[near, :3],
         imu[near, 3:],
-        truth.select(known),
-        v_WB[known],
-        bias_gyro_B[known],
-        bias_accel_B[known],
+        TrueTrajectory(truth.t_ns[known], truth.R_WB[known], p_WB[known], values=values[known]),
         motion,
     )
 
@@ -218,20 +205,8 @@ def interpolate_poses(t_ns: Int, R_WB: Float, p_WB: Float, query_ns: Int) -> tup
     return R, np.einsum("mk,mki->mi", weights, p_WB[stencil])
 
 
-def _without_jumps(truth: Trajectory, v_WB: Float) -> Trajectory:
-    """Without published velocities there is nothing to tell a jump by, and none is found."""
-    dt = np.diff(truth.t_ns)[:, None] * 1e-9
-    jump = np.diff(truth.p_WB, axis=0) - 0.5 * (v_WB[1:] + v_WB[:-1]) * dt
-    jump[~(np.linalg.norm(jump, axis=1) >= _JUMP_M)] = 0.0
-    return replace(truth, p_WB=truth.p_WB - np.vstack([np.zeros(3), np.cumsum(jump, axis=0)]))
-
-
-def _states(t_ns: Int, *columns: Float) -> tuple[NavState, ...]:
-    return tuple(NavState(*state) for state in zip(t_ns.tolist(), *columns, strict=True))
-
-
 def _linear(t_ns: Int, values: Float, query_ns: Int) -> Float:
-    """(Q, 3) at ``query_ns`` (Q,) from ``values`` (K, 3) at ``t_ns`` (K,)."""
+    """(Q, D) at ``query_ns`` (Q,) from ``values`` (K, D) at ``t_ns`` (K,)."""
     at_s, query_s = (t_ns - t_ns[0]) * 1e-9, (query_ns - t_ns[0]) * 1e-9
     return np.column_stack([np.interp(query_s, at_s, column) for column in values.T])
 

@@ -183,7 +183,7 @@ def simulated_stream(
             errors=errors,
             time_offset_ns=calibration.cameras[0].time_offset_ns,
         )
-        errors = _starting_at(piece.bias_gyro_B[-1], piece.bias_accel_B[-1])
+        errors = _starting_at(*np.split(piece.truth.values[-1, 10:], 2))
         new = slice(1 if first else 0, None)
         samples = map(ImuSample, piece.imu_ns[new].tolist(), piece.gyro_B[new], piece.accel_B[new])
         measured: Iterable[ImuSample | FrameTracks] = samples
@@ -232,13 +232,12 @@ class TrackSimulator:
                     if other == c:  # the very pixels that were drawn
                         new_xy, new_seen = born_xy, np.ones(missing, bool)
                     views[other] = np.concatenate([xy, new_xy]), np.concatenate([seen, new_seen])
-        ids, camera, xy, xy_normalised = [], [], [], []
+        parts = []
         for c, (ideal_xy, seen) in enumerate(views):
-            ids.append(self._ids[seen])
-            camera.append(np.full(int(seen.sum()), c))
-            xy.append(self._disturb(ideal_xy[seen]))
-            xy_normalised.append(self._cameras[c].model.undistort(xy[-1]))
-        return FrameTracks(t_ns, *(np.concatenate(part) for part in (ids, camera, xy, xy_normalised)))
+            xy = self._disturb(ideal_xy[seen])
+            parts.append((self._ids[seen], np.full(len(xy), c), xy, self._cameras[c].model.undistort(xy)))
+        ids, camera, xy, xy_normalised = map(np.concatenate, zip(*parts, strict=True))
+        return FrameTracks(t_ns, ids, camera, xy, xy_normalised)
 
     def _project(self, camera: int, R_WC: Float, p_WC: Float, p_WF: Float) -> tuple[Float, Bool]:
         """Pixels (N, 2) of landmarks (N, 3) m in a camera, and which of them it sees."""
@@ -292,12 +291,10 @@ def cut_segments(t_ns: Int, gyro_B: Float, accel_B: Float, frames_ns: Int) -> li
 def _sequence(scenario: Scenario, calibration: Calibration, simulator: TrackSimulator) -> TrackSequence:
     frames_ns = scenario.frames_ns
     segments = cut_segments(scenario.imu_ns, scenario.gyro_B, scenario.accel_B, frames_ns)
-    states = scenario.states_at(frames_ns)
-    truth = Trajectory(frames_ns, np.array([s.R_WB for s in states]), np.array([s.p_WB for s in states]))
+    R_WB, p_WB, _ = scenario.motion(frames_ns)
     packets = zip(segments, _tracks(scenario, calibration, simulator), strict=True)
-    published = (scenario.v_WB, scenario.bias_gyro_B, scenario.bias_accel_B)
-    known = all(np.isfinite(columns).all() for columns in published)
-    return TrackSequence(scenario.name, calibration, tuple(packets), truth, states if known else ())
+    truth = Trajectory(frames_ns, R_WB, p_WB)
+    return TrackSequence(scenario.name, calibration, tuple(packets), truth, scenario.states_at(frames_ns))
 
 
 def _tracks(scenario: Scenario, calibration: Calibration, simulator: TrackSimulator) -> Iterator[FrameTracks]:
