@@ -12,11 +12,12 @@ from trajectory_helpers import disturbed, flight, moved, write_run
 from vioframe.cli import main
 from vioframe.errors import ConfigError, RunError
 from vioframe.evaluation.landmarks import belonging, read_landmarks
+from vioframe.evaluation.map_quality import MapQuality
 from vioframe.geometry import so3
 from vioframe.geometry.meshes import distances, read_mesh
 from vioframe.io.trajectories import write_tum
-from vioframe.report.evaluated import evaluate_path
-from vioframe.report.map_quality import MapQuality, measure_maps, simulated_world
+from vioframe.report.map_quality import measure_maps, simulated_world
+from vioframe.runs.evaluated import evaluate_path
 from vioframe.runs.folder import RunFolder
 from vioframe.runs.recorder import write_ply
 

@@ -16,7 +16,6 @@ from vioframe.geometry import so3
 from vioframe.geometry.trajectory import Trajectory
 from vioframe.io.calibration import packaged_calibration, write_calibration
 from vioframe.io.trajectories import write_tum
-from vioframe.report.evaluated import evaluate_paths
 from vioframe.report.scene import Flight, Scene, scene_of
 from vioframe.report.scene_drawing import TRUTH_RGB, cameras, draw, rgb
 from vioframe.report.scene_grid import ground_grid
@@ -24,6 +23,7 @@ from vioframe.report.scene_picture import render
 from vioframe.report.scene_shapes import balls, creases, dashes, facing, polyline, rods, thinned
 from vioframe.report.scene_view import best_azimuth_deg, view_of
 from vioframe.report.viewing import choose_view
+from vioframe.runs.evaluated import evaluate_paths
 from vioframe.runs.recorder import write_ply
 
 SIZE = (480, 320)
@@ -294,7 +294,7 @@ def test_the_window_shows_the_same(run):
     code = f"""
 import sys
 import numpy as np, open3d
-from vioframe.report.evaluated import evaluate_paths
+from vioframe.runs.evaluated import evaluate_paths
 from vioframe.report.scene import scene_of
 from vioframe.report.scene_window import fill
 from vioframe.report.viewing import choose_view

@@ -12,13 +12,13 @@ from itertools import product
 
 import numpy as np
 
-from vioframe.bench.consistency import PARTS, Outcome, Trial
 from vioframe.bench.contenders import Contender
 from vioframe.bench.processes import installed, map_in_processes
 from vioframe.bench.results import backend_row
 from vioframe.bench.run import BackendRun, run_backend
 from vioframe.errors import ConfigError, TrajectoryError
 from vioframe.evaluation.alignment import align_first
+from vioframe.evaluation.consistency import PARTS, Outcome, Trial
 from vioframe.evaluation.nees import nees
 from vioframe.geometry.trajectory import Trajectory
 from vioframe.io.calibration import packaged_calibration

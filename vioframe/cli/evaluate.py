@@ -56,11 +56,11 @@ def command(
     `evaluation_loop.json`) in each run folder.
     """
     from vioframe.parts import registry
-    from vioframe.report.evaluated import evaluate_paths
     from vioframe.report.map_quality import measure_maps
-    from vioframe.report.metrics import create_metrics, measure_runs
     from vioframe.report.rows import notes
     from vioframe.report.tables import to_csv, to_json, to_markdown, to_rich
+    from vioframe.runs.evaluated import evaluate_paths, measure_runs
+    from vioframe.runs.metrics import create_metrics
     from vioframe.runs.recorder import write_json
 
     asked = create_metrics(metrics, registry.load()) if metrics else ()

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import click
 
 if TYPE_CHECKING:
-    from vioframe.report.evaluated import Evaluated
+    from vioframe.runs.evaluated import Evaluated
 
 _FILE = click.Path(path_type=Path)
 
@@ -64,10 +64,10 @@ def command(
     landmarks, aligned by position and yaw. Opens a window unless --save or
     --map say what to write instead.
     """
-    from vioframe.report.evaluated import evaluate_paths
     from vioframe.report.rows import notes
     from vioframe.report.scene_window import check_display
     from vioframe.report.viewing import export_map, view_runs
+    from vioframe.runs.evaluated import evaluate_paths
 
     if save is not None and save.suffix.lower() != ".png":
         raise click.BadParameter(f"{save} does not end in .png", param_hint="'--save'")

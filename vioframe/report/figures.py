@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 
 from vioframe.errors import RunError
 from vioframe.report import plot_cost, plot_errors, plot_paths
-from vioframe.report.evaluated import Evaluated
 from vioframe.report.style import RC
+from vioframe.runs.evaluated import Evaluated
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

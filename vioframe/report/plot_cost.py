@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vioframe.report.evaluated import Evaluated
 from vioframe.report.style import PALETTE_SIZE, caption, colour, legend_above, line
+from vioframe.runs.evaluated import Evaluated
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 
 from vioframe.evaluation import RelativeErrors, Stats, TrajectoryErrors
-from vioframe.report.evaluated import Evaluated
-from vioframe.report.map_quality import WITHIN_M, MapQuality
+from vioframe.evaluation.map_quality import WITHIN_M, MapQuality
+from vioframe.runs.evaluated import Evaluated
 
 ALIGNED_BY = {"posyaw": "position + yaw", "se3": "SE(3)", "sim3": "Sim(3)", "first": "first pose"}
 

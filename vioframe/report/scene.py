@@ -9,7 +9,7 @@ import numpy as np
 
 from vioframe.evaluation.landmarks import Landmarks, belonging
 from vioframe.geometry.trajectory import Trajectory
-from vioframe.report.evaluated import Evaluated
+from vioframe.runs.evaluated import Evaluated
 from vioframe.types import Calibration, Float, Int
 
 _NEAR_PERCENT = 80.0

@@ -8,8 +8,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from io import StringIO
 from typing import TYPE_CHECKING, Any
 
-from vioframe.report.evaluated import Evaluated
 from vioframe.report.rows import sections
+from vioframe.runs.evaluated import Evaluated
 
 if TYPE_CHECKING:
     from rich.table import Table

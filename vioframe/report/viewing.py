@@ -9,11 +9,11 @@ import numpy as np
 
 from vioframe.errors import RunError
 from vioframe.geometry.meshes import import_open3d, read_mesh
-from vioframe.report.evaluated import Evaluated
 from vioframe.report.plot_paths import alignment_caption
 from vioframe.report.scene import Scene, aligned_landmarks, scene_of
 from vioframe.report.scene_grid import Grid, ground_grid
 from vioframe.report.scene_view import View, best_azimuth_deg, view_of
+from vioframe.runs.evaluated import Evaluated
 from vioframe.runs.recorder import write_ply
 
 

@@ -21,8 +21,8 @@ from vioframe.io.calibration import packaged_calibration
 from vioframe.parts import config as configuration
 from vioframe.parts.config import Config, DatasetConfig, PartConfig
 from vioframe.parts.registry import BACKEND, DETECTOR, Registry
-from vioframe.report.metrics import create_metrics
 from vioframe.report.suite.results import Data, Kind, Labels
+from vioframe.runs.metrics import create_metrics
 from vioframe.simulation.config import SimulationConfig
 from vioframe.simulation.flights import flight as named_flight
 

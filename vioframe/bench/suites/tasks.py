@@ -14,11 +14,10 @@ from vioframe.bench.suites.plan import AnyJob, FlightJob, RecordingJob, SpeedJob
 from vioframe.bench.suites.store import Store
 from vioframe.errors import TrajectoryError
 from vioframe.evaluation import Comparison
-from vioframe.report.evaluated import Evaluated, evaluate_path, with_loop_closure
-from vioframe.report.matched_truth import write_matched_truth
-from vioframe.report.metrics import create_metrics, measure
 from vioframe.report.suite.results import RUN_FOLDER
+from vioframe.runs.evaluated import Evaluated, evaluate_path, with_loop_closure, write_matched_truth
 from vioframe.runs.folder import RunFolder
+from vioframe.runs.metrics import create_metrics, measure
 from vioframe.simulation.record import record
 from vioframe.simulation.recording import SimulatedRecording
 from vioframe.types import NS_PER_S
