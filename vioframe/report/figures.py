@@ -58,6 +58,6 @@ def _available(runs: Sequence[Evaluated], band_m: float | None) -> dict[str, _Dr
         drawings["relative_error"] = plot_errors.relative_error
     if any(run.stage_ms() for run in runs):
         drawings["timing"] = plot_cost.timing
-    if any(run.folder and run.folder.track_counts() for run in runs):
+    if any(run.folder and run.folder.tracks() for run in runs):
         drawings["tracks"] = plot_cost.tracks
     return drawings

@@ -24,7 +24,7 @@ def simulated_world(folder: RunFolder) -> Path | None:
     # Here, because the simulator comes along: evaluating a recorded flight has no need of it.
     from vioframe.simulation.files import WORLD, simulation_folder
 
-    path = folder.recording()
+    path = folder.dataset_config().path
     if path is None:
         return None
     world = simulation_folder(path.parent if path.name == "mav0" else path) / WORLD

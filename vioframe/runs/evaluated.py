@@ -10,11 +10,13 @@ from typing import Any
 
 import numpy as np
 
-from vioframe.errors import VioframeError
+from vioframe.errors import RunError, VioframeError
 from vioframe.evaluation import Comparison, TrajectoryErrors, associate, evaluate
+from vioframe.evaluation.landmarks import Landmarks, belonging
 from vioframe.evaluation.map_quality import MapQuality
 from vioframe.geometry.trajectory import Trajectory
 from vioframe.io.trajectories import load_trajectory, write_tum
+from vioframe.runs.recorder import write_ply
 from vioframe.runs.metrics import AskedMetric, Measured, measure
 from vioframe.runs.folder import RunFolder
 from vioframe.types import NS_PER_S, Int
@@ -61,6 +63,19 @@ class Evaluated:
     @property
     def summary(self) -> Mapping[str, Any]:
         return self.folder.summary if self.folder else {}
+
+    @property
+    def aligned(self) -> Trajectory | None:
+        """The whole estimate, also where the ground truth does not reach, in its world where there is one."""
+        return self.errors.alignment.apply(self.estimate) if self.errors and self.estimate else self.estimate
+
+    def landmarks(self) -> Landmarks | None:
+        """The landmarks in the same world, without those that stand alone; None where there are none."""
+        landmarks = self.folder.landmarks() if self.folder else None
+        if landmarks is None or not len(landmarks):
+            return None
+        kept = landmarks.select(belonging(landmarks.p_WF))
+        return kept.moved(self.errors.alignment) if self.errors else kept
 
     def breaks(self, t_ns: Int) -> Int:
         """Indices into the ascending stamps (N,) of poses that a line must not lead to: they begin a stretch anew."""
@@ -168,3 +183,19 @@ def _comparison(run: Evaluated) -> Comparison | None:
     if run.errors.alignment_name == "posyaw":
         return Comparison(run.estimate, run.ground_truth, run.errors)
     return Comparison.of(run.estimate, run.ground_truth)
+
+
+def export_map(run: Evaluated, path: Path) -> int:
+    """Write :meth:`Evaluated.landmarks` to a PLY file as ``map.ply`` is one, and return their number.
+
+    Raises :class:`RunError` where the run has no landmarks or the file cannot be written.
+    """
+    landmarks = run.landmarks()
+    if landmarks is None:
+        raise RunError(f"{run.name} has no landmarks: only a run folder whose map.ply holds some has a map to write")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_ply(path, landmarks.by_id())
+    except OSError as error:
+        raise RunError(f"cannot write {path}: {error.strerror}; choose another name") from error
+    return len(landmarks)
