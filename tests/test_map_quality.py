@@ -113,7 +113,7 @@ def test_the_table_and_the_json_hold_the_map(tmp_path):
     table = evaluate(run, other).stdout
     rows = {line.split("│")[0].strip(): line.split("│")[1:] for line in table.splitlines() if "│" in line}
     assert [cell.strip() for cell in rows["90 % are within"]] == ["0.3000", "–"]
-    assert [cell.strip() for cell in rows["within 5, 10, 20 cm [%]"]] == ["40.0, 60.0, 80.0", "–"]
+    assert [cell.strip() for cell in rows["within 5, 10, 20 cm"]] == ["40.0%, 60.0%, 80.0%", "–"]
     figures = json.loads(evaluate(run, "--format", "json").stdout)[0]["map"]
     assert figures["landmarks"] == 5
     assert figures["median_m"] == pytest.approx(0.08, abs=1e-5)

@@ -33,7 +33,7 @@ def command(
     stage; features over time: as far as the runs have what it takes.
     """
     from vioframe.report.figures import write_figures
-    from vioframe.report.rows import notes
+    from vioframe.report.tables import notes
     from vioframe.runs.evaluated import evaluate_paths
 
     evaluated = evaluate_paths(runs, ground_truth, alignment)

@@ -26,7 +26,7 @@ def command(
     on one time line; aligned by position and yaw. --save and --map write a file instead.
     """
     from vioframe.parts import registry
-    from vioframe.report.rows import notes
+    from vioframe.report.tables import notes
     from vioframe.report.view import view_runs
     from vioframe.runs.evaluated import evaluate_paths, export_map
 

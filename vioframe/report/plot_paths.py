@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vioframe.report.rows import ALIGNED_BY
+from vioframe.evaluation import ALIGNED_BY
 from vioframe.report.style import TRUTH, caption, legend_above, line
 from vioframe.runs.evaluated import Evaluated
 from vioframe.types import Float

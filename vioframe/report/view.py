@@ -33,6 +33,8 @@ _TIME = "time"
 _SIGMAS = 3.0
 _JPEG_QUALITY = 80
 _FRUSTUM_M = 0.25
+# The world is seen through, as it would hide what flies in it.
+_GLASS = (120, 130, 150, 24)
 # In points of the screen, which rerun tells from metres by their sign.
 _LINE, _TRUTH, _LANDMARK, _IN_VIEW, _TRACK = -2.0, -1.0, -1.0, -2.5, 3.0
 _POSITION, _ROTATION, _VELOCITY, _BIAS_GYRO, _BIAS_ACCEL = "position", "rotation", "velocity", "bias_gyro", "bias_accel"
@@ -76,9 +78,8 @@ def view_runs(
             stream.save(save, default_blueprint=blueprint)
         stream.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         if mesh is not None:
-            # Walls are seen from within only: from outside one looks through them at the flight.
-            mesh3d = rr.Mesh3D(vertex_positions=mesh.reshape(-1, 3).astype(np.float32), face_rendering="Front")
-            stream.log("world/mesh", mesh3d, static=True)
+            glass = rr.Mesh3D(vertex_positions=mesh.reshape(-1, 3).astype(np.float32), albedo_factor=_GLASS)
+            stream.log("world/mesh", glass, static=True)
         for each in shown:
             each.log_all()
         _log_truths(shown)

@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vioframe.evaluation import TrajectoryErrors
-from vioframe.report.rows import ALIGNED_BY
+from vioframe.evaluation import ALIGNED_BY, TrajectoryErrors
 from vioframe.report.suite.page_blocks import Case, Plot
 from vioframe.report.suite.page_look import BAND_COLOUR, TRUTH_COLOUR, Look, axes, compact, panels, picture
 from vioframe.report.suite.pooled import BAND_M
