@@ -17,8 +17,8 @@ from vioframe.geometry import so3
 from vioframe.geometry.cameras import Camera
 from vioframe.geometry.trajectory import Trajectory
 from vioframe.io.calibration import packaged_calibration
+from vioframe.simulation import TrackSequence
 from vioframe.simulation.segments import cut_segments
-from vioframe.simulation.sequence import TrackSequence
 from vioframe.types import Calibration, Float, FrameTracks, Int
 
 CORNERS_PER_TAG = 4
@@ -110,7 +110,7 @@ def _tracks(views: list[BoardView], camera: Camera) -> list[FrameTracks]:
         appearances += seen & ~seen_before
         seen_before = seen
         ids = view.corner + count * (appearances[view.corner] - 1)
-        tracks.append(FrameTracks(view.t_ns, ids, view.xy, camera.undistort(view.xy)))
+        tracks.append(FrameTracks(view.t_ns, ids, np.zeros_like(ids), view.xy, camera.undistort(view.xy)))
     return tracks
 
 

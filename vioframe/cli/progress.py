@@ -1,27 +1,47 @@
-"""The progress bar of a run: frame rate, real-time factor, tracked points and what the back-end says."""
+"""What is shown while a command works, and tables of what came of it."""
 
 from __future__ import annotations
 
 from types import TracebackType
-from typing import Self
+from typing import TYPE_CHECKING, Self
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from vioframe.types import NS_PER_S, Step
 
+if TYPE_CHECKING:
+    from rich.table import Table
+
+_WIDE = 1000
+
+
+def print_table(table: Table) -> None:
+    """Into a file or a pipe the table goes whole: rich would fold it at 80 columns."""
+    console = Console()
+    (console if console.is_terminal else Console(width=_WIDE)).print(table)
+
+
+def progress_bar(*, quiet: bool = False) -> Progress:
+    """A bar with what is done, the task's ``figures`` and the time that is left, on standard error."""
+    return Progress(
+        BarColumn(bar_width=12),
+        MofNCompleteColumn(),
+        TextColumn("{task.fields[figures]}"),
+        TimeRemainingColumn(compact=True),
+        console=Console(stderr=True),
+        disable=quiet,
+    )
+
 
 class RunProgress:
-    """Fed with each :class:`Step`; a context manager. ``frames`` is their expected number, None where unknown."""
+    """Frame rate, real-time factor, tracked points and what the back-end says; fed with each :class:`Step`.
+
+    A context manager. ``frames`` is their expected number, None where unknown.
+    """
 
     def __init__(self, frames: int | None) -> None:
-        self._progress = Progress(
-            BarColumn(bar_width=12),
-            MofNCompleteColumn(),
-            TextColumn("{task.fields[figures]}"),
-            TimeRemainingColumn(compact=True),
-            console=Console(stderr=True),
-        )
+        self._progress = progress_bar()
         self._task = self._progress.add_task("", total=frames, figures="")
         self._first_t_ns: int | None = None
 

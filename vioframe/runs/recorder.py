@@ -47,7 +47,7 @@ CALIBRATION_COLUMNS = (
     *(f"sigma_{name}" for name in ("rx", "ry", "rz", "px", "py", "pz", "time_offset_s")),
     *(f"sigma_{name}" for name in ("fx", "fy", "cx", "cy", "d1", "d2", "d3", "d4")),
 )
-"""Of ``calibration.csv``: the camera's pose on the body (R_BC as a quaternion, p_BC m), time offset, intrinsics, and
+"""Of ``calibration.csv``: the camera by its place in the rig, its pose on the body (R_BC as a quaternion, p_BC m), time offset, intrinsics, and
 their standard deviations (rad, m, s, px); zero is what is not estimated."""
 LOOP_COLUMNS = ("earlier_t_ns", "later_t_ns", "x_m", "y_m", "z_m", "yaw_rad", "inliers", "accepted")
 _UPPER = np.triu_indices(6)
@@ -207,7 +207,7 @@ class Recorder:
         if self._calibration is None:
             self._append("calibration.csv", ",".join(CALIBRATION_COLUMNS) + "\n")
         self._calibration = learned.calibration
-        for camera, sigma in zip(learned.calibration.cameras, learned.sigma, strict=True):
+        for place, (camera, sigma) in enumerate(zip(learned.calibration.cameras, learned.sigma, strict=True)):
             model = camera.model
             values = np.concatenate(
                 [
@@ -220,7 +220,7 @@ class Recorder:
                     sigma.intrinsics,
                 ]
             )
-            self._append("calibration.csv", f"{t_ns},{camera.name}," + _csv_values(values))
+            self._append("calibration.csv", f"{t_ns},{place}," + _csv_values(values))
 
     def _add_timings(self, t_ns: int, stage_seconds: Mapping[str, float]) -> None:
         self._stage_totals.update(stage_seconds)

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
 from heapq import merge
+from importlib.metadata import version
 from pathlib import Path
 
 from pydantic_core import to_jsonable_python
 
-import vioframe
 from vioframe.errors import DatasetError
 from vioframe.io.calibration import write_calibration
 from vioframe.io.convert import FORMATS, appearing, format_of, write_sidecar
@@ -101,8 +101,8 @@ def _describe(recording: SimulatedRecording, folder: Path) -> None:
         "path_m": round(recording.ground_truth.path_length_m, 6),
         "true_calibration": recording.true_calibration,
         "calibration_told": recording.calibration,
-        "vioframe": vioframe.__version__,
-        "revision": machine.commit(Path(vioframe.__file__).parent),
+        "vioframe": version("vioframe"),
+        "revision": machine.commit(Path(__file__).parent),
     }
     plain = to_jsonable_python(made, fallback=lambda array: array.tolist())
     heading = "# A simulated recording: `vioframe simulate --config FILE NAME` makes it again.\n"
