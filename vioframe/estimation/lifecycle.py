@@ -141,7 +141,7 @@ class LifeCycle:
 
 
 def _prior(rotation_cov: Float | None) -> CameraSigma:
-    """How well a camera's calibration is known to begin with, its rotation with the covariance that was found, if any."""
+    """How well a camera's calibration is known to begin with, its rotation as it was found, if it was."""
     rotation = np.full(3, _SIGMA_ROTATION) if rotation_cov is None else np.sqrt(np.diag(rotation_cov))
     intrinsics = np.repeat([_SIGMA_PIXELS, _SIGMA_DISTORTION], 4)
     return CameraSigma(rotation, np.full(3, _SIGMA_POSITION), _SIGMA_OFFSET, intrinsics)
