@@ -44,8 +44,8 @@ class EurocDataset:
         self._mav0 = _mav0(path)
         self._bit_depth = bit_depth
         wanted = [cameras] if isinstance(cameras, str) else cameras
-        folders = self._camera_folders(wanted)
         imu_file = self._table(imu)
+        folders = self._camera_folders(wanted)
         if calibration:
             files = [calibration] if isinstance(calibration, Path) else calibration
         else:

@@ -89,7 +89,8 @@ def convert(
         raise DatasetError(f"{format} offers no compression {compression!r}; it has: {', '.join(offered) or 'none'}")
     with appearing(destination) as unfinished:
         camera_names = [camera.name for camera in calibration.cameras]
-        counts = _write(measurements, truth, FORMATS[format].open(unfinished, compression, camera_names))
+        with FORMATS[format].open(unfinished, compression, camera_names) as writer:
+            counts = write_recording(measurements, truth, [writer])
         if not counts.frames or not counts.imu_samples:
             raise DatasetError(f"nothing to write to {destination}: the source has no readable frame or no IMU sample")
         if format == "asl":
@@ -99,26 +100,29 @@ def convert(
     return counts
 
 
-@dataclass(frozen=True, slots=True)
-class _TrueRow:
-    t_ns: int
-    values: list[float]
-
-
-def _write(measurements: Iterable[Measurement], truth: Trajectory | None, writer: RecordingWriter) -> Conversion:
+def write_recording(
+    measurements: Iterable[Measurement], truth: Trajectory | None, writers: Sequence[RecordingWriter]
+) -> Conversion:
+    """Hand all to each of ``writers``, the truth in its place by time."""
     rows = () if truth is None else map(_TrueRow, truth.t_ns.tolist(), true_values(truth).tolist())
     counts: Counter[type] = Counter()
     items: Iterator[Measurement | _TrueRow] = merge(measurements, rows, key=lambda item: item.t_ns)
-    with writer:
-        for item in items:
+    for item in items:
+        for writer in writers:
             if isinstance(item, FrameSet):
                 writer.write_frame(item)
             elif isinstance(item, ImuSample):
                 writer.write_imu(item)
             elif isinstance(item, _TrueRow):
                 writer.write_true_values(item.t_ns, item.values)
-            counts[type(item)] += 1
+        counts[type(item)] += 1
     return Conversion(*(counts[kind] for kind in (FrameSet, ImuSample, _TrueRow, Unreadable)))
+
+
+@dataclass(frozen=True, slots=True)
+class _TrueRow:
+    t_ns: int
+    values: list[float]
 
 
 @contextmanager

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from pathlib import Path
 from types import TracebackType
@@ -12,8 +11,7 @@ from typing import Any, Protocol, Self, TextIO
 import numpy as np
 
 from vioframe.errors import DatasetError
-from vioframe.geometry import so3
-from vioframe.types import NS_PER_S, Float, FrameSet, Image, ImuSample, NavState
+from vioframe.types import NS_PER_S, Float, FrameSet, Image, ImuSample
 
 IMU_TOPIC = "/imu0"
 GROUND_TRUTH_TOPIC = "/vioframe/ground_truth"
@@ -58,28 +56,12 @@ class RecordingWriter(Protocol):
 
     def write_imu(self, sample: ImuSample) -> None: ...
 
-    def write_truth(self, state: NavState) -> None:
-        """A true state: velocity and biases as far as it knows them (they are not NaN)."""
-        ...
-
     def write_true_values(self, t_ns: int, values: Sequence[float]) -> None:
-        """The same as a row of :attr:`vioframe.io.trajectories.TrueTrajectory.values`."""
+        """A row of :attr:`vioframe.io.trajectories.TrueTrajectory.values`."""
         ...
 
 
-class _TruthWriter(ABC):
-    """True states to rows."""
-
-    def write_truth(self, state: NavState) -> None:
-        x, y, z, w = so3.to_quat_xyzw(state.R_WB).tolist()
-        known = np.concatenate([state.v_WB, state.bias_gyro_B, state.bias_accel_B])
-        self.write_true_values(state.t_ns, [*state.p_WB.tolist(), w, x, y, z, *known[np.isfinite(known)].tolist()])
-
-    @abstractmethod
-    def write_true_values(self, t_ns: int, values: Sequence[float]) -> None: ...
-
-
-class TruthFile(_TruthWriter):
+class TruthFile:
     """A ground-truth file of EuRoC's, with as many columns as its first row has."""
 
     def __init__(self, path: Path) -> None:
@@ -98,7 +80,7 @@ class TruthFile(_TruthWriter):
         self._file.close()
 
 
-class AslWriter(_TruthWriter):
+class AslWriter:
     """An ASL folder: in ``mav0`` a folder of lossless images for each camera, ``imu0``, and
     ``state_groundtruth_estimate0`` where the truth is known; numbers are written so as to read back equal."""
 
@@ -150,7 +132,7 @@ class AslWriter(_TruthWriter):
         self._truth.write_true_values(t_ns, values)
 
 
-class _RosWriter(_TruthWriter):
+class _RosWriter:
     """What ROS 1 and ROS 2 have in common: messages, and a time of recording that keeps them in the order they came."""
 
     def __init__(
