@@ -5,7 +5,6 @@ A camera is a folder with a table ``data.csv`` and a folder ``data`` of images.
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Iterator, Mapping
 from heapq import merge
 from itertools import islice
@@ -88,10 +87,8 @@ class EurocDataset:
 
     @property
     def frame_count(self) -> int:
-        counts: Counter[int] = Counter()
-        for camera in range(len(self._folders)):
-            counts |= Counter(t_ns for t_ns, place, _ in self._images if place == camera)
-        return counts.total()
+        stamps = [t_ns for t_ns, _, _ in self._images]
+        return len(stamps) if len(self._folders) == 1 else len(set(stamps))
 
     @property
     def ground_truth(self) -> Trajectory | None:

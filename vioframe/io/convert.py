@@ -12,13 +12,11 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from heapq import merge
 from pathlib import Path
 
 from vioframe.errors import DatasetError
 from vioframe.geometry.trajectory import Trajectory
 from vioframe.io.calibration import sidecar_folder, write_calibration
-from vioframe.io.trajectories import true_values
 from vioframe.io.writers import AslWriter, McapWriter, RecordingWriter, Ros1Writer, Ros2Writer
 from vioframe.types import Calibration, FrameSet, ImuSample, Measurement, Unreadable
 
@@ -103,26 +101,19 @@ def convert(
 def write_recording(
     measurements: Iterable[Measurement], truth: Trajectory | None, writers: Sequence[RecordingWriter]
 ) -> Conversion:
-    """Hand all to each of ``writers``, the truth in its place by time."""
-    rows = () if truth is None else map(_TrueRow, truth.t_ns.tolist(), true_values(truth).tolist())
+    """Hand everything to each of ``writers``."""
     counts: Counter[type] = Counter()
-    items: Iterator[Measurement | _TrueRow] = merge(measurements, rows, key=lambda item: item.t_ns)
-    for item in items:
+    for writer in writers:
+        if truth is not None:
+            writer.write_truth(truth)
+    for measurement in measurements:
         for writer in writers:
-            if isinstance(item, FrameSet):
-                writer.write_frame(item)
-            elif isinstance(item, ImuSample):
-                writer.write_imu(item)
-            elif isinstance(item, _TrueRow):
-                writer.write_true_values(item.t_ns, item.values)
-        counts[type(item)] += 1
-    return Conversion(*(counts[kind] for kind in (FrameSet, ImuSample, _TrueRow, Unreadable)))
-
-
-@dataclass(frozen=True, slots=True)
-class _TrueRow:
-    t_ns: int
-    values: list[float]
+            if isinstance(measurement, FrameSet):
+                writer.write_frame(measurement)
+            elif isinstance(measurement, ImuSample):
+                writer.write_imu(measurement)
+        counts[type(measurement)] += 1
+    return Conversion(counts[FrameSet], counts[ImuSample], 0 if truth is None else len(truth), counts[Unreadable])
 
 
 @contextmanager

@@ -28,13 +28,21 @@ from vioframe.types import NS_PER_S, Float, Int
 _GZIP_MAGIC = b"\x1f\x8b"
 _MOTION_CAPTURE = re.compile(r"vicon|leica", re.IGNORECASE)
 _EUROC_COLUMNS = (8, 11, 17)
+_EUROC_HEADING = (
+    "#timestamp",
+    *(f" p_RS_R_{axis} [m]" for axis in "xyz"),
+    *(f" q_RS_{part} []" for part in "wxyz"),
+    *(f" v_RS_R_{axis} [m s^-1]" for axis in "xyz"),
+    *(f" b_w_RS_S_{axis} [rad s^-1]" for axis in "xyz"),
+    *(f" b_a_RS_S_{axis} [m s^-2]" for axis in "xyz"),
+)
 _QUAT_NORM_TOLERANCE = 0.01
 _INT64_MAX = 2**63 - 1
 
 
 @dataclass(frozen=True, eq=False)
 class TrueTrajectory(Trajectory):
-    """A trajectory that keeps what EuRoC's ground truth knows beside poses, and its numbers as they were given.
+    """A trajectory that knows velocity and biases too, as EuRoC's ground truth does, and keeps numbers as given.
 
     ``values`` (N, 7, 10 or 16) are ``p_WB`` and the quaternion wxyz (of any norm), then ``v_WB`` m/s, then
     ``bias_gyro_B`` rad/s and ``bias_accel_B`` m/s^2: the columns of EuRoC's file behind the stamp.
@@ -125,6 +133,18 @@ def write_tum(trajectory: Trajectory, path: str | Path) -> None:
     # Without a time of its own in the gzip header, equal trajectories give equal bytes.
     data = gzip.compress(text.encode(), mtime=0) if path.suffix == ".gz" else text.encode()
     path.write_bytes(data)
+
+
+def write_euroc(trajectory: Trajectory, path: str | Path) -> None:
+    """Write ``trajectory`` as a EuRoC csv of 17, 11 or 8 columns, as many as it knows; numbers read back equal."""
+    values = true_values(trajectory)
+    heading = ",".join(_EUROC_HEADING[: 1 + values.shape[1]])
+    if values.shape[1] == 7:
+        # Poses alone under EuRoC's names are its raw motion capture, which is refused as a truth.
+        heading = heading.replace("RS_R", "WB")
+    rows = zip(trajectory.t_ns.tolist(), values.tolist(), strict=True)
+    lines = (",".join([str(t_ns), *map(repr, row)]) + "\n" for t_ns, row in rows)
+    Path(path).write_text(heading + "\n" + "".join(lines), encoding="utf-8")
 
 
 def _tum_line(t_ns: int, p_WB: Float, quat_xyzw: Float) -> str:
