@@ -1,6 +1,7 @@
 """Readers: what is in a recording comes out exactly; what is wrong with one is said in a line, or counted."""
 
 import logging
+import re
 import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -38,6 +39,7 @@ from vioframe.io.convert import convert
 from vioframe.io.images import gathered
 from vioframe.io.memory import ArrayDataset
 from vioframe.io.synchronise import synchronise
+from vioframe.testing import check_dataset
 from vioframe.types import FrameSet, Image, ImuSample, Measurement, Unreadable
 from vioframe_euroc import EurocDataset
 from vioframe_rosbag import RosbagDataset
@@ -669,6 +671,13 @@ class TestArrays:
         convert(dataset.measurements(), dataset.calibration, tmp_path / "a.bag", truth=dataset.ground_truth)
         assert_equal(RosbagDataset(tmp_path / "a.bag").measurements(), pair_measurements())
 
+    def test_the_example_of_the_documentation(self) -> None:
+        page = Path(__file__).parents[1] / "docs" / "data.md"
+        (example,) = re.findall(r"^```python\n(.*?)^```", page.read_text(), re.MULTILINE | re.DOTALL)
+        defined: dict[str, Any] = {}
+        exec(example, defined)
+        assert len(list(synchronise(defined["dataset"].measurements(), incidents=Incidents()))) == 198
+
     @pytest.mark.parametrize(
         ("name", "change", "message"),
         [
@@ -691,6 +700,37 @@ class TestArrays:
         with pytest.raises(DatasetError, match=message) as caught:
             ArrayDataset(CALIBRATION, **(arrays | {name: change(arrays[name])}))
         one_line(caught)
+
+
+class TestConformance:
+    @pytest.mark.parametrize(("reader", "name"), [(EurocDataset, "pair"), (RosbagDataset, "pair.mcap")])
+    def test_the_built_in_readers_conform(self, tmp_path: Path, reader: type[Dataset], name: str) -> None:
+        convert(pair_measurements(), PAIR, tmp_path / name, truth=true_trajectory())
+        check_dataset(reader, tmp_path / name)
+        check_dataset(reader, tmp_path / name, cameras=["cam1"])
+
+    @pytest.mark.parametrize(
+        ("spoil", "message"),
+        [
+            (lambda images: images[:1], "a frame set has 1 places, the calibration 2 cameras"),
+            (lambda images: list(images), "the images of a frame set are a list, not a tuple"),
+            (lambda images: (None, None), "a frame set holds no image"),
+            (lambda images: (images[0], images[0]), r"an image of cam1 is \(64, 48\), the calibration for \(32, 24\)"),
+            (lambda images: (images[0].copy(), images[1]), "an image of cam0 is writeable"),
+            (lambda images: (images[0], images[1] * 1.0), r"an image of cam1 is \(24, 32\) float64"),
+        ],
+    )
+    def test_a_reader_that_breaks_a_promise_is_found_out(
+        self, tmp_path: Path, spoil: Callable[[Any], Any], message: str
+    ) -> None:
+        class Spoilt(EurocDataset):
+            def measurements(self) -> Iterator[Measurement]:
+                for m in super().measurements():
+                    yield FrameSet(m.t_ns, spoil(m.images)) if isinstance(m, FrameSet) else m
+
+        convert(pair_measurements(alone=()), PAIR, tmp_path / "pair")
+        with pytest.raises(AssertionError, match=message):
+            check_dataset(Spoilt, tmp_path / "pair")
 
 
 def test_the_real_recordings(shared_data: Path) -> None:
