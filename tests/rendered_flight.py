@@ -21,11 +21,11 @@ from vioframe.types import NS_PER_S, Calibration, FrameSet, ImuSample, Measureme
 WIDTH, HEIGHT = 376, 240
 FRAME_RATE_HZ = 10
 DURATION_S = 11.5
-# EuRoC's first camera, without its distortion, at half its resolution.
-CALIBRATION: Calibration = packaged_calibration("euroc", ["cam0"]).with_camera(
+# EuRoC's camera, without its distortion, at half its resolution.
+CALIBRATION: Calibration = packaged_calibration("euroc", cameras=["cam0"]).with_camera(
     0, model=Camera(229.0, 229.0, 187.5, 119.5, (0.0, 0.0, 0.0, 0.0), (WIDTH, HEIGHT))
 )
-(CAMERA,) = CALIBRATION.cameras
+CAMERA = CALIBRATION.cameras[0]
 # The flight "stop_and_go" begins with 4 s of rest, more than initialisation needs.
 _BEGIN_S = 2.5
 _START_NS = 100 * NS_PER_S
