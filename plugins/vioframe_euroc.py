@@ -16,7 +16,7 @@ import numpy as np
 from vioframe.errors import DatasetError
 from vioframe.interfaces import DatasetFactory
 from vioframe.io.calibration import match_cameras
-from vioframe.io.images import check_bit_depth, check_size, decode_image, gathered, single, to_gray8
+from vioframe.io.images import check_bit_depth, decode_image, frame_set, gathered
 from vioframe.parts.hooks import hookimpl
 from vioframe.types import FrameSet, ImuSample, Measurement, Unreadable
 
@@ -122,9 +122,7 @@ class EurocDataset:
             return Unreadable(t_ns, "frame_unreadable", f"{path.name}: {err.strerror}")
         if image is None:
             return Unreadable(t_ns, "frame_unreadable", f"{path.name} is damaged")
-        gray = to_gray8(image, self._bit_depth, str(folder))
-        check_size(gray, self.calibration.cameras[place].model, str(folder))
-        return single(t_ns, gray, place, len(self._folders))
+        return frame_set(t_ns, image, place, self.calibration, self._bit_depth, str(folder))
 
 
 def _mav0(path: Path) -> Path:

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import shutil
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Protocol, Self, TextIO
+from typing import Any, Self, TextIO
 
 import numpy as np
 
@@ -35,27 +35,28 @@ _IMU_HEADING = (
 )
 
 
-class RecordingWriter(Protocol):
+class RecordingWriter(ABC):
     """A recording being written; leaving its context completes it."""
 
-    def __enter__(self) -> Self: ...
+    def __enter__(self) -> Self:
+        return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None: ...
+    @abstractmethod
+    def __exit__(self, *error: object) -> None: ...
 
-    def write_frame(self, frames: FrameSet) -> None:
-        """The images there are, of the cameras in the order that the writer was told."""
-        ...
-
-    def write_imu(self, sample: ImuSample) -> None: ...
-
+    @abstractmethod
     def write_truth(self, truth: Trajectory) -> None:
         """All of the ground truth, with velocity and biases where it is a ``TrueTrajectory``."""
-        ...
+
+    @abstractmethod
+    def write_frame(self, frames: FrameSet) -> None:
+        """The images there are, of the cameras in the order that the writer was told."""
+
+    @abstractmethod
+    def write_imu(self, sample: ImuSample) -> None: ...
 
 
-class AslWriter:
+class AslWriter(RecordingWriter):
     """An ASL folder: in ``mav0`` a folder of lossless images for each camera, ``imu0``, and
     ``state_groundtruth_estimate0`` where the truth is known; numbers are written so as to read back equal."""
 
@@ -73,12 +74,7 @@ class AslWriter:
         file.write(heading)
         return file
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         for _, file in self._cameras:
             file.close()
         self._imu.close()
@@ -103,7 +99,7 @@ class AslWriter:
         write_euroc(truth, folder / "data.csv")
 
 
-class _RosWriter:
+class _RosWriter(RecordingWriter):
     """What ROS 1 and ROS 2 have in common: messages, and a time of recording that keeps them in the order they came."""
 
     def __init__(
@@ -123,13 +119,8 @@ class _RosWriter:
         for name in camera_names:
             self._connect(_image_topic(name), _IMAGE)
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._bag.__exit__(kind, error, trace)
+    def __exit__(self, *error: object) -> None:
+        self._bag.__exit__(*error)
 
     def write_frame(self, frames: FrameSet) -> None:
         for name, image in zip(self._camera_names, frames.images, strict=True):
@@ -242,11 +233,9 @@ class McapWriter(_RosWriter):
             bag.set_compression(CompressionMode.STORAGE, CompressionFormat[compression.upper()])
         super().__init__(bag, camera_names, *_ros2_types())
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        super().__exit__(kind, error, trace)
-        if kind is None:
+    def __exit__(self, *error: object) -> None:
+        super().__exit__(*error)
+        if error[0] is None:
             next(self._folder.glob("*.mcap")).rename(self._path)
         shutil.rmtree(self._folder)
 
