@@ -33,7 +33,7 @@ def small_calibration(divisor: int = 4, cameras: Sequence[str] = ("cam0",)) -> C
 def small_simulation(
     folder: Path, workers: int = 1, divisor: int = 4, rig: Calibration | None = None, **settings: Any
 ) -> SimulatedRecording:
-    """A recording of 188 x 120 px, by one camera unless a ``rig`` is given; the calibration is written to ``folder``."""
+    """A recording of 188 x 120 px, by one camera unless a ``rig`` is given; its calibration is kept in ``folder``."""
     files = folder / f"calibration_{len(list(folder.iterdir()))}"
     write_calibration(rig or small_calibration(divisor), files)
     config = SimulationConfig.model_validate({"duration_s": 1.0, "calibration": [files], **settings})
