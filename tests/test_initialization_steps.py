@@ -25,8 +25,7 @@ from vioframe.geometry import so3
 from vioframe.io.calibration import packaged_calibration
 from vioframe.simulation.flights import flight
 from vioframe.simulation.imu import ImuErrors, read_imu
-from vioframe.simulation.segments import cut_segments
-from vioframe.simulation.synthetic import simulated_sequence
+from vioframe.simulation.tracks import cut_segments, simulated_sequence
 from vioframe.types import DBA, DTHETA, GRAVITY_M_S2, Float, FrameTracks, ImuNoise, ImuSegment
 
 CALIBRATION = packaged_calibration("euroc")

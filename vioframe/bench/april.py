@@ -17,8 +17,7 @@ from vioframe.geometry import so3
 from vioframe.geometry.cameras import Camera
 from vioframe.geometry.trajectory import Trajectory
 from vioframe.io.calibration import packaged_calibration
-from vioframe.simulation import TrackSequence
-from vioframe.simulation.segments import cut_segments
+from vioframe.simulation import TrackSequence, cut_segments
 from vioframe.types import Calibration, Float, FrameTracks, Int
 
 CORNERS_PER_TAG = 4

@@ -5,7 +5,7 @@ import numpy as np
 from vioframe.errors import TrajectoryError
 from vioframe.geometry import so3
 from vioframe.geometry.trajectory import Trajectory
-from vioframe.simulation.poses import interpolate_poses
+from vioframe.simulation.scenario import interpolate_poses
 from vioframe.types import Float, Int
 
 _HALF_WINDOW_S = 0.5
