@@ -1,4 +1,4 @@
-"""The network in torch, as it is trained; its layers bear the names of the published checkpoints, which load as such."""
+"""The network in torch, as it is trained; its layers are named as in the published checkpoints, which load as such."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.nn.functional import avg_pool2d, grid_sample, interpolate, normalize, pad, pixel_shuffle, pixel_unshuffle
+from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from vioframe_keypointnet.architecture import CELL_PX, FAINT, FULL, Architecture
 from vioframe_keypointnet.weights import Weights
@@ -123,12 +124,16 @@ class KeypointNet(nn.Module):
 
 
 def of_weights(weights: Weights) -> KeypointNet:
-    """The network with ``weights``, ready to run."""
+    """The network with ``weights``, ready to run, each batch norm made part of the convolution before it."""
     network = KeypointNet(weights.architecture)
     # Counters of batches are all that may be missing: a weights file has been checked for the rest.
     state = {name: torch.from_numpy(np.array(values)) for name, values in weights.tensors.items()}
     network.load_state_dict(state, strict=False)
-    return network.eval()
+    network.eval()
+    for name, layer in list(network.named_children()):
+        if isinstance(layer, nn.Sequential):
+            network.add_module(name, fuse_conv_bn_eval(layer[0], layer[1]))
+    return network.to(memory_format=torch.channels_last)
 
 
 def locally_normalised(images: Tensor) -> Tensor:

@@ -158,8 +158,8 @@ def varies(image: Image, x: int, y: int, height: int, width: int, min_contrast: 
 class Peaks:
     """Selects among the peaks of responses.
 
-    A peak is the highest within :attr:`Rules.reach_px` along both axes, of equals the first row by row; its place is that of
-    the parabolas through it and its neighbours. Not taken: what :func:`select` leaves.
+    A peak is the highest within :attr:`Rules.reach_px` along both axes, of equals the first row by row; its
+    place is that of the parabolas through it and its neighbours. Not taken: what :func:`select` leaves.
     """
 
     def __init__(self, rules: Rules) -> None:

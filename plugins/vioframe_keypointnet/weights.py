@@ -1,10 +1,11 @@
 """Trained weights: one ``.safetensors`` file that also says which network it is of, and how it was trained.
 
 The metadata holds ``architecture``, a ``card`` (free JSON: data, schedule, figures) and, for int8 inference,
-``activation_ranges``, so that nobody who only runs the network needs images to calibrate it. Official checkpoints of KP2D,
-``{"state_dict": ..., "config": ...}``, are read too, without running any code they hold: torch's own restricted loader
-admits tensors and plain containers and nothing else; the one class it is told of in addition is the yacs ``CfgNode`` of
-``config``, a dictionary, in whose place it puts one of Python's own.
+``activation_ranges``, so that nobody who only runs the network needs images to calibrate it.
+
+Official checkpoints of KP2D, ``{"state_dict": ..., "config": ...}``, are read too, without running any code they hold:
+torch's own restricted loader admits tensors and plain containers and nothing else; the one class it is told of in
+addition is the yacs ``CfgNode`` of ``config``, a dictionary, in whose place it puts one of Python's own.
 """
 
 from __future__ import annotations
