@@ -15,7 +15,7 @@ from vioframe.types import Image, Keypoints
 from vioframe_keypointnet import runtimes
 from vioframe_keypointnet.architecture import Architecture
 from vioframe_keypointnet.options import KeypointNetOptions
-from vioframe_keypointnet.selection import Array, Peaks, Rules, describe, padded_to_cells, select
+from vioframe_keypointnet.selection import Array, Rules, describe, padded_to_cells, peaks, select
 from vioframe_keypointnet.weights import load
 
 Choose = Callable[[Array, Image, tuple[int, int], int], tuple[Array, Array]]
@@ -59,4 +59,4 @@ def keypointnet(options: KeypointNetOptions) -> KeypointNet:
 
 def chooser(architecture: Architecture, rules: Rules) -> Choose:
     """How keypoints are chosen among what a network of ``architecture`` finds."""
-    return Peaks(rules) if architecture.peaks else partial(select, rules=rules)
+    return partial(peaks if architecture.peaks else select, rules=rules)
