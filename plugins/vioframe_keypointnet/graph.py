@@ -60,8 +60,7 @@ def _build(graph: _Graph, weights: Weights, descriptors: bool) -> tuple[str, ...
             x = graph.node("MaxPool", [x], kernel_shape=[2, 2], strides=[2, 2])
     if architecture.peaks:
         response = _Convolution(RESPONSE, tensors["convR.weight"], tensors["convR.bias"], activated=False)
-        found = graph.convolve(response, after["2"])
-        found = graph.node("DepthToSpace", [found], blocksize=architecture.fold, mode="CRD")
+        found = graph.node("Transpose", [graph.convolve(response, after["2"])], perm=[0, 2, 3, 1])
     else:
         hidden = _stacked(HEADS, [_normalised(tensors, name) for name in ("Da", "Pa")])
         found = graph.convolve(_joint_output(tensors), graph.convolve(hidden, x))

@@ -79,14 +79,15 @@ class KeypointNet(nn.Module):
     def found(self, grey: Tensor, *, descriptors: bool) -> tuple[Tensor, ...]:
         """What is needed to choose keypoints of ``grey`` (B, 1, H, W) in [0, 1]; the exported graph gives the same.
 
-        (B, 3, H/8, W/8), before sigmoid and tanh, the score, x and y of each cell; of a network of peaks (B, 1, H, W),
-        the response of each pixel. Then, if asked for, (B, D, H/4, W/4) descriptors, not yet normalised.
+        (B, 3, H/8, W/8), before sigmoid and tanh, the score, x and y of each cell; of a network of peaks
+        (B, H/2, W/2, 4), the response of 2 x 2 pixels, row by row. Then, if asked for, (B, D, H/4, W/4) descriptors,
+        not normalised.
         """
         peaks = self.architecture.peaks
         images = grey.expand(-1, self.architecture.image_channels, -1, -1)
         after = self._encode(images, "1234" if descriptors or not peaks else "12")
         if peaks:
-            first = pixel_shuffle(self.convR(after["2"]), self.architecture.fold)
+            first = self.convR(after["2"]).permute(0, 2, 3, 1)
         else:
             first = torch.cat([self._score(after["4"]), self._place(after["4"])], dim=1)
         return (first, self._describe(after)) if descriptors else (first,)

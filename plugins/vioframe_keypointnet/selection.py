@@ -81,13 +81,13 @@ def candidate_places(heads: Array) -> tuple[Array, Array]:
     return np.clip(offset[0], 0.0, w * CELL_PX - 1.0), np.clip(offset[1], 0.0, h * CELL_PX - 1.0)
 
 
-def peaks(responses: Array, image: Image, shape: tuple[int, int], max_points: int, rules: Rules) -> tuple[Array, Array]:
-    """``xy`` (N, 2) px and ``score`` (N,) in (0, 1), strongest first, of the peaks of ``responses`` (1, H, W).
+def peaks(found: Array, image: Image, shape: tuple[int, int], max_points: int, rules: Rules) -> tuple[Array, Array]:
+    """``xy`` (N, 2) px and ``score`` (N,) in (0, 1), strongest first, of the peaks of ``found`` (H/2, W/2, 4).
 
     A peak is the highest of all pixels nearer than ``nms_px`` along both axes, of equals the first row by row; its
     place is that of the parabolas through it and its neighbours. Not taken: what :func:`select` leaves.
     """
-    response, reach = responses[0], max(ceil(rules.nms_px) - 1, 1)
+    response, reach = by_pixels(found), max(ceil(rules.nms_px) - 1, 1)
     # The highest pixels nearly always hold enough peaks; to look at and to sort all takes several times as long.
     for above in (_exceeded_by(response, _PIXELS_A_POINT * max_points), -np.inf):
         at = _peaks(response, np.float32(above), reach)
@@ -101,6 +101,16 @@ def peaks(responses: Array, image: Image, shape: tuple[int, int], max_points: in
     xy[:, 0] = x + _summits(response[y, x - 1], here, response[y, x + 1])
     xy[:, 1] = y + _summits(response[y - 1, x], here, response[y + 1, x])
     return xy, _sigmoid(here)
+
+
+def by_pixels(found: Array) -> Array:
+    """(H, W) of (H/2, W/2, 4), the values of 2 x 2 pixels, row by row."""
+    h, w, _ = found.shape
+    out = np.empty((2 * h, 2 * w), np.float32)
+    # Two of a row are moved as one: twice as fast.
+    pairs = np.ascontiguousarray(found).view(np.float64)
+    out.view(np.float64)[0::2], out.view(np.float64)[1::2] = pairs[..., 0], pairs[..., 1]
+    return out
 
 
 def describe(descriptors: Array, xy: Array) -> Array:
