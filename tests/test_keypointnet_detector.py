@@ -11,8 +11,8 @@ torch = pytest.importorskip("torch")
 
 from keypointnet_helpers import TINY, network, texture, weights  # noqa: E402
 
+from vioframe.bench.detectors.images import random_homography  # noqa: E402
 from vioframe.bench.detectors.metrics import score_pair  # noqa: E402
-from vioframe.bench.detectors.pairs import random_homography  # noqa: E402
 from vioframe.errors import ConfigError  # noqa: E402
 from vioframe.testing import check_detector  # noqa: E402
 from vioframe_keypointnet import vioframe_detectors  # noqa: E402

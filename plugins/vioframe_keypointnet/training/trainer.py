@@ -19,8 +19,8 @@ from torch import Tensor
 from torch.nn import Module
 from torch.optim import Adam
 
+from vioframe.bench.detectors.images import random_homography
 from vioframe.bench.detectors.metrics import score_pair
-from vioframe.bench.detectors.pairs import random_homography
 from vioframe.errors import ConfigError
 from vioframe.types import TrainingJob, TrainingStep
 from vioframe_keypointnet import weights
