@@ -34,6 +34,17 @@ class _Request:
     installed: Registry
     seed: int
     quiet: bool
+    given: dict[str, Any]
+    """Arguments of the one question by name."""
+
+    def __getitem__(self, name: str) -> Any:
+        return self.given[name]
+
+    @property
+    def workers(self) -> int:
+        from vioframe.bench.processes import usable_cores
+
+        return self["workers"] or usable_cores()
 
     def line_up(self, *, describing: bool = False) -> LineUp:
         """Those that can take part; asked for descriptors where these are of use."""
@@ -42,11 +53,11 @@ class _Request:
         entrants = [each.describing(self.installed) for each in self.entrants] if describing else self.entrants
         return line_up(entrants, self.installed)
 
-    def baseline(self, given: str | None) -> str:
+    def baseline(self) -> str:
         """The detector to lead over; raises :class:`ConfigError` where the one asked for does not take part."""
         from vioframe.bench.detectors.tables import BASELINE
 
-        labels = [entrant.label for entrant in self.entrants]
+        given, labels = self["baseline"], [entrant.label for entrant in self.entrants]
         if given is not None and given not in labels:
             raise ConfigError(f"--baseline {given} does not take part; one of {', '.join(labels)} can be led over")
         return given or BASELINE
@@ -132,15 +143,18 @@ def command(
 
     installed = registry.load()
     entrants = parse_entrants(detectors or everyone(installed, question), options, installed)
-    ask: dict[str, Callable[..., _Answer]] = {"speed": _speed, "quality": _quality, "frontend": _frontend}
-    answer = ask[question](_Request(entrants, installed, seed, quiet), **given)
+    ask = {"speed": _speed, "quality": _quality, "frontend": _frontend}
+    answer = ask[question](_Request(entrants, installed, seed, quiet, given))
     click.echo("\n\n".join(answer.tables))
     absent = answer.line_up.absent
     for label, reason in absent.items():
         click.echo(f"note: {label} does not take part: {reason}", err=True)
     if keep is not None:
         known = answer.result.astype(object).where(pd.notna(answer.result), None)
-        rows = [*known.to_dict("records"), *({"detector": label, "absent": reason} for label, reason in absent.items())]
+        rows: list[Any] = [
+            *known.to_dict("records"),
+            *({"detector": label, "absent": reason} for label, reason in absent.items()),
+        ]
         taking_part = {entrant.label: dict(entrant.options) for entrant, _ in answer.line_up.ready}
         record(keep, rows, {"question": question, "seed": seed, **answer.settings, "detectors": taking_part})
         click.echo(f"written to {keep}")
@@ -157,13 +171,13 @@ def _given(question: str, specific: dict[str, Any]) -> dict[str, Any]:
     return {name: specific[name] for name in _USES[question]}
 
 
-def _speed(asked: _Request, images: Path | None, limit: int | None, rounds: int | None) -> _Answer:
+def _speed(asked: _Request) -> _Answer:
     import pandas as pd
 
     from vioframe.bench.detectors import speed, tables
     from vioframe.bench.detectors.images import evenly, find_images, fit, procedural_images, read_grey
 
-    limit, rounds = limit or _SPEED_IMAGES, rounds or _SPEED_ROUNDS
+    images, limit, rounds = asked["images"], asked["limit"] or _SPEED_IMAGES, asked["rounds"] or _SPEED_ROUNDS
     if images is None:
         pictures, source = procedural_images(limit, speed.RESOLUTION, asked.seed), "drawn surfaces"
     else:
@@ -180,34 +194,27 @@ def _speed(asked: _Request, images: Path | None, limit: int | None, rounds: int 
     return _Answer(result, settings, [f"{heading}\n{tables.overview(result, tables.SPEED)}"], lined_up)
 
 
-def _quality(
-    asked: _Request,
-    images: Path | None,
-    hpatches: Path | None,
-    limit: int | None,
-    degradation: tuple[str, ...],
-    baseline: str | None,
-    workers: int | None,
-) -> _Answer:
+def _quality(asked: _Request) -> _Answer:
     from vioframe.bench.detectors import quality, tables
     from vioframe.bench.detectors.degradations import choose
     from vioframe.bench.detectors.images import evenly, hpatches_pairs, synthetic_pairs
 
+    images, hpatches = asked["images"], asked["hpatches"]
     if images is not None and hpatches is not None:
         raise ConfigError("--images and --hpatches are two sets of pairs; measure one at a time")
-    chosen, over = choose(degradation), asked.baseline(baseline)
+    chosen, over = choose(asked["degradation"]), asked.baseline()
     if images is not None:
         pairs, source = synthetic_pairs(images, asked.seed), f"{images.name}, synthetic homographies"
     elif hpatches is not None:
         pairs, source = hpatches_pairs(hpatches), "HPatches"
     else:
         raise DatasetError("no images given: --images DIR for any photographs, or --hpatches DIR")
-    pairs = evenly(pairs, limit)
+    pairs = evenly(pairs, asked["limit"])
     lined_up = asked.line_up(describing=True)
     entrants = [entrant for entrant, _ in lined_up.ready]
     with asked.watch("pairs", len(pairs)) as on_done:
         scores = quality.score_detectors(
-            entrants, pairs, chosen, seed=asked.seed, workers=_workers(workers), on_pairs=on_done
+            entrants, pairs, chosen, seed=asked.seed, workers=asked.workers, on_pairs=on_done
         )
     settings = {"pairs": source, "pair_count": len(pairs), "resolution": quality.RESOLUTION, "top_k": quality.TOP_K}
     heading = (
@@ -218,31 +225,23 @@ def _quality(
     return _Answer(result, {**settings, "baseline": over}, tables.swept("quality", heading, result, over), lined_up)
 
 
-def _frontend(
-    asked: _Request,
-    dataset: Path | None,
-    degradation: tuple[str, ...],
-    baseline: str | None,
-    start: float | None,
-    duration: float | None,
-    ground_truth: Path | None,
-    workers: int | None,
-) -> _Answer:
+def _frontend(asked: _Request) -> _Answer:
     from vioframe.bench.detectors import flight, tables
     from vioframe.bench.detectors.degradations import choose
 
-    if dataset is None:
+    if asked["dataset"] is None:
         raise DatasetError(
             "no recording given: `vioframe bench detectors --frontend DATASET`; `vioframe simulate` makes some"
         )
-    chosen, over = choose(degradation), asked.baseline(baseline)
-    stretch = flight.Stretch(dataset, start or 0.0, _FLIGHT_S if duration is None else duration, ground_truth)
+    chosen, over = choose(asked["degradation"]), asked.baseline()
+    duration_s = _FLIGHT_S if asked["duration"] is None else asked["duration"]
+    stretch = flight.Stretch(asked["dataset"], asked["start"] or 0.0, duration_s, asked["ground_truth"])
     name = flight.check(stretch, asked.installed)
     lined_up = asked.line_up()
     entrants = [entrant for entrant, _ in lined_up.ready]
     with asked.watch("flights", len(chosen)) as on_done:
         result = flight.fly_detectors(
-            entrants, stretch, chosen, seed=asked.seed, workers=_workers(workers), baseline=over, on_flight=on_done
+            entrants, stretch, chosen, seed=asked.seed, workers=asked.workers, baseline=over, on_flight=on_done
         )
     settings = {
         "dataset": name,
@@ -257,9 +256,3 @@ def _frontend(
         f"within {flight.INLIER_PX:g} px of the true epipolar line over {flight.BASELINE_FRAMES} frames"
     )
     return _Answer(result, settings, tables.swept("frontend", heading, result, over), lined_up)
-
-
-def _workers(given: int | None) -> int:
-    from vioframe.bench.processes import usable_cores
-
-    return given or usable_cores()
