@@ -262,7 +262,7 @@ def tracks(*ids_by_frame, xy=None):
     out = []
     for k, ids in enumerate(ids_by_frame):
         places = np.zeros((len(ids), 2)) if xy is None else np.array(xy[k], float).reshape(-1, 2)
-        out.append(FrameTracks(k, np.array(ids, np.int64), places, places))
+        out.append(FrameTracks(k, np.array(ids, np.int64), np.zeros(len(ids), np.int64), places, places))
     return out
 
 

@@ -108,8 +108,9 @@ def gather(sources: Sequence[Path], channels: int, frames_per_recording: int) ->
                 raise ConfigError(f"{source} holds neither photographs nor a recording: {error}") from error
             pictures += found
         else:
-            for number, frame in frames_of(dataset, frames_per_recording):
-                pictures.append(Picture(f"{source}#{number}", _with_channels(frame.image, channels, str(source))))
+            for number, frames in frames_of(dataset, frames_per_recording):
+                image = next(image for image in frames.images if image is not None)
+                pictures.append(Picture(f"{source}#{number}", _with_channels(image, channels, str(source))))
     return pictures
 
 

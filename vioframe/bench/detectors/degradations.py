@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from vioframe.errors import ConfigError
 from vioframe.parts.options import did_you_mean
-from vioframe.simulation.sensor import digitise
+from vioframe.simulation.camera import digitise
 from vioframe.types import Float, Image
 
 _WHITE = 255.0
