@@ -13,8 +13,7 @@ from itertools import product
 import numpy as np
 
 from vioframe.bench.processes import installed, map_in_processes
-from vioframe.bench.results import backend_row
-from vioframe.bench.run import BackendRun, run_backend
+from vioframe.bench.run import BackendRun, backend_row, run_backend
 from vioframe.errors import ConfigError, TrajectoryError
 from vioframe.estimation.lifecycle import warm_up
 from vioframe.estimation.options import EstimationOptions

@@ -13,10 +13,10 @@ from vioframe.bench.detectors.degradations import Circumstances, Degradation
 from vioframe.bench.detectors.entrants import Entrant
 from vioframe.bench.detectors.leads import BASELINE, lead_of_shares
 from vioframe.bench.detectors.tracks import coverage, lives
-from vioframe.bench.epipolar import epipolar_errors_px
 from vioframe.bench.processes import map_in_processes, single_threaded
 from vioframe.bench.results import Row
 from vioframe.errors import ConfigError, DatasetError
+from vioframe.evaluation.epipolar import epipolar_errors_px
 from vioframe.frontend import Frontend, FrontendOptions
 from vioframe.frontend.refill import GRID
 from vioframe.geometry.trajectory import Trajectory
