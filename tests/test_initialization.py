@@ -8,9 +8,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from april_board import april_sequence
 from initialization_helpers import Errors, Motion, first_estimate, judge, seen_by, velocity_of, without_points
 
-from vioframe.bench.april import april_sequence
 from vioframe.estimation.initialization import InitialEstimate, Initializer
 from vioframe.estimation.initialization.attitude import level_rotation
 from vioframe.frontend import Frontend, FrontendOptions

@@ -13,9 +13,9 @@ import pandas as pd
 from vioframe.bench.detectors.degradations import Circumstances, Degradation
 from vioframe.bench.detectors.entrants import Entrant
 from vioframe.bench.detectors.tables import BASELINE, CONFIDENCE
-from vioframe.bench.epipolar import epipolar_errors_px
 from vioframe.bench.processes import map_in_processes, single_threaded
 from vioframe.errors import ConfigError, DatasetError
+from vioframe.evaluation.epipolar import epipolar_errors_px
 from vioframe.frontend import Frontend, FrontendOptions
 from vioframe.frontend.refill import GRID
 from vioframe.geometry.trajectory import Trajectory
