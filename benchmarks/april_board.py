@@ -18,7 +18,6 @@ from vioframe.geometry.trajectory import Trajectory
 from vioframe.io.calibration import packaged_calibration
 from vioframe.simulation import TrackSequence, cut_segments
 from vioframe.simulation.scenario import interpolate_poses
-from vioframe.simulation.tracks import cut_segments
 from vioframe.types import Calibration, Float, FrameTracks, Int
 
 CORNERS_PER_TAG = 4

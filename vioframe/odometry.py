@@ -1,9 +1,10 @@
-"""Visual-inertial odometry, measurement by measurement: push what the sensors bring, get what is known after each frame.
+"""Visual-inertial odometry: push what the sensors bring, get what is known after each frame.
 
     measurements -> packets -> tracks -> estimate -> files -> report
 
-:class:`Odometry` is the main loop. A recording is pushed through it by :mod:`vioframe.pipeline`, a live camera by anybody;
-a recorder, a progress bar and a loop closer are consumers of the :class:`~vioframe.types.Step` objects it gives.
+:class:`Odometry` is the main loop. A recording is pushed through it by :mod:`vioframe.pipeline`, a live camera by
+anybody; a recorder, a progress bar and a loop closer are consumers of the :class:`~vioframe.types.Step` objects it
+gives.
 """
 
 from __future__ import annotations

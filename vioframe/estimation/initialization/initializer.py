@@ -20,8 +20,8 @@ _log = logging.getLogger("vioframe.estimation.initialization")
 class Initializer:
     """Tries the static method at every frame, and the dynamic one every so often, until one is sure of itself.
 
-    Where the camera's rotation on the body is not known both wait for its hand-eye calibration, which is done once. Every
-    attempt is logged to ``vioframe.estimation.initialization``.
+    Where the camera's rotation on the body is not known both wait for its hand-eye calibration, which is done once.
+    Every attempt is logged to ``vioframe.estimation.initialization``.
     """
 
     def __init__(self, calibration: Calibration, options: InitializationOptions | None = None) -> None:
