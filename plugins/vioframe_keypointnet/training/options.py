@@ -39,6 +39,8 @@ class TrainingOptions:
     """Pairs an epoch; null: each image once."""
     learning_rate: PositiveFloat = 1e-3
     """Of Adam; 1e-4 is usual for fine-tuning."""
+    photometric_probability: Annotated[float, Field(ge=0.0, le=1.0)] = 0.5
+    """Of each effect of light, lens and sensor on a view; small networks do better with 0.25."""
     frames_per_recording: PositiveInt = 200
     """Images taken, evenly, from each recording."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
