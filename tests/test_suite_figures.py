@@ -11,17 +11,17 @@ import pytest
 from click.testing import CliRunner
 from matplotlib import colors
 from suite_helpers import MadeUp, comparison, labels, stress
+from vioframe.report.suite.pooled import BAND_M, inside, pool_relative
+from vioframe.report.suite.results import Data, SuiteResults
+from vioframe.report.suite.stress import curves
 
 from vioframe.cli import main
 from vioframe.report.style import RC
 from vioframe.report.suite import figures as module
 from vioframe.report.suite import figures_cost, figures_flights, figures_spread, figures_stress
 from vioframe.report.suite.figures import figures, write_figures
-from vioframe.report.suite.pooled import BAND_M, inside, pool_relative
 from vioframe.report.suite.report import write_report
-from vioframe.report.suite.results import Data, SuiteResults
 from vioframe.report.suite.statistics import groups
-from vioframe.report.suite.stress import curves
 
 PNG = b"\x89PNG\r\n\x1a\n"
 
