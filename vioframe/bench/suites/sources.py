@@ -15,7 +15,6 @@ from vioframe.parts.registry import FLIGHT, Registry
 from vioframe.runs.results import Data
 from vioframe.simulation import config as simulation
 from vioframe.simulation.config import MANIFEST, SimulationConfig, simulation_folder
-
 from vioframe.simulation.scenario import GROUND_TRUTH_FILES, find_file, motion_files, sensor_folder
 
 DEFAULT_STAND_IN_S = 30.0

@@ -73,7 +73,8 @@ def _draw(case: Case, caption: str) -> Any:
     spatial = any(trace["type"] == "scatter3d" for trace in columns[0][1])
     width = max(_NARROWEST_INCH, (_COLUMN_INCH if rows > 1 or spatial else 6.0) * len(columns))
     height = 5.2 if spatial else max(_ROW_INCH * rows, _categories(columns)) + 1.5
-    if case.pictures[0][1].get("equal"):
+    equal = bool(columns[0][2].get("equal"))
+    if equal:
         every = (np.concatenate([trace[axis] for trace in columns[0][1]]) for axis in "xy")
         across, up = (np.nanmax(values) - np.nanmin(values) for values in every)
         height = float(np.clip(6.0 * up / across, 1.2, 8.0)) + 1.6
@@ -86,10 +87,9 @@ def _draw(case: Case, caption: str) -> Any:
             _panel(ax, own, layout, row, by_backend=bool(title))
             ax.set_ylabel("" if k and not spatial else ax.get_ylabel())
         panels[0, k].set_title(title or layout.get("title", {}).get("text", ""), pad=22 if rows > 1 else None)
-    if not spatial:
-        for row in panels:
-            _same_scale(row)
-        canvas.align_ylabels(panels[:, 0])
+    for row in () if spatial or equal else panels:
+        _same_scale(row)
+    canvas.align_ylabels(() if spatial else panels[:, 0])
     _legend(canvas, columns)
     letters = int(_LETTERS_AN_INCH * width)
     canvas.supxlabel(fill(caption, letters), fontsize=10, color="#555555", x=0.01, ha="left")
