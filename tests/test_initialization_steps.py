@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from vioframe.estimation.inertial.imu_factors import ImuFactors, StateArrays
+from vioframe.estimation.factors.inertial import ImuFactors, StateArrays
 from vioframe.estimation.inertial.preintegration import Preintegrated, preintegrate
 from vioframe.estimation.initialization import bundle_adjustment, landmarks, static
 from vioframe.estimation.initialization.alignment import _solve_on_gravity_sphere, align, rotations

@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.stats import chi2
 
+from vioframe.estimation.factors.tracks import TrackTable
 from vioframe.estimation.initialization import Starter
 from vioframe.estimation.recovery import DivergedError, check_plausible, noise_over
 from vioframe.estimation.standstill import StandstillDetector
@@ -17,7 +18,6 @@ from vioframe.types import Calibration, Estimate, FrameTracks, ImuSegment, NavSt
 from vioframe_msckf.options import MsckfOptions
 from vioframe_msckf.standstill import hold_still
 from vioframe_msckf.state import EXTRINSICS, FilterState
-from vioframe_msckf.tracks import ObservationTable
 from vioframe_msckf.updates import promote_tracks, select_tracks, update_from_landmarks, update_from_tracks
 
 
@@ -40,7 +40,7 @@ class Msckf:
         dof = np.arange(1, 2 * self._options.max_clones + 3)
         self._gate = np.concatenate([[0.0], chi2.ppf(self._options.gate_quantile, dof)])
         self._state: FilterState | None = None
-        self._observations = ObservationTable()
+        self._observations = TrackTable()
         self._standstill = StandstillDetector(self._options.standstill_disparity_px)
         self._seeing_ns = 0
         if initial_state is not None:
@@ -90,7 +90,7 @@ class Msckf:
         observations.drop(np.concatenate([selection.finished, promoted]))
         if len(state.clones) >= options.max_clones:
             state.drop_oldest_clone()
-            observations.drop_oldest_frame()
+            observations.drop_frame(0)
         watch.lap("marginalise")
 
         if len(ids) or used:
@@ -131,7 +131,7 @@ class Msckf:
         if found is not None and options.calibrate_extrinsics:
             rotation = slice(EXTRINSICS.start, EXTRINSICS.start + 3)
             self._state.cov[rotation, rotation] = found.cov
-        self._observations = ObservationTable()
+        self._observations = TrackTable()
         self._seeing_ns = nav.t_ns
 
     def _check(self, state: NavState) -> None:

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vioframe.estimation.inertial.imu_factors import ImuFactors, StateArrays
+from vioframe.estimation.factors.inertial import ImuFactors, StateArrays
 from vioframe.estimation.initialization import landmarks as lm
 from vioframe.estimation.initialization.landmarks import Observations
 from vioframe.types import DBA, DBG, DP, Calibration, Float

@@ -12,7 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from vioframe.estimation.inertial.imu_factors import ImuFactors, StateArrays
+from vioframe.estimation.factors.inertial import ImuFactors, StateArrays
 from vioframe.estimation.inertial.preintegration import Preintegrated, preintegrate
 from vioframe.estimation.initialization import bundle_adjustment
 from vioframe.estimation.initialization import landmarks as lm

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vioframe.estimation.inertial.imu_factors import StateArrays
+from vioframe.estimation.factors.inertial import StateArrays
 from vioframe.estimation.initialization.window import Window
 from vioframe.geometry import so3
 from vioframe.types import Calibration, Float, Int

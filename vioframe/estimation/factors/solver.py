@@ -1,4 +1,5 @@
-"""Levenberg-Marquardt over the window (Madsen, Nielsen, Tingleff, "Methods for non-linear least squares", 2004)."""
+"""Levenberg-Marquardt over the factors of a window (Madsen, Nielsen, Tingleff, "Methods for non-linear least squares",
+2004)."""
 
 from __future__ import annotations
 
@@ -9,9 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg.lapack import dpotrf, dpotrs
 
-from vioframe.estimation.recovery import DivergedError
-from vioframe.types import Float
-from vioframe_sliding_window.problem import Problem, Variables
+from vioframe.arrays import Float
+from vioframe.estimation.factors.problem import Problem, Variables
 
 _FIRST_DAMPING, _LARGEST_DAMPING = 1e-6, 1e3
 _RELATIVE_DECREASE = 1e-3
@@ -31,7 +31,7 @@ def solve(
 ) -> Solution:
     """Minimise from ``x`` over the entries ``active`` of the error vector; the others stay.
 
-    ``max_seconds`` ends it early, where it is not zero. Raises :class:`DivergedError` where nothing finite comes out.
+    ``max_seconds`` ends it early, where it is not zero. Raises ``LinAlgError`` where nothing finite comes out.
     """
     begin_s = perf_counter()
     damping, cost = _FIRST_DAMPING, problem.cost(x)
@@ -56,12 +56,12 @@ def solve(
 
 
 def solve_positive(S: Float, g: Float) -> Float:
-    """S^-1 g for a positive definite S (n, n), g (n,) or (n, m); raises :class:`DivergedError` for any other."""
+    """S^-1 g for a positive definite S (n, n), g (n,) or (n, m); raises ``LinAlgError`` for any other."""
     # Jacobi scaling: the entries of S differ by many orders of magnitude.
     scale = 1.0 / np.sqrt(np.maximum(np.diag(S), 1e-12))
     L, bad = dpotrf(S * scale[:, None] * scale, lower=1, overwrite_a=1)
     if bad:
-        raise DivergedError("the window's equations are not positive definite")
+        raise np.linalg.LinAlgError("the window's equations are not positive definite")
     scaled = (scale * g.T).T
     out, _ = dpotrs(L, scaled, lower=1)
     return np.asarray((scale * out.T).T)
@@ -69,5 +69,5 @@ def solve_positive(S: Float, g: Float) -> Float:
 
 def _finite(solution: Solution) -> Solution:
     if not np.isfinite(solution.cost):
-        raise DivergedError("the window's estimate is not finite")
+        raise np.linalg.LinAlgError("the window's estimate is not finite")
     return solution
