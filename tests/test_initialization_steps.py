@@ -8,16 +8,18 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from vioframe.estimation.factors.inertial import ImuFactors, StateArrays
+from vioframe.estimation.factors.inertial import StateArrays
+from vioframe.estimation.factors.landmarks import camera_poses, positions
+from vioframe.estimation.factors.problem import Problem, Variables
+from vioframe.estimation.factors.reprojection import Calibrated
 from vioframe.estimation.inertial.preintegration import Preintegrated, preintegrate
-from vioframe.estimation.initialization import bundle_adjustment, landmarks, static
+from vioframe.estimation.initialization import static
 from vioframe.estimation.initialization.alignment import _solve_on_gravity_sphere, align, rotations
 from vioframe.estimation.initialization.attitude import level_rotation
-from vioframe.estimation.initialization.bundle_adjustment import Problem
+from vioframe.estimation.initialization.bundle_adjustment import adjusted, adjustment, covariance
 from vioframe.estimation.initialization.estimate import RefusalError
 from vioframe.estimation.initialization.gyro_bias import estimate_gyro_bias
 from vioframe.estimation.initialization.judgement import scale_sigma
-from vioframe.estimation.initialization.landmarks import Observations
 from vioframe.estimation.initialization.options import InitializationOptions
 from vioframe.estimation.initialization.structure import solve_structure
 from vioframe.estimation.initialization.window import Window, build_window, spread_indices
@@ -92,14 +94,14 @@ def scene(
     return Scene(window, truth, p_WF[keep])
 
 
-def problem_of(s: Scene, pixels: float = 1.0) -> tuple[Problem, Float]:
-    """The bundle adjustment of a scene, and its true landmarks [x y rho]."""
-    observations = Observations.of(s.window)
-    host = observations.frame[observations.start]
-    R_WC = s.truth.R_WB @ CALIBRATION.R_BC
-    p_C = np.einsum("lji,lj->li", R_WC[host], s.p_WF - (s.truth.p_WB + s.truth.R_WB @ CALIBRATION.p_BC)[host])
-    problem = Problem(observations, ImuFactors.stack(s.imu()), CALIBRATION, pixels * PIXEL, 0.2, 0.15)
-    return problem, np.column_stack([p_C[:, :2] / p_C[:, 2:], 1.0 / p_C[:, 2]])
+def problem_of(s: Scene) -> tuple[Problem, Variables]:
+    """The bundle adjustment of a scene, and its true values."""
+    camera = Calibrated(CALIBRATION.R_BC, CALIBRATION.p_BC)
+    R_WC, p_WC = camera_poses(s.truth, camera)
+    host = s.window.seen.argmax(axis=0)
+    p_C = np.einsum("lji,lj->li", R_WC[host], s.p_WF - p_WC[host])
+    truth = Variables(s.truth, camera, np.column_stack([p_C[:, :2] / p_C[:, 2:], 1.0 / p_C[:, 2]]))
+    return adjustment(s.window, s.imu(), truth, CALIBRATION.camera.focal_px, InitializationOptions()), truth
 
 
 class TestGyroBias:
@@ -210,40 +212,12 @@ class TestAlignment:
 
 
 class TestBundleAdjustment:
-    def test_projection_vanishes_at_the_truth(self):
+    def test_errors_vanish_at_the_truth(self):
         s = scene()
         problem, truth = problem_of(s)
-        r, depth_ratio = landmarks.project(s.truth, truth, problem.observations, CALIBRATION)
-        np.testing.assert_allclose(r, 0.0, atol=1e-12)
-        assert (depth_ratio > 0.0).all()
-        np.testing.assert_allclose(
-            landmarks.positions(s.truth, truth, problem.observations, CALIBRATION), s.p_WF, atol=1e-9
-        )
-
-    def test_projection_jacobians_on_the_manifold(self):
-        s = scene(1.0)
-        problem, points = problem_of(s)
-        obs = problem.observations
-        r, J_frame, J_host, J_landmark = landmarks.linearise(s.truth, points, obs, CALIBRATION)
-        np.testing.assert_array_equal(r, landmarks.project(s.truth, points, obs, CALIBRATION)[0])
-        h, M = 1e-6, np.arange(len(r))
-
-        def change(states: StateArrays, moved: Float) -> Float:
-            return landmarks.project(states, moved, obs, CALIBRATION)[0]
-
-        by_pose = np.zeros((len(r), 2, 11, 6))
-        by_pose[M, :, obs.frame] += J_frame
-        by_pose[M, :, obs.host] += J_host
-        for k in range(11):
-            for i in range(6):
-                step = np.zeros((11, 15))
-                step[k, i] = h
-                numeric = (change(s.truth.retract(step), points) - change(s.truth.retract(-step), points)) / (2.0 * h)
-                np.testing.assert_allclose(by_pose[:, :, k, i], numeric, atol=1e-8)
-        for i in range(3):
-            step = h * np.eye(3)[i]
-            numeric = (change(s.truth, points + step) - change(s.truth, points - step)) / (2.0 * h)
-            np.testing.assert_allclose(J_landmark[:, :, i], numeric, atol=1e-8)
+        np.testing.assert_allclose(problem.sightings.errors(truth.poses, truth.camera, truth.landmarks), 0.0, atol=1e-9)
+        hosts = problem.sightings.seen.argmax(axis=1)
+        np.testing.assert_allclose(positions(s.truth, truth.camera, hosts, truth.landmarks), s.p_WF, atol=1e-9)
 
     def test_finds_back_from_far_off(self):
         s = scene()
@@ -251,14 +225,19 @@ class TestBundleAdjustment:
         rng = np.random.default_rng(0)
         sigma = np.repeat([0.05, 0.1, 0.1, 0.005, 0.05], 3)
         start = s.truth.retract(rng.normal(0.0, sigma, (11, 15)))
-        points = truth + rng.normal(0.0, [0.01, 0.01, 0.05], truth.shape)
-        solution = bundle_adjustment.solve(problem, start, points)
+        points = truth.landmarks + rng.normal(0.0, [0.01, 0.01, 0.05], truth.landmarks.shape)
+        start = replace(truth, states=start, landmarks=points)
+        problem = adjustment(s.window, s.imu(), start, CALIBRATION.camera.focal_px, InitializationOptions())
+        solution = adjusted(problem, start)
+        states = solution.variables.states
         assert solution.converged
+        # The first state has not moved, nor turned about gravity.
+        np.testing.assert_allclose(states.p_WB[0], start.states.p_WB[0], atol=1e-6)
+        assert abs(so3.log(states.R_WB[0] @ start.states.R_WB[0].T)[2]) < 1e-3
         # The prior pulls the accelerometer's bias a little towards zero, and tilt with it.
-        assert solution.cost < bundle_adjustment._cost(problem, s.truth, truth) + 1e-9
-        relative = np.swapaxes(solution.states.R_WB[:1], -1, -2) @ solution.states.R_WB
+        relative = np.swapaxes(states.R_WB[:1], -1, -2) @ states.R_WB
         np.testing.assert_allclose(relative, s.truth.R_WB[:1].swapaxes(-1, -2) @ s.truth.R_WB, atol=2e-4)
-        size = np.linalg.norm(solution.states.p_WB[-1] - solution.states.p_WB[0])
+        size = np.linalg.norm(states.p_WB[-1] - states.p_WB[0])
         np.testing.assert_allclose(size, np.linalg.norm(s.truth.p_WB[-1] - s.truth.p_WB[0]), rtol=5e-3)
 
     def test_covariance_is_honest(self):
@@ -269,9 +248,9 @@ class TestBundleAdjustment:
             bias_accel = np.random.default_rng(100 + seed).normal(0.0, 0.15, 3)
             s = scene(1.0, seed, noise=NOISE, bias_accel=bias_accel)
             problem, truth = problem_of(s)
-            solution = bundle_adjustment.solve(problem, s.truth, truth)
-            cov = bundle_adjustment.covariance(problem, solution)
-            newest, true = solution.states[-1:], s.truth[-1:]
+            x = adjusted(problem, truth).variables
+            cov = covariance(problem, x, InitializationOptions())
+            newest, true = x.states[-1:], s.truth[-1:]
             yaw = so3.log(newest.R_WB[0] @ true.R_WB[0].T)[2]
             turn = so3.exp([0.0, 0.0, yaw])
             error = np.concatenate(
@@ -289,8 +268,8 @@ class TestBundleAdjustment:
             basis[:2, :3], basis[2:, 3:] = horizontal, np.eye(9)
             e = basis @ error
             distances.append(e @ np.linalg.solve(basis @ P @ basis.T, e))
-            q, p = (x - x.mean(axis=0) for x in (solution.states.p_WB, s.truth.p_WB @ turn.T))
-            scales.append(((q * p).sum() / (p * p).sum() - 1.0) / scale_sigma(solution.states.p_WB, cov))
+            q, p = (path - path.mean(axis=0) for path in (x.states.p_WB, s.truth.p_WB @ turn.T))
+            scales.append(((q * p).sum() / (p * p).sum() - 1.0) / scale_sigma(x.states.p_WB, cov))
         low, high = chi2.ppf([0.001, 0.999], 11 * len(distances)) / len(distances)
         assert low < np.mean(distances) < high
         low, high = chi2.ppf([0.001, 0.999], len(scales)) / len(scales)

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from vioframe.estimation.initialization import dynamic
 from vioframe.types import NS_PER_S, Calibration, FrameTracks, ImuSegment, NavState, g_W
 from vioframe_loose_ekf.backend import LooseEkf
 from vioframe_loose_ekf.options import LooseEkfOptions
@@ -11,6 +12,7 @@ _FRAMES, _PERIOD_NS, _SPEED_M_S, _POINTS = 8, NS_PER_S // 10, 1.0, 60
 
 def warm_up(calibration: Calibration) -> None:
     """Fly sideways past a wall of points, long enough to make a map and a keyframe."""
+    dynamic.warm_up(calibration)
     right_W = calibration.R_BC[:, 0]
     rng = np.random.default_rng(0)
     p_CF = rng.uniform([-1.0, -1.0, 3.0], [1.0, 1.0, 5.0], (_POINTS, 3))

@@ -3,6 +3,7 @@
 import numpy as np
 
 from vioframe.estimation.inertial.preintegration import preintegrate
+from vioframe.estimation.initialization import dynamic
 from vioframe.types import NS_PER_S, Calibration, FrameTracks, ImuSegment, NavState, g_W
 from vioframe_msckf.backend import Msckf
 from vioframe_msckf.options import MsckfOptions
@@ -12,6 +13,7 @@ _FRAMES, _PERIOD_NS, _SPEED_M_S = 6, NS_PER_S // 10, 1.0
 
 def warm_up(calibration: Calibration) -> None:
     """Fly a small filter sideways past a wall of points, long enough to come through every update once."""
+    dynamic.warm_up(calibration)
     right_W = calibration.R_BC[:, 0]
     rng = np.random.default_rng(0)
     p_CF = rng.uniform([-1.0, -1.0, 3.0], [1.0, 1.0, 5.0], (20, 3))

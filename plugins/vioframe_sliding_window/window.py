@@ -159,7 +159,11 @@ class Window:
         options, rows = self._options, np.flatnonzero(self.tracks.known)
         problem = self._problem(rows)
         solution = solve(
-            problem, self._variables(rows), self._active(), options.max_iterations, 1e-3 * options.max_solve_ms
+            problem,
+            self._variables(rows),
+            self._active(),
+            options.max_iterations,
+            max_seconds=1e-3 * options.max_solve_ms,
         )
         x = solution.variables
         self._states, self._camera, self.tracks.landmarks[rows] = x.states, x.camera, x.landmarks

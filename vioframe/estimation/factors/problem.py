@@ -131,7 +131,7 @@ class Problem:
         d = self.prior.difference(x)
         total = 0.5 * d @ self.prior.H @ d + self.prior.b @ d
         total += self.sightings.cost(x.poses, x.camera, x.landmarks)
-        r = self._reading_residuals(x.states)
+        r = self.reading_residuals(x.states)
         total += 0.5 * float((r * r).sum())
         for k, still in self.still.items():
             total += 0.5 * float(((_still_residual(still, x.states, k) / still.sigma) ** 2).sum())
@@ -158,8 +158,8 @@ class Problem:
         b[columns] += b_visual
         return Normal(H, b, V, W, c, columns)
 
-    def _reading_residuals(self, states: StateArrays) -> Float:
-        """Whitened, (count, 15)."""
+    def reading_residuals(self, states: StateArrays) -> Float:
+        """Of the readings between each state and the next, whitened, (count, 15)."""
         count = len(self.readings.dt_s)
         r = self.readings.residuals(states[:count], states[1 : count + 1])
         return np.asarray((self.readings.sqrt_information @ r[..., None])[..., 0])
@@ -168,7 +168,7 @@ class Problem:
         count = len(self.readings.dt_s)
         if not count:
             return
-        r = self._reading_residuals(states)
+        r = self.reading_residuals(states)
         _, J_i, J_j = self.readings.linearise(first[:count], first[1 : count + 1])
         J = self.readings.sqrt_information @ np.concatenate([J_i, J_j], axis=2)
         J_T = np.swapaxes(J, -1, -2)

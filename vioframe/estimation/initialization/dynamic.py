@@ -12,21 +12,22 @@ from dataclasses import replace
 
 import numpy as np
 
-from vioframe.estimation.factors.inertial import ImuFactors, StateArrays
+from vioframe.estimation.factors.inertial import StateArrays
+from vioframe.estimation.factors.landmarks import positions
+from vioframe.estimation.factors.problem import Problem, Variables
+from vioframe.estimation.factors.reprojection import Calibrated
+from vioframe.estimation.factors.solver import Solution
 from vioframe.estimation.inertial.preintegration import Preintegrated, preintegrate
-from vioframe.estimation.initialization import bundle_adjustment
-from vioframe.estimation.initialization import landmarks as lm
 from vioframe.estimation.initialization.alignment import Alignment, align, rotations
 from vioframe.estimation.initialization.attitude import level_rotation
-from vioframe.estimation.initialization.bundle_adjustment import Problem, Solution
+from vioframe.estimation.initialization.bundle_adjustment import adjusted, adjustment, covariance
 from vioframe.estimation.initialization.estimate import InitialEstimate, RefusalError
 from vioframe.estimation.initialization.gyro_bias import estimate_gyro_bias
 from vioframe.estimation.initialization.judgement import check_fit, check_lookahead, check_parallax, check_uncertainty
-from vioframe.estimation.initialization.landmarks import Observations
 from vioframe.estimation.initialization.options import InitializationOptions
 from vioframe.estimation.initialization.structure import Structure, solve_structure
 from vioframe.estimation.initialization.window import Bool, Packet, Window, build_window, spread_indices
-from vioframe.types import DP, DV, Calibration, Float, NavState
+from vioframe.types import DP, DV, Calibration, Float, ImuSegment, NavState, g_W
 
 _MIN_VIEWS = 4
 # Tracks farther off than this are not noise: standard deviations, typical over all views.
@@ -52,29 +53,28 @@ def initialise(packets: Sequence[Packet], calibration: Calibration, options: Ini
     alignment = align(structure.position, imu[:-1], calibration, options.bias_accel_sigma)
     if alignment.scale <= 0.0:
         raise RefusalError("the readings contradict the direction of the motion in the images")
-    states, landmarks = _start_of_adjustment(window.without_last(), structure, alignment, bias_gyro)
-    problem = _problem(window.without_last(), states, calibration, sigma, options)
-    solution = bundle_adjustment.solve(problem, states, landmarks)
-    keep = _explained(problem, solution)
+    x = _start_of_adjustment(window.without_last(), structure, alignment, bias_gyro, calibration)
+    problem, solution = _adjusted(window.without_last(), x, calibration, options)
+    keep = _explained(problem, solution.variables)
     window = window.only(keep)
     _require(window, "tracks fit the bundle adjustment", options)
-    problem = _problem(window.without_last(), solution.states, calibration, sigma, options)
-    solution = bundle_adjustment.solve(problem, solution.states, solution.landmarks[keep])
+    x = replace(solution.variables, landmarks=solution.variables.landmarks[keep])
+    problem, solution = _adjusted(window.without_last(), x, calibration, options)
     check_fit(problem, solution, options)
 
-    predicted = _predict(packets[-held_out:], solution.states.unstack(window.t_ns[:-1])[-1], calibration)
-    p_WF = lm.positions(solution.states, solution.landmarks, problem.observations, calibration)
+    x = solution.variables
+    predicted = _predict(packets[-held_out:], x.states.unstack(window.t_ns[:-1])[-1], calibration)
+    p_WF = _positions(problem, x)
     check_lookahead(predicted, [tracks for _, tracks in packets[-held_out:]], window.ids, p_WF, calibration, options)
 
-    states = StateArrays.stack([*solution.states.unstack(window.t_ns[:-1]), predicted[-1]])
-    problem = _problem(window, states, calibration, sigma, options)
-    solution = bundle_adjustment.solve(problem, states, solution.landmarks)
+    x = replace(x, states=x.states.append(StateArrays.stack(predicted[-1:])))
+    problem, solution = _adjusted(window, x, calibration, options)
     check_fit(problem, solution, options)
-    cov = bundle_adjustment.covariance(problem, solution)
-    check_uncertainty(solution, cov, options)
-    p_WF = lm.positions(solution.states, solution.landmarks, problem.observations, calibration)
-    keep = _explained(problem, solution)
-    return _estimate(window.only(keep), solution, cov, p_WF[keep])
+    x = solution.variables
+    cov = covariance(problem, x, options)
+    check_uncertainty(x.states.p_WB, cov, options)
+    keep = _explained(problem, x)
+    return _estimate(window.only(keep), x.states, cov, _positions(problem, x)[keep])
 
 
 def _require(window: Window, what: str, options: InitializationOptions) -> None:
@@ -113,9 +113,9 @@ def _structure(window: Window, R_B0C: Float, sigma: float, options: Initializati
 
 
 def _start_of_adjustment(
-    window: Window, structure: Structure, alignment: Alignment, bias_gyro_B: Float
-) -> tuple[StateArrays, Float]:
-    """States in a world with z up, and landmarks (L, 3) [x y rho] in the first frame that sees them."""
+    window: Window, structure: Structure, alignment: Alignment, bias_gyro_B: Float, calibration: Calibration
+) -> Variables:
+    """States in a world with z up, and landmarks [x y rho] in the first frame that sees them."""
     R_WB0 = level_rotation(-alignment.g_B0)
     count = len(window.t_ns)
     states = StateArrays(
@@ -128,38 +128,34 @@ def _start_of_adjustment(
     track = np.arange(len(window.ids))
     host = window.seen.argmax(axis=0)
     inverse_depth = 1.0 / (alignment.scale * structure.depth[host, track])
-    return states, np.column_stack([window.xy[host, track], inverse_depth])
+    landmarks = np.column_stack([window.xy[host, track], inverse_depth])
+    return Variables(states, _camera(calibration), landmarks)
 
 
-def _problem(
-    window: Window, states: StateArrays, calibration: Calibration, sigma: float, options: InitializationOptions
-) -> Problem:
-    """The adjustment of ``window``, its readings integrated at the biases of ``states``."""
-    imu = [
-        preintegrate(segment, bias_gyro, bias_accel, calibration.imu)
-        for segment, bias_gyro, bias_accel in zip(
-            window.segments, states.bias_gyro_B[:-1], states.bias_accel_B[:-1], strict=True
-        )
-    ]
-    return Problem(
-        Observations.of(window),
-        ImuFactors.stack(imu),
-        calibration,
-        sigma,
-        options.bias_gyro_sigma,
-        options.bias_accel_sigma,
-    )
+def _camera(calibration: Calibration) -> Calibrated:
+    # Contiguous, as what the solver makes of it is: kernels are compiled for each layout that they meet.
+    return Calibrated(np.ascontiguousarray(calibration.R_BC), np.ascontiguousarray(calibration.p_BC))
 
 
-def _explained(problem: Problem, solution: Solution) -> Bool:
+def _adjusted(
+    window: Window, x: Variables, calibration: Calibration, options: InitializationOptions
+) -> tuple[Problem, Solution]:
+    """The adjustment of ``window`` from ``x``, its readings integrated at the biases there."""
+    biases = zip(x.states.bias_gyro_B[:-1], x.states.bias_accel_B[:-1], strict=True)
+    imu = [preintegrate(segment, *bias, calibration.imu) for segment, bias in zip(window.segments, biases, strict=True)]
+    problem = adjustment(window, imu, x, calibration.camera.focal_px, options)
+    return problem, adjusted(problem, x)
+
+
+def _explained(problem: Problem, x: Variables) -> Bool:
     """(L,) whether a track's landmark lies in front of its cameras, at a finite depth, and near its observations."""
-    obs = problem.observations
-    r, depth_ratio = lm.project(solution.states, solution.landmarks, obs, problem.calibration)
-    views = np.diff(np.append(obs.start, len(obs.frame)))
-    rms = np.sqrt(np.add.reduceat((r**2).sum(axis=1), obs.start) / (2 * views)) / problem.sigma
-    in_front = np.minimum.reduceat(depth_ratio, obs.start) > 0.0
-    keep: Bool = (rms < _ADJUSTED_LIMIT) & in_front & (solution.landmarks[:, 2] > 1.0 / _FARTHEST_M)
-    return keep
+    errors = problem.sightings.errors(x.poses, x.camera, x.landmarks)
+    return np.asarray((errors < _ADJUSTED_LIMIT) & (x.landmarks[:, 2] > 1.0 / _FARTHEST_M))
+
+
+def _positions(problem: Problem, x: Variables) -> Float:
+    """(L, 3) m of the landmarks in the world."""
+    return positions(x.states, x.camera, problem.sightings.seen.argmax(axis=1), x.landmarks)
 
 
 def _predict(packets: Sequence[Packet], last: NavState, calibration: Calibration) -> list[NavState]:
@@ -171,19 +167,31 @@ def _predict(packets: Sequence[Packet], last: NavState, calibration: Calibration
     return out
 
 
-def _estimate(window: Window, solution: Solution, cov: Float, p_WF: Float) -> InitialEstimate:
+def _estimate(window: Window, adjusted: StateArrays, cov: Float, p_WF: Float) -> InitialEstimate:
     """The world turned and moved so that yaw and position are zero at the first state."""
-    R_0, p_0 = solution.states.R_WB[0], solution.states.p_WB[0]
+    R_0, p_0 = adjusted.R_WB[0], adjusted.p_WB[0]
     R_new = level_rotation(R_0[2]) @ R_0.T  # R_0[2] is the vertical in the body
     turn = np.eye(15)
     turn[DP, DP] = turn[DV, DV] = R_new
     states = StateArrays(
-        R_new @ solution.states.R_WB,
-        (solution.states.p_WB - p_0) @ R_new.T,
-        solution.states.v_WB @ R_new.T,
-        solution.states.bias_gyro_B,
-        solution.states.bias_accel_B,
+        R_new @ adjusted.R_WB,
+        (adjusted.p_WB - p_0) @ R_new.T,
+        adjusted.v_WB @ R_new.T,
+        adjusted.bias_gyro_B,
+        adjusted.bias_accel_B,
     ).unstack(window.t_ns)
     newest = turn @ cov[-15:, -15:] @ turn.T
     states[-1] = replace(states[-1], cov=0.5 * (newest + newest.T))
     return InitialEstimate("dynamic", tuple(states), window.ids, (p_WF - p_0) @ R_new.T)
+
+
+def warm_up(calibration: Calibration) -> None:
+    """Compile the kernels of the adjustment, or load them from the cache, so that the first attempt does not wait."""
+    t_ns, half_ns = np.arange(4) * 100_000_000, np.arange(3) * 50_000_000
+    xy = np.tile(np.random.default_rng(0).uniform(-0.3, 0.3, (20, 2)), (4, 1, 1))
+    segments = tuple(ImuSegment(t + half_ns, np.zeros((3, 3)), np.tile(-g_W, (3, 1))) for t in t_ns[:-1])
+    window = Window(t_ns, segments, np.arange(20), xy, np.ones((4, 20), bool))
+    state = NavState(0, np.eye(3), *np.zeros((4, 3)))
+    x = Variables(StateArrays.stack([state] * 4), _camera(calibration), np.column_stack([xy[0], np.full(20, 0.2)]))
+    problem, solution = _adjusted(window, x, calibration, InitializationOptions())
+    _explained(problem, solution.variables)

@@ -9,8 +9,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from vioframe.estimation.initialization import landmarks as lm
-from vioframe.estimation.initialization.bundle_adjustment import Problem, Solution
+from vioframe.estimation.factors.problem import Problem
+from vioframe.estimation.factors.solver import Solution
 from vioframe.estimation.initialization.estimate import RefusalError
 from vioframe.estimation.initialization.options import InitializationOptions
 from vioframe.estimation.initialization.window import Window
@@ -38,16 +38,17 @@ def check_fit(problem: Problem, solution: Solution, options: InitializationOptio
     """Observations, readings and biases must be as the noise and the priors have them."""
     if not solution.converged:
         raise RefusalError("the bundle adjustment did not converge")
-    r, _ = lm.project(solution.states, solution.landmarks, problem.observations, problem.calibration)
-    rms = float(np.sqrt((r**2).mean())) * problem.calibration.camera.focal_px
+    x, sightings = solution.variables, problem.sightings
+    errors = sightings.errors(x.poses, x.camera, x.landmarks)
+    used = ~np.isinf(errors)  # what is behind a camera is let go of, and says nothing of the others
+    views = sightings.seen.sum(axis=1)[used]
+    rms = sightings.sigma * float(np.sqrt((views * errors[used] ** 2).sum() / views.sum()))
     if not rms <= options.max_reprojection_px:
         raise RefusalError(f"reprojection error of {rms:.1f} px RMS, {options.max_reprojection_px:.1f} px are allowed")
-    factors, states = problem.factors, solution.states
-    readings = (factors.sqrt_information @ factors.residuals(states[:-1], states[1:])[..., None])[..., 0]
-    inertial = float((readings**2).mean())
+    inertial = float((problem.reading_residuals(x.states) ** 2).mean())
     if not inertial <= _MAX_INERTIAL:
         raise RefusalError(f"the readings disagree with the images: {inertial:.1f} times their noise's variance")
-    bias = float(np.linalg.norm(states.bias_accel_B[-1]))
+    bias = float(np.linalg.norm(x.states.bias_accel_B[-1]))
     if not bias <= _MAX_BIAS_SIGMAS * options.bias_accel_sigma:
         raise RefusalError(f"accelerometer bias of {bias:.2f} m/s^2 is not plausible")
 
@@ -72,8 +73,11 @@ def check_lookahead(
             raise RefusalError(f"the prediction misses a later frame by {px:.1f} px")
 
 
-def check_uncertainty(solution: Solution, cov: Float, options: InitializationOptions) -> None:
-    """Velocity, gravity's direction and scale must be determined well; ``cov`` (15 K, 15 K) is of all states."""
+def check_uncertainty(p_WB: Float, cov: Float, options: InitializationOptions) -> None:
+    """Velocity, gravity's direction and scale must be determined well; ``cov`` (15 K, 15 K) is of all states.
+
+    ``p_WB`` (K, 3) is the path.
+    """
     newest = cov[-15:, -15:]
     velocity = float(np.sqrt(np.linalg.eigvalsh(newest[DV, DV])[-1]))
     if not velocity <= options.max_velocity_sigma:
@@ -81,7 +85,7 @@ def check_uncertainty(solution: Solution, cov: Float, options: InitializationOpt
     tilt = float(np.rad2deg(np.sqrt(np.linalg.eigvalsh(newest[DTHETA, DTHETA])[-1])))
     if not tilt <= options.max_tilt_sigma_deg:
         raise RefusalError(f"gravity's direction known to {tilt:.2f} deg only (standard deviation)")
-    scale = scale_sigma(solution.states.p_WB, cov)
+    scale = scale_sigma(p_WB, cov)
     if not scale <= options.max_scale_sigma:
         raise RefusalError(f"scale known to {100.0 * scale:.0f} % only (standard deviation)")
 

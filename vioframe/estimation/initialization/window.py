@@ -9,6 +9,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from vioframe.estimation.factors.tracks import TrackTable
 from vioframe.estimation.inertial.preintegration import join_segments
 from vioframe.types import Float, FrameTracks, ImuSegment, Int
 
@@ -43,16 +44,16 @@ def build_window(packets: Sequence[Packet], chosen: Sequence[int], min_views: in
     """The frames ``chosen``, ascending indices of ``packets``, and the tracks that ``min_views`` or more see."""
     tracks = [packets[k][1] for k in chosen]
     segments = tuple(join_segments([imu for imu, _ in packets[a + 1 : b + 1]]) for a, b in pairwise(chosen))
-    ids, views = np.unique(np.concatenate([t.ids for t in tracks]), return_counts=True)
+    table = TrackTable()
+    for frame in tracks:
+        table.add_frame(frame)
     # The longest first; the older id where they are equally long.
-    order = np.lexsort((ids, -views))
-    order = order[views[order] >= min_views][:max_landmarks]
-    ids = np.sort(ids[order])
-    xy = np.full((len(chosen), len(ids), 2), np.nan)
-    for k, track in enumerate(tracks):
-        _, column, row = np.intersect1d(ids, track.ids, return_indices=True)
-        xy[k, column] = track.xy_normalised[row]
-    return Window(np.array([t.t_ns for t in tracks]), segments, ids, xy, ~np.isnan(xy[..., 0]))
+    views = table.lengths()
+    order = np.argsort(-views, kind="stable")
+    rows = np.sort(order[views[order] >= min_views][:max_landmarks])
+    seen = table.seen[rows].T
+    xy = np.where(seen[..., None], np.swapaxes(table.xy_normalised[rows], 0, 1), np.nan)
+    return Window(np.array([t.t_ns for t in tracks]), segments, table.ids[rows], xy, seen)
 
 
 def finite_tracks(tracks: FrameTracks) -> FrameTracks:
