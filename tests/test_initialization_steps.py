@@ -14,15 +14,22 @@ from vioframe.estimation.factors.problem import Problem, Variables
 from vioframe.estimation.factors.reprojection import Calibrated
 from vioframe.estimation.inertial.preintegration import Preintegrated, preintegrate
 from vioframe.estimation.initialization import static
-from vioframe.estimation.initialization.alignment import _solve_on_gravity_sphere, align, rotations
-from vioframe.estimation.initialization.attitude import level_rotation
 from vioframe.estimation.initialization.bundle_adjustment import adjusted, adjustment, covariance
-from vioframe.estimation.initialization.estimate import RefusalError
-from vioframe.estimation.initialization.gyro_bias import estimate_gyro_bias
-from vioframe.estimation.initialization.judgement import scale_sigma
-from vioframe.estimation.initialization.options import InitializationOptions
-from vioframe.estimation.initialization.structure import solve_structure
-from vioframe.estimation.initialization.window import Window, build_window, spread_indices
+from vioframe.estimation.initialization.closed_form import (
+    _solve_on_gravity_sphere,
+    align,
+    estimate_gyro_bias,
+    rotations,
+    solve_structure,
+)
+from vioframe.estimation.initialization.dynamic import scale_sigma
+from vioframe.estimation.initialization.window import (
+    BIAS_ACCEL_SIGMA,
+    RefusalError,
+    Window,
+    build_window,
+    spread_indices,
+)
 from vioframe.geometry import so3
 from vioframe.io.calibration import packaged_calibration
 from vioframe.simulation.flights import flight
@@ -101,7 +108,7 @@ def problem_of(s: Scene) -> tuple[Problem, Variables]:
     host = s.window.seen.argmax(axis=0)
     p_C = np.einsum("lji,lj->li", R_WC[host], s.p_WF - p_WC[host])
     truth = Variables(s.truth, camera, np.column_stack([p_C[:, :2] / p_C[:, 2:], 1.0 / p_C[:, 2]]))
-    return adjustment(s.window, s.imu(), truth, CALIBRATION.camera.focal_px, InitializationOptions()), truth
+    return adjustment(s.window, s.imu(), truth, CALIBRATION.camera.focal_px), truth
 
 
 class TestGyroBias:
@@ -172,7 +179,7 @@ class TestStructure:
 class TestAlignment:
     def test_exact_on_exact_data(self):
         s = scene()
-        alignment = align(s.camera / 3.7, s.imu(BIAS_GYRO, ZERO), CALIBRATION, 10.0)
+        alignment = align(s.camera / 3.7, s.imu(BIAS_GYRO, ZERO), CALIBRATION.p_BC, 10.0)
         R_0, g_B0 = s.truth.R_WB[0], s.truth.R_WB[0].T @ [0.0, 0.0, -GRAVITY_M_S2]
         np.testing.assert_allclose(alignment.scale, 3.7, rtol=1e-3)
         np.testing.assert_allclose(alignment.g_B0, g_B0, atol=5e-3)
@@ -183,7 +190,7 @@ class TestAlignment:
 
     def test_mirrored_path_has_negative_scale(self):
         s = scene()
-        assert align(-s.camera, s.imu(BIAS_GYRO, ZERO), CALIBRATION, 0.15).scale < 0.0
+        assert align(-s.camera, s.imu(BIAS_GYRO, ZERO), CALIBRATION.p_BC, 0.15).scale < 0.0
 
     @pytest.mark.parametrize("seed", range(5))
     def test_gravity_sphere_holds_the_global_minimum(self, seed: int):
@@ -227,7 +234,7 @@ class TestBundleAdjustment:
         start = s.truth.retract(rng.normal(0.0, sigma, (11, 15)))
         points = truth.landmarks + rng.normal(0.0, [0.01, 0.01, 0.05], truth.landmarks.shape)
         start = replace(truth, states=start, landmarks=points)
-        problem = adjustment(s.window, s.imu(), start, CALIBRATION.camera.focal_px, InitializationOptions())
+        problem = adjustment(s.window, s.imu(), start, CALIBRATION.camera.focal_px)
         solution = adjusted(problem, start)
         states = solution.variables.states
         assert solution.converged
@@ -249,7 +256,7 @@ class TestBundleAdjustment:
             s = scene(1.0, seed, noise=NOISE, bias_accel=bias_accel)
             problem, truth = problem_of(s)
             x = adjusted(problem, truth).variables
-            cov = covariance(problem, x, InitializationOptions())
+            cov = covariance(problem, x)
             newest, true = x.states[-1:], s.truth[-1:]
             yaw = so3.log(newest.R_WB[0] @ true.R_WB[0].T)[2]
             turn = so3.exp([0.0, 0.0, yaw])
@@ -279,8 +286,7 @@ class TestBundleAdjustment:
 class TestStatic:
     def test_tilt_and_bias_are_tied_together(self):
         sequence = simulated_sequence("standstill", duration_s=1.0, bias_accel_B=BIAS_ACCEL)
-        options = InitializationOptions()
-        estimate = static.initialise(sequence.packets, sequence.calibration, options)
+        estimate = static.initialise(sequence.packets, sequence.calibration.imu)
         cov = estimate.states[-1].cov
         assert cov is not None
         # To first order the specific force explained, hat(f) dtheta + dba, is known far better than either part.
@@ -290,7 +296,7 @@ class TestStatic:
         both = cov[np.ix_(part, part)]
         assert np.sqrt(np.linalg.eigvalsh(J @ both @ J.T)[-1]) < 0.01
         tilt_sigma = np.sqrt(np.linalg.eigvalsh(cov[DTHETA, DTHETA])[-1])
-        np.testing.assert_allclose(tilt_sigma, options.bias_accel_sigma / GRAVITY_M_S2, rtol=0.02)
+        np.testing.assert_allclose(tilt_sigma, BIAS_ACCEL_SIGMA / GRAVITY_M_S2, rtol=0.02)
         up = estimate.states[-1].R_WB[2]
         assert np.sqrt(up @ cov[DBA, DBA] @ up) < 0.01  # along gravity the bias is seen
 
@@ -298,12 +304,12 @@ class TestStatic:
         sequence = simulated_sequence("standstill", duration_s=1.0)
         packets = [(ImuSegment(imu.t_ns, imu.gyro_B, 1.1 * imu.accel_B), tracks) for imu, tracks in sequence.packets]
         with pytest.raises(RefusalError, match="too far from gravity"):
-            static.initialise(packets, sequence.calibration, InitializationOptions())
+            static.initialise(packets, sequence.calibration.imu)
 
     def test_too_few_frames_are_refused(self):
         sequence = simulated_sequence("standstill", duration_s=1.0, frame_rate_hz=2.0)
         with pytest.raises(RefusalError, match="only 3 frames"):
-            static.initialise(sequence.packets, sequence.calibration, InitializationOptions())
+            static.initialise(sequence.packets, sequence.calibration.imu)
 
 
 class TestWindow:
@@ -336,12 +342,12 @@ class TestAttitude:
     def test_puts_the_vertical_upright_without_turning_about_it(self):
         rng = np.random.default_rng(0)
         for up in rng.normal(size=(20, 3)):
-            R = level_rotation(up)
+            R = so3.level_rotation(up)
             np.testing.assert_allclose(R @ up, [0.0, 0.0, np.linalg.norm(up)], atol=1e-12)
             assert abs(so3.log(R)[2]) < 1e-12
 
     @pytest.mark.parametrize("up", [[0.0, 0.0, 2.0], [0.0, 0.0, -2.0], [1e-9, 0.0, 1.0], [1e-9, 0.0, -1.0]])
     def test_upright_and_upside_down(self, up: list[float]):
-        R = level_rotation(np.array(up))
+        R = so3.level_rotation(np.array(up))
         np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-12)
         np.testing.assert_allclose(R @ up, [0.0, 0.0, np.linalg.norm(up)], atol=1e-12)

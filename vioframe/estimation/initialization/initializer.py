@@ -8,28 +8,32 @@ from dataclasses import replace
 import numpy as np
 
 from vioframe.estimation.initialization import dynamic, static
-from vioframe.estimation.initialization.estimate import InitialEstimate, RefusalError
 from vioframe.estimation.initialization.hand_eye import CameraRotation, RotationCalibrator
-from vioframe.estimation.initialization.options import InitializationOptions
-from vioframe.estimation.initialization.window import Packet, finite_tracks
+from vioframe.estimation.initialization.window import LARGEST_IMU_GAP_S, InitialEstimate, Packet, RefusalError
 from vioframe.types import Calibration, FrameTracks, ImuNoise, ImuSegment
 
 _log = logging.getLogger("vioframe.estimation.initialization")
+
+# Length of the standstill that the static method needs.
+_STATIC_WINDOW_S = 1.0
+# The dynamic method is first tried when the window is this long, and looks back no farther than this; every so often.
+_SHORTEST_WINDOW_S, _LONGEST_WINDOW_S, _ATTEMPT_INTERVAL_S = 1.5, 3.0, 0.1
+# The dynamic method takes all densities of the IMU this many times as large: data sheets are measured at rest, and
+# vibration, scale and alignment errors come on top (measured on EuRoC's flights: 4 to 10).
+_IMU_NOISE_FACTOR = 8.0
 
 
 class Initializer:
     """Tries the static method at every frame, and the dynamic one every so often, until one is sure of itself.
 
-    With ``options.unknown_camera_rotation`` both wait for the hand-eye calibration of the camera's rotation, which is
+    With ``unknown_camera_rotation`` both wait for the hand-eye calibration of the camera's rotation, which is
     done once. Every attempt is logged to ``vioframe.estimation.initialization``.
     """
 
-    def __init__(self, calibration: Calibration, options: InitializationOptions | None = None) -> None:
-        options = options or InitializationOptions()
+    def __init__(self, calibration: Calibration, *, unknown_camera_rotation: bool = False) -> None:
         self._calibration = calibration
-        self._in_flight = replace(calibration, imu=_inflated(calibration.imu, options.imu_noise_factor))
-        self._options = options
-        self._calibrator = RotationCalibrator(calibration, options) if options.unknown_camera_rotation else None
+        self._in_flight = replace(calibration, imu=_inflated(calibration.imu, _IMU_NOISE_FACTOR))
+        self._calibrator = RotationCalibrator(calibration) if unknown_camera_rotation else None
         self._camera_rotation: CameraRotation | None = None
         self._refusals: dict[str, str] = {}
         self._packets: list[Packet] = []
@@ -60,11 +64,11 @@ class Initializer:
 
     def add(self, imu: ImuSegment, tracks: FrameTracks) -> InitialEstimate | None:
         """Take one frame; an estimate whose newest state is at this frame, or None as long as none can be trusted."""
-        if imu.largest_gap_s > self._options.largest_imu_gap_s:
+        if imu.largest_gap_s > LARGEST_IMU_GAP_S:
             self.reset()
             _log.info("no readings for %.2f s: begun anew", imu.largest_gap_s)
-        self._packets.append((imu, finite_tracks(tracks)))
-        self._packets = self._last(self._options.longest_window_s)
+        self._packets.append((imu, tracks.finite()))
+        self._packets = self._last(_LONGEST_WINDOW_S)
         if self._calibrator is not None and not self._find_camera_rotation(self._calibrator, imu, tracks):
             return None
         for method, attempt in (("static", self._static), ("dynamic", self._dynamic)):
@@ -93,20 +97,20 @@ class Initializer:
         return True
 
     def _static(self) -> InitialEstimate | None:
-        packets = self._last(self._options.static_window_s)
-        if _duration_s(packets) < 0.95 * self._options.static_window_s:
+        packets = self._last(_STATIC_WINDOW_S)
+        if _duration_s(packets) < 0.95 * _STATIC_WINDOW_S:
             return None
-        return static.initialise(packets, self._calibration, self._options)
+        return static.initialise(packets, self._calibration.imu)
 
     def _dynamic(self) -> InitialEstimate | None:
         newest_ns = self._packets[-1][1].t_ns
         last_ns = self._last_attempt_ns
-        if last_ns is not None and newest_ns - last_ns < self._options.attempt_interval_s * 1e9:
+        if last_ns is not None and newest_ns - last_ns < _ATTEMPT_INTERVAL_S * 1e9:
             return None
-        if _duration_s(self._packets) < self._options.shortest_window_s:
+        if _duration_s(self._packets) < _SHORTEST_WINDOW_S:
             return None
         self._last_attempt_ns = newest_ns
-        return dynamic.initialise(self._packets, self._in_flight, self._options)
+        return dynamic.initialise(self._packets, self._in_flight)
 
     def _last(self, seconds: float) -> list[Packet]:
         """The frames of the last ``seconds``."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from vioframe.estimation.initialization.hand_eye import CameraRotation
 from vioframe.estimation.initialization.initializer import Initializer
-from vioframe.estimation.initialization.options import InitializationOptions
 from vioframe.estimation.recovery import continued_from
 from vioframe.stopwatch import Stopwatch
 from vioframe.types import Calibration, Estimate, FrameTracks, ImuSegment, NavState, Status
@@ -14,9 +13,7 @@ class Starter:
     """Feeds the initialiser, and puts each new start where the body was last."""
 
     def __init__(self, calibration: Calibration, *, unknown_camera_rotation: bool = False) -> None:
-        self._initializer = Initializer(
-            calibration, InitializationOptions(unknown_camera_rotation=unknown_camera_rotation)
-        )
+        self._initializer = Initializer(calibration, unknown_camera_rotation=unknown_camera_rotation)
         self._last: NavState | None = None
 
     @property
