@@ -40,7 +40,11 @@ class LooseEkf:
         self._options = options or LooseEkfOptions()
         if self._options.unknown_camera_rotation and initial_state is not None:
             raise ValueError("unknown_camera_rotation is found while initialising; leave out initial_state")
-        self._starter = Starter(calibration, unknown_camera_rotation=self._options.unknown_camera_rotation)
+        self._starter = Starter(
+            calibration,
+            imu_noise_factor=self._options.imu_noise_factor,
+            unknown_camera_rotation=self._options.unknown_camera_rotation,
+        )
         self._noise_at_rest = calibration.imu
         self._noise = calibration.imu.in_flight(self._options.imu_noise_factor)
         self._drifts = Drifts(self._options, calibration.camera.focal_px)

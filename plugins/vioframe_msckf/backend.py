@@ -34,7 +34,11 @@ class Msckf:
         self._options = options or MsckfOptions()
         if self._options.unknown_camera_rotation and initial_state is not None:
             raise ValueError("unknown_camera_rotation is found while initialising; leave out initial_state")
-        self._starter = Starter(calibration, unknown_camera_rotation=self._options.unknown_camera_rotation)
+        self._starter = Starter(
+            calibration,
+            imu_noise_factor=self._options.imu_noise_factor,
+            unknown_camera_rotation=self._options.unknown_camera_rotation,
+        )
         self._noise_at_rest = calibration.imu
         self._noise = calibration.imu.in_flight(self._options.imu_noise_factor)
         dof = np.arange(1, 2 * self._options.max_clones + 3)

@@ -43,7 +43,11 @@ class SlidingWindow:
         self._options = options or SlidingWindowOptions()
         if self._options.unknown_camera_rotation and initial_state is not None:
             raise ValueError("unknown_camera_rotation is found while initialising; leave out initial_state")
-        self._starter = Starter(calibration, unknown_camera_rotation=self._options.unknown_camera_rotation)
+        self._starter = Starter(
+            calibration,
+            imu_noise_factor=self._options.imu_noise_factor,
+            unknown_camera_rotation=self._options.unknown_camera_rotation,
+        )
         self._noise = calibration.imu.in_flight(self._options.imu_noise_factor)
         self._standstill = StandstillDetector(self._options.standstill_disparity_px)
         self._window: Window | None = None

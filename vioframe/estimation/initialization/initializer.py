@@ -10,7 +10,7 @@ import numpy as np
 from vioframe.estimation.initialization import dynamic, static
 from vioframe.estimation.initialization.hand_eye import CameraRotation, RotationCalibrator
 from vioframe.estimation.initialization.window import LARGEST_IMU_GAP_S, InitialEstimate, Packet, RefusalError
-from vioframe.types import Calibration, FrameTracks, ImuNoise, ImuSegment
+from vioframe.types import Calibration, FrameTracks, ImuSegment
 
 _log = logging.getLogger("vioframe.estimation.initialization")
 
@@ -18,21 +18,24 @@ _log = logging.getLogger("vioframe.estimation.initialization")
 _STATIC_WINDOW_S = 1.0
 # The dynamic method is first tried when the window is this long, and looks back no farther than this; every so often.
 _SHORTEST_WINDOW_S, _LONGEST_WINDOW_S, _ATTEMPT_INTERVAL_S = 1.5, 3.0, 0.1
-# The dynamic method takes all densities of the IMU this many times as large: data sheets are measured at rest, and
-# vibration, scale and alignment errors come on top (measured on EuRoC's flights: 4 to 10).
-_IMU_NOISE_FACTOR = 8.0
+# Times ``imu_noise_factor`` in the dynamic method, which has no later readings to correct what vibration, scale and
+# alignment errors do over its seconds: with 8 in all its squared errors on EuRoC's flights are as its covariance says.
+_IN_MOTION = 2.0
 
 
 class Initializer:
     """Tries the static method at every frame, and the dynamic one every so often, until one is sure of itself.
 
     With ``unknown_camera_rotation`` both wait for the hand-eye calibration of the camera's rotation, which is
-    done once. Every attempt is logged to ``vioframe.estimation.initialization``.
+    done once. ``imu_noise_factor`` is what the back-end multiplies the IMU's white noise by
+    (:meth:`~vioframe.types.ImuNoise.in_flight`). Every attempt is logged to ``vioframe.estimation.initialization``.
     """
 
-    def __init__(self, calibration: Calibration, *, unknown_camera_rotation: bool = False) -> None:
+    def __init__(
+        self, calibration: Calibration, *, imu_noise_factor: float = 4.0, unknown_camera_rotation: bool = False
+    ) -> None:
         self._calibration = calibration
-        self._in_flight = replace(calibration, imu=_inflated(calibration.imu, _IMU_NOISE_FACTOR))
+        self._in_flight = replace(calibration, imu=calibration.imu.in_flight(_IN_MOTION * imu_noise_factor))
         self._calibrator = RotationCalibrator(calibration) if unknown_camera_rotation else None
         self._camera_rotation: CameraRotation | None = None
         self._refusals: dict[str, str] = {}
@@ -120,13 +123,3 @@ class Initializer:
 
 def _duration_s(packets: list[Packet]) -> float:
     return (packets[-1][1].t_ns - packets[0][1].t_ns) * 1e-9
-
-
-def _inflated(noise: ImuNoise, factor: float) -> ImuNoise:
-    return ImuNoise(
-        noise.gyro_density * factor,
-        noise.accel_density * factor,
-        noise.gyro_walk * factor,
-        noise.accel_walk * factor,
-        noise.rate_hz,
-    )

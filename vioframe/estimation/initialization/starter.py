@@ -12,8 +12,12 @@ from vioframe.types import Calibration, Estimate, FrameTracks, ImuSegment, NavSt
 class Starter:
     """Feeds the initialiser, and puts each new start where the body was last."""
 
-    def __init__(self, calibration: Calibration, *, unknown_camera_rotation: bool = False) -> None:
-        self._initializer = Initializer(calibration, unknown_camera_rotation=unknown_camera_rotation)
+    def __init__(
+        self, calibration: Calibration, *, imu_noise_factor: float = 4.0, unknown_camera_rotation: bool = False
+    ) -> None:
+        self._initializer = Initializer(
+            calibration, imu_noise_factor=imu_noise_factor, unknown_camera_rotation=unknown_camera_rotation
+        )
         self._last: NavState | None = None
 
     @property
