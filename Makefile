@@ -48,7 +48,7 @@ demo: install
 	$(BIN)/vioframe run $(FLIGHT_BAG) --backend sliding_window --loop-closure pose_graph --out $(DEMO)/sliding_window --overwrite
 	$(BIN)/vioframe evaluate $(RUNS)
 	$(BIN)/vioframe plot $(RUNS) --out $(DEMO)/plots
-	$(BIN)/vioframe view $(DEMO)/$(firstword $(DETECTORS)) --world $(FLIGHT_BAG).simulation/world.ply --save $(DEMO)/plots/view.png
+	$(BIN)/vioframe view $(DEMO)/$(firstword $(DETECTORS)) $(DEMO)/sliding_window --world $(FLIGHT_BAG).simulation/world.ply --save $(DEMO)/plots/view.rrd
 
 install: $(INSTALLED) system-libraries
 
@@ -59,9 +59,9 @@ $(INSTALLED): pyproject.toml constraints.txt
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable ".[test,open3d]"
 	@touch $@
 
-# Only the 3-D views need these, so what cannot be installed is said and not fatal.
+# Only Open3D needs these, so what cannot be installed is said and not fatal.
 system-libraries:
-	@$(call debian_packages,$(SYSTEM_LIBRARIES),Open3D's 3-D views need system libraries)
+	@$(call debian_packages,$(SYSTEM_LIBRARIES),Open3D needs system libraries)
 
 # Without it the tests of a report's page are skipped.
 browser:

@@ -23,7 +23,7 @@ def main(data: Path, backend: str, assignments: tuple[str, ...], keep: bool) -> 
 
     def sequences() -> Iterator[tuple[Row, TrackSequence]]:
         sequence = april_sequence(folder)
-        views, camera = read_board_views(folder), sequence.calibration.camera
+        views, camera = read_board_views(folder), sequence.calibration.cameras[0].model
         pixels = reprojection_px(views, camera, *board_poses(views, camera))
         yield {"pnp_px": float(np.sqrt(np.mean(pixels**2)))}, sequence
 

@@ -57,7 +57,7 @@ def main(
                 cv2.setNumThreads(threads)
                 for name in detectors:
                     frontend = Frontend(
-                        installed.create_detector(name), dataset.calibration.camera, options, Incidents()
+                        installed.create_detector(name), dataset.calibration.cameras[0].model, options, Incidents()
                     )
                     yield {"detector": name, "threads": threads, **measure(frontend, dataset)}
 
@@ -67,7 +67,7 @@ def main(
 def measure(frontend: Frontend, dataset: Dataset) -> Row:
     steps, seconds = [], []
     for imu, frame in synchronise(dataset.measurements(), incidents=Incidents()):
-        steps.append(frontend.track(imu, frame, dataset.calibration.R_BC))
+        steps.append(frontend.track(imu, frame, dataset.calibration.cameras[0].R_BC))
         seconds.append(frontend.stage_seconds)
     ms = {stage: 1e3 * float(np.mean([s.get(stage, 0.0) for s in seconds])) for stage in seconds[-1]}
     lifetimes = np.unique(np.concatenate([s.ids for s in steps]), return_counts=True)[1]

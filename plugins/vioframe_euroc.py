@@ -1,8 +1,13 @@
-"""The ASL folder layout of EuRoC: ``mav0/cam0/data.csv`` and images, ``mav0/imu0/data.csv``, a ``sensor.yaml`` each."""
+"""The ASL folder layout of EuRoC: ``mav0/cam0/data.csv`` and images, ``mav0/imu0/data.csv``, a ``sensor.yaml`` each.
+
+A camera is a folder with a table ``data.csv`` and a folder ``data`` of images.
+"""
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator, Mapping
+from heapq import merge
 from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -11,10 +16,10 @@ import numpy as np
 
 from vioframe.errors import DatasetError
 from vioframe.interfaces import DatasetFactory
-from vioframe.io.calibration import as_paths, load_calibration
-from vioframe.io.images import check_bit_depth, check_size, decode_image, to_gray8
+from vioframe.io.calibration import match_cameras
+from vioframe.io.images import check_bit_depth, check_size, decode_image, gathered, single, to_gray8
 from vioframe.parts.hooks import hookimpl
-from vioframe.types import Calibration, Frame, ImuSample, Measurement, Unreadable
+from vioframe.types import FrameSet, ImuSample, Measurement, Unreadable
 
 if TYPE_CHECKING:
     from vioframe.geometry.trajectory import Trajectory
@@ -24,34 +29,53 @@ _ROWS_AHEAD = 5
 
 
 class EurocDataset:
-    """A sequence in ASL layout: one camera, one IMU, and the ground truth where there is one."""
+    """A sequence in ASL layout: its cameras, one IMU, and the ground truth where there is one."""
 
     def __init__(
         self,
         path: Path,
         *,
-        camera: Annotated[str, "folder of the camera to use"] = "cam0",
+        cameras: Annotated[list[str] | str | None, "folders of the cameras to use; by default all"] = None,
         imu: Annotated[str, "folder of the IMU to use"] = "imu0",
         calibration: Annotated[list[Path] | Path | None, "calibration files or folder, instead of sensor.yaml"] = None,
         bit_depth: Annotated[int | None, "bits in use in 16-bit images, 8 to 16"] = None,
     ) -> None:
         check_bit_depth(bit_depth)
         self._mav0 = _mav0(path)
-        self._camera_folder = self._mav0 / camera
         self._bit_depth = bit_depth
-        for folder in (self._camera_folder, self._mav0 / imu):
-            if not (folder / "data.csv").is_file():
-                there = ", ".join(sorted(file.parent.name for file in self._mav0.glob("*/data.csv")))
-                remedy = f"choose camera and imu among: {there}" if there else "no sensor is there; copy it again"
-                raise DatasetError(f"{folder / 'data.csv'} is missing; {remedy}")
-        files = calibration or [self._mav0 / name / "sensor.yaml" for name in (camera, imu)]
-        self.calibration: Calibration = load_calibration(*as_paths(files), camera=camera)
-        self._frames = list(_frame_rows(self._camera_folder / "data.csv"))
-        self._imu = list(_imu_rows(self._mav0 / imu / "data.csv"))
-        if not self._frames:
-            raise DatasetError(f"{self._camera_folder / 'data.csv'} lists no image; the recording has no camera data")
+        wanted = [cameras] if isinstance(cameras, str) else cameras
+        folders = self._camera_folders(wanted)
+        imu_file = self._table(imu)
+        if calibration:
+            files = [calibration] if isinstance(calibration, Path) else calibration
+        else:
+            described = [name for name in folders if (self._mav0 / name / "sensor.yaml").is_file()]
+            files = [self._mav0 / name / "sensor.yaml" for name in (*(described or folders), imu)]
+        self.calibration, self._folders = match_cameras(files, list(folders), wanted)
+        rows = [[(t_ns, place, file) for t_ns, file in folders[name]] for place, name in enumerate(self._folders)]
+        self._images = list(merge(*rows, key=lambda row: row[0]))
+        self._imu = list(_imu_rows(imu_file))
         if not any(isinstance(row, ImuSample) for row in self._imu):
-            raise DatasetError(f"{self._mav0 / imu / 'data.csv'} holds no sample; the recording has no IMU data")
+            raise DatasetError(f"{imu_file} holds no sample; the recording has no IMU data")
+
+    def _camera_folders(self, wanted: list[str] | None) -> dict[str, list[tuple[int, str]]]:
+        """The stamp and file of each image in the folders wanted, or in all that list some."""
+        if wanted is None:
+            names = sorted(folder.parent.name for folder in self._mav0.glob("*/data") if folder.is_dir())
+        else:
+            names = [camera.rpartition(":")[2] for camera in wanted]
+        rows = {name: list(_frame_rows(self._table(name))) for name in names or ["cam0"]}
+        if empty := [name for name in rows if not rows[name] and (wanted or not any(rows.values()))]:
+            raise DatasetError(f"{self._mav0 / empty[0] / 'data.csv'} lists no image; the recording has no camera data")
+        return {name: images for name, images in rows.items() if images}
+
+    def _table(self, sensor: str) -> Path:
+        file = self._mav0 / sensor / "data.csv"
+        if not file.is_file():
+            there = ", ".join(sorted(file.parent.name for file in self._mav0.glob("*/data.csv")))
+            remedy = f"choose cameras and imu among: {there}" if there else "no sensor is there; copy it again"
+            raise DatasetError(f"{file} is missing; {remedy}")
+        return file
 
     @staticmethod
     def accepts(path: Path) -> bool:
@@ -64,7 +88,10 @@ class EurocDataset:
 
     @property
     def frame_count(self) -> int:
-        return len(self._frames)
+        counts: Counter[int] = Counter()
+        for camera in range(len(self._folders)):
+            counts |= Counter(t_ns for t_ns, place, _ in self._images if place == camera)
+        return counts.total()
 
     @property
     def ground_truth(self) -> Trajectory | None:
@@ -77,26 +104,30 @@ class EurocDataset:
 
     def measurements(self) -> Iterator[Measurement]:
         """IMU samples and frames, each in the order of their file."""
+        return gathered(self._read())
+
+    def _read(self) -> Iterator[Measurement]:
         imu = iter(self._imu)
         taken = 0
-        due = _rows_due([sample.t_ns for sample in self._imu], [t_ns for t_ns, _ in self._frames])
-        for (t_ns, file), count in zip(self._frames, due, strict=True):
+        due = _rows_due([sample.t_ns for sample in self._imu], [t_ns for t_ns, _, _ in self._images])
+        for image, count in zip(self._images, due, strict=True):
             yield from islice(imu, max(0, count - taken))
             taken = max(taken, count)
-            yield self._frame(t_ns, file)
+            yield self._frame(*image)
         yield from imu
 
-    def _frame(self, t_ns: int, file: str) -> Frame | Unreadable:
-        path = self._camera_folder / "data" / file
+    def _frame(self, t_ns: int, place: int, file: str) -> FrameSet | Unreadable:
+        folder = self._mav0 / self._folders[place]
+        path = folder / "data" / file
         try:
             image = decode_image(path.read_bytes())
         except OSError as err:
             return Unreadable(t_ns, "frame_unreadable", f"{path.name}: {err.strerror}")
         if image is None:
             return Unreadable(t_ns, "frame_unreadable", f"{path.name} is damaged")
-        gray = to_gray8(image, self._bit_depth, str(self._camera_folder))
-        check_size(gray, self.calibration.camera, str(self._camera_folder))
-        return Frame(t_ns, gray)
+        gray = to_gray8(image, self._bit_depth, str(folder))
+        check_size(gray, self.calibration.cameras[place].model, str(folder))
+        return single(t_ns, gray, place, len(self._folders))
 
 
 def _mav0(path: Path) -> Path:

@@ -1,6 +1,7 @@
 """ROS recordings, read without ROS: ROS 1 ``.bag``, ROS 2 folders and ``.db3`` (sqlite3), and MCAP, compressed or not.
 
-Topics are found by message type. Stamps are those of the message headers, not the times of recording.
+Topics are found by message type, and told apart by the names of the calibrated cameras or the topics that these were
+calibrated from. Stamps are those of the message headers, not the times of recording.
 
 The calibration is, in this order: the option ``calibration``; the folder ``<recording>.calib`` beside the recording, as
 ``vioframe convert`` writes it; EuRoC's published one, with a warning, where the recording looks like EuRoC's.
@@ -11,7 +12,8 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import astuple, replace
+from dataclasses import replace
+from itertools import chain, takewhile
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -20,11 +22,11 @@ from numpy.typing import NDArray
 
 from vioframe.errors import DatasetError
 from vioframe.interfaces import DatasetFactory
-from vioframe.io.calibration import as_paths, load_calibration, packaged_calibration, sidecar_folder
-from vioframe.io.images import check_bit_depth, check_size, decode_image, to_gray8
-from vioframe.io.writers import GROUND_TRUTH_TOPIC
+from vioframe.io.calibration import PACKAGED, match_cameras, sidecar_folder
+from vioframe.io.images import check_bit_depth, check_size, decode_image, gathered, single, to_gray8
+from vioframe.io.writers import GROUND_TRUTH_TOPIC, TRUE_VECTOR_TOPICS
 from vioframe.parts.hooks import hookimpl
-from vioframe.types import NS_PER_S, Calibration, Frame, Image, ImuSample, Measurement, Unreadable
+from vioframe.types import NS_PER_S, Image, ImuSample, Measurement, Unreadable
 
 if TYPE_CHECKING:
     from rosbags.highlevel import AnyReader
@@ -43,14 +45,15 @@ _EUROC_SHAPE = (480, 752)
 
 
 class RosbagDataset:
-    """One camera and one IMU of a ROS 1 or ROS 2 recording."""
+    """Cameras and one IMU of a ROS 1 or ROS 2 recording."""
 
     def __init__(
         self,
         path: Path,
         *,
-        camera: Annotated[str | None, "camera to use, as in cam1: its topic and its calibration"] = None,
-        camera_topic: Annotated[str | None, "image topic; by default that of the camera, or the first"] = None,
+        cameras: Annotated[
+            list[str] | str | None, "cameras to use, by name, by topic or as NAME:TOPIC; by default all calibrated ones"
+        ] = None,
         imu_topic: Annotated[str | None, "IMU topic; by default the first"] = None,
         calibration: Annotated[list[Path] | Path | None, "calibration files or folder"] = None,
         bit_depth: Annotated[int | None, "bits in use in 16-bit images, 8 to 16"] = None,
@@ -58,15 +61,22 @@ class RosbagDataset:
         check_bit_depth(bit_depth)
         self._path = path
         self._bit_depth = bit_depth
+        wanted = [cameras] if isinstance(cameras, str) else cameras
         with _opened(path) as reader:
-            self._camera_topic = _choose_camera(reader, path, camera_topic, camera)
-            self._imu_topic = _choose_topic(reader, path, (_IMU,), imu_topic, "IMU")
-            self.frame_count: int = reader.topics[self._camera_topic].msgcount
-            first = next((m for m in self._messages(reader, self._camera_topic) if isinstance(m, Frame)), None)
-        if first is None:
-            raise DatasetError(f"{path}: no image of {self._camera_topic} can be read")
-        self.calibration = self._find_calibration(calibration, camera or self._camera_topic, first.image)
-        check_size(first.image, self.calibration.camera, self._where)
+            topics = _topics(reader, path, (_RAW_IMAGE, _COMPRESSED_IMAGE), "camera")
+            for topic in [camera[camera.index("/") :] for camera in wanted or () if "/" in camera]:
+                _check_topic(path, topic, topics, "camera")
+            imu_topics = _topics(reader, path, (_IMU,), "IMU")
+            self._imu_topic = imu_topic or imu_topics[0]
+            _check_topic(path, self._imu_topic, imu_topics, "IMU")
+            files = self._calibration_files(calibration, reader, topics)
+            self.calibration, self._topics = match_cameras(files, topics, wanted)
+            _log.info("%s: using %s and %s", path.name, ", ".join(self._topics), self._imu_topic)
+            for topic, camera in zip(self._topics, self.calibration.cameras, strict=True):
+                check_size(self._first_image(reader, topic), camera.model, self._where(topic))
+            counts = [reader.topics[topic].msgcount for topic in self._topics]
+        # Which images of several cameras belong together is told by their stamps: to count these is to read them all.
+        self.frame_count: int | None = counts[0] if len(counts) == 1 else None
 
     @staticmethod
     def accepts(path: Path) -> bool:
@@ -82,58 +92,82 @@ class RosbagDataset:
 
     @property
     def ground_truth(self) -> Trajectory | None:
-        """That of a simulated recording. Motion capture is not aligned in time: other truth comes from a file."""
-        from vioframe.geometry.trajectory import Trajectory
+        """That of a recording of vioframe's. Motion capture is not aligned in time: other truth comes from a file."""
+        from vioframe.io.trajectories import TrueTrajectory
 
+        poses: dict[int, list[float]] = {}
+        vectors: dict[str, dict[int, list[float]]] = {topic: {} for topic in TRUE_VECTOR_TOPICS}
         with _opened(self._path) as reader:
-            connections = [connection for connection in reader.connections if connection.topic == GROUND_TRUTH_TOPIC]
-            poses = [
-                (_stamp_ns(message), astuple(message.pose.position), astuple(message.pose.orientation))
-                for message in _deserialized(reader, connections, self._path)
-            ]
+            for topic, message in self._deserialized(reader, GROUND_TRUTH_TOPIC, *TRUE_VECTOR_TOPICS):
+                t_ns = _stamp_ns(message)
+                if topic == GROUND_TRUTH_TOPIC:
+                    p, q = message.pose.position, message.pose.orientation
+                    poses[t_ns] = [p.x, p.y, p.z, q.w, q.x, q.y, q.z]
+                else:
+                    vectors[topic][t_ns] = [message.vector.x, message.vector.y, message.vector.z]
         if not poses:
             return None
-        t_ns, p_WB, quat_xyzw = (np.array(part) for part in zip(*poses, strict=True))
-        return Trajectory.from_quat_xyzw(t_ns, p_WB[:, :3], quat_xyzw[:, :4])
+        known = list(takewhile(lambda of_stamp: of_stamp.keys() == poses.keys(), vectors.values()))
+        rows = [[*pose, *chain.from_iterable(of_stamp[t_ns] for of_stamp in known)] for t_ns, pose in poses.items()]
+        return TrueTrajectory.of(np.array(list(poses)), np.array(rows))
 
     def measurements(self) -> Iterator[Measurement]:
         """IMU samples and frames in the order in which they were recorded."""
+        return gathered(self._read())
+
+    def _read(self) -> Iterator[Measurement]:
+        cameras = self.calibration.cameras
         with _opened(self._path) as reader:
-            for measurement in self._messages(reader, self._camera_topic, self._imu_topic):
-                if isinstance(measurement, Frame):
-                    check_size(measurement.image, self.calibration.camera, self._where)
-                yield measurement
+            for topic, message in self._deserialized(reader, *self._topics, self._imu_topic):
+                if topic == self._imu_topic:
+                    yield _imu_sample(message)
+                    continue
+                image, place = self._image(topic, message), self._topics.index(topic)
+                if image is None:
+                    detail = f"the image's data on {topic} are damaged or incomplete"
+                    yield Unreadable(_stamp_ns(message), "frame_unreadable", detail)
+                else:
+                    check_size(image, cameras[place].model, self._where(topic))
+                    yield single(_stamp_ns(message), image, place, len(cameras))
 
-    @property
-    def _where(self) -> str:
-        return f"{self._path} [{self._camera_topic}]"
+    def _where(self, topic: str) -> str:
+        return f"{self._path} [{topic}]"
 
-    def _messages(self, reader: AnyReader, *topics: str) -> Iterator[Measurement]:
+    def _deserialized(self, reader: AnyReader, *topics: str) -> Iterator[tuple[str, Any]]:
+        """Topic and message, in the order of recording; raises :class:`DatasetError` for damage."""
         connections = [connection for connection in reader.connections if connection.topic in topics]
-        for message in _deserialized(reader, connections, self._path):
-            yield _imu_sample(message) if hasattr(message, "angular_velocity") else self._frame(message)
+        if not connections:
+            return  # rosbags takes no connections for all of them
+        try:
+            for connection, _, data in reader.messages(connections):
+                yield connection.topic, reader.deserialize(data, connection.msgtype)
+        except Exception as err:
+            raise _damaged(self._path, err) from err
 
-    def _frame(self, message: Any) -> Frame | Unreadable:
-        t_ns = _stamp_ns(message)
-        image = _raw_image(message, self._where) if hasattr(message, "encoding") else decode_image(message.data)
-        if image is None:
-            return Unreadable(t_ns, "frame_unreadable", "the image's data are damaged or incomplete")
-        return Frame(t_ns, to_gray8(image, self._bit_depth, self._where))
+    def _image(self, topic: str, message: Any) -> Image | None:
+        """The image of a message, None where it is damaged."""
+        raw = hasattr(message, "encoding")
+        image = _raw_image(message, self._where(topic)) if raw else decode_image(message.data)
+        return None if image is None else to_gray8(image, self._bit_depth, self._where(topic))
 
-    def _find_calibration(self, files: list[Path] | Path | None, camera: str, image: Image) -> Calibration:
-        if files:
-            return load_calibration(*as_paths(files), camera=camera)
+    def _first_image(self, reader: AnyReader, topic: str) -> Image:
+        for _, message in self._deserialized(reader, topic):
+            if (image := self._image(topic, message)) is not None:
+                return image
+        raise DatasetError(f"{self._path}: no image of {topic} can be read")
+
+    def _calibration_files(self, given: list[Path] | Path | None, reader: AnyReader, topics: list[str]) -> list[Path]:
+        if given:
+            return [given] if isinstance(given, Path) else given
         sidecar = sidecar_folder(self._path)
         if sidecar.is_dir():
-            return load_calibration(sidecar, camera=camera)
-        topics_match = self._camera_topic in _EUROC_CAMERA_TOPICS and self._imu_topic == _EUROC_IMU_TOPIC
-        if topics_match and image.shape == _EUROC_SHAPE:
+            return [sidecar]
+        as_eurocs = [topic for topic in topics if topic in _EUROC_CAMERA_TOPICS and self._imu_topic == _EUROC_IMU_TOPIC]
+        if as_eurocs and self._first_image(reader, as_eurocs[0]).shape == _EUROC_SHAPE:
             _log.warning(
-                "%s brings no calibration and looks like EuRoC: using EuRoC's published calibration of %s",
-                self._path.name,
-                self._camera_topic.split("/")[1],
+                "%s brings no calibration and looks like EuRoC: using EuRoC's published calibration", self._path.name
             )
-            return packaged_calibration("euroc", camera=self._camera_topic)
+            return [PACKAGED / "euroc"]
         raise DatasetError(
             f"{self._path} brings no calibration; name its files with the option calibration, or put them in {sidecar}"
         )
@@ -162,17 +196,6 @@ def _opened(path: Path) -> Iterator[AnyReader]:
         reader.close()
 
 
-def _deserialized(reader: AnyReader, connections: list[Any], path: Path) -> Iterator[Any]:
-    """The messages of these connections in the order of recording; raises :class:`DatasetError` for damage."""
-    if not connections:
-        return  # rosbags takes no connections for all of them
-    try:
-        for connection, _, data in reader.messages(connections):
-            yield reader.deserialize(data, connection.msgtype)
-    except Exception as err:
-        raise _damaged(path, err) from err
-
-
 def _check_sqlite_size(file: Path) -> None:
     """Raise EOFError for a truncated sqlite file: sqlite itself reads what is missing of the last page as zeros."""
     with file.open("rb") as stream:
@@ -192,33 +215,19 @@ def _damaged(path: Path, err: Exception) -> DatasetError:
     )
 
 
-def _topics(reader: AnyReader, types: tuple[str, ...]) -> list[str]:
-    """The topics of these types that have messages, in the order of the types, then by name."""
+def _topics(reader: AnyReader, path: Path, types: tuple[str, ...], sensor: str) -> list[str]:
+    """The topics of these types that have messages, in the order of the types, then by name; at least one."""
     found = {(types.index(c.msgtype), c.topic) for c in reader.connections if c.msgtype in types and c.msgcount}
+    if not found:
+        there = ", ".join(sorted({c.topic for c in reader.connections})) or "none"
+        raise DatasetError(f"{path} has no {sensor} messages ({' or '.join(types)}); its topics: {there}")
     return [topic for _, topic in sorted(found)]
 
 
-def _choose_camera(reader: AnyReader, path: Path, wanted: str | None, camera: str | None) -> str:
-    types = (_RAW_IMAGE, _COMPRESSED_IMAGE)
-    if wanted is None and camera is not None:
-        # A camera that no topic is named after is one of the calibration's.
-        wanted = next((topic for topic in _topics(reader, types) if camera in topic.split("/")), None)
-    return _choose_topic(reader, path, types, wanted, "camera")
-
-
-def _choose_topic(reader: AnyReader, path: Path, types: tuple[str, ...], wanted: str | None, sensor: str) -> str:
-    topics = _topics(reader, types)
-    if wanted is not None:
-        if wanted not in topics:
-            there = ", ".join(topics) or "none"
-            raise DatasetError(f"{path} has no {sensor} messages on {wanted}; its {sensor} topics: {there}")
-        return wanted
-    if not topics:
-        there = ", ".join(sorted({c.topic for c in reader.connections})) or "none"
-        raise DatasetError(f"{path} has no {sensor} messages ({' or '.join(types)}); its topics: {there}")
-    if len(topics) > 1:
-        _log.info("%s: using %s of the %s topics %s", path.name, topics[0], sensor, ", ".join(topics))
-    return topics[0]
+def _check_topic(path: Path, wanted: str, topics: list[str], sensor: str) -> None:
+    if wanted not in topics:
+        there = ", ".join(topics)
+        raise DatasetError(f"{path} has no {sensor} messages on {wanted}; its {sensor} topics: {there}")
 
 
 def _stamp_ns(message: Any) -> int:

@@ -10,7 +10,7 @@ import numpy as np
 from vioframe.estimation.initialization import InitialEstimate, Initializer
 from vioframe.geometry import so3
 from vioframe.geometry.cameras import Camera
-from vioframe.simulation.sequence import Packet, TrackSequence
+from vioframe.simulation import Packet, TrackSequence
 from vioframe.types import DTHETA, DV, Calibration, Float, FrameTracks, Int
 
 

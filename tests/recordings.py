@@ -2,37 +2,93 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from vioframe.geometry import so3
 from vioframe.geometry.cameras import Camera
-from vioframe.types import Calibration, Frame, ImuNoise, ImuSample, Measurement
+from vioframe.io.trajectories import TrueTrajectory
+from vioframe.types import Calibration, CameraOnBody, FrameSet, Image, ImuNoise, ImuSample, Measurement
 
 T0_NS = 1_403_636_584_763_555_584
 WIDTH, HEIGHT = 64, 48
-CALIBRATION = Calibration(
+CAMERA = CameraOnBody(
+    "cam0",
     Camera(40.0, 41.0, 31.5, 23.5, (-0.28, 0.07, 2e-4, 2e-5), (WIDTH, HEIGHT)),
     np.eye(3),
     np.array([0.1, 0.2, 0.3]),
-    ImuNoise(1.7e-4, 2e-3, 1.9e-5, 3e-3, 200.0),
     time_offset_ns=-3_000_000,
 )
+CALIBRATION = Calibration((CAMERA,), ImuNoise(1.7e-4, 2e-3, 1.9e-5, 3e-3, 200.0))
+# A camera of another size, turned, its rotation with all its digits.
+SECOND = CameraOnBody(
+    "cam1",
+    Camera(20.0, 21.0, 15.5, 11.5, (0.1, -0.02, 1e-3, 2e-3), (32, 24), "equidistant"),
+    so3.exp([0.3, -1.2, 0.4]),
+    np.array([-0.1, 1 / 3, 0.05]),
+)
+PAIR = Calibration((CAMERA, SECOND), CALIBRATION.imu)
 
 
-def measurements(frame_count: int = 6, size: tuple[int, int] = (HEIGHT, WIDTH), seed: int = 0) -> list[Measurement]:
+def measurements(
+    frame_count: int = 6, size: tuple[int, int] = (HEIGHT, WIDTH), seed: int = 0
+) -> list[ImuSample | FrameSet]:
     """Random images at 20 Hz and readings at 200 Hz, in order of time; stamps need all their digits."""
     rng = np.random.default_rng(seed)
-    out: list[Measurement] = []
+    out: list[ImuSample | FrameSet] = []
     for i in range(10 * frame_count + 11):
         t_ns = T0_NS + i * 5_000_064
         out.append(ImuSample(t_ns, rng.normal(size=3), rng.normal(size=3)))
         if i >= 10 and i % 10 == 0 and i <= 10 * frame_count:
-            out.append(Frame(t_ns + 17, rng.integers(0, 256, size, dtype=np.uint8)))
+            out.append(FrameSet(t_ns + 17, (_read_only(rng, size),)))
     return out
+
+
+def pair_measurements(alone: Sequence[int] = (2, 4), silent_from: int = 5) -> list[ImuSample | FrameSet]:
+    """The same of :data:`PAIR`: ``alone`` are frames at which each camera has a stamp of its own; from ``silent_from``
+    on the second camera is silent."""
+    out: list[ImuSample | FrameSet] = []
+    rng, number = np.random.default_rng(1), -1
+    for m in measurements():
+        if isinstance(m, ImuSample):
+            out.append(m)
+            continue
+        number += 1
+        other = None if number >= silent_from else _read_only(rng, (24, 32))
+        if number in alone and other is not None:
+            out += [FrameSet(m.t_ns, (*m.images, None)), FrameSet(m.t_ns + 1000, (None, other))]
+        else:
+            out.append(FrameSet(m.t_ns, (*m.images, other)))
+    return out
+
+
+def _read_only(rng: np.random.Generator, size: tuple[int, int]) -> Image:
+    image = rng.integers(0, 256, size, dtype=np.uint8)
+    image.flags.writeable = False
+    return image
+
+
+def true_trajectory(columns: int = 16) -> TrueTrajectory:
+    """A truth with all its digits, quaternions off the unit by their rounding, before, during and after the images."""
+    rng = np.random.default_rng(2)
+    values = rng.normal(size=(40, 16))[:, :columns]
+    values[:, 3:7] = np.round(values[:, 3:7] / np.linalg.norm(values[:, 3:7], axis=1, keepdims=True), 6)
+    return TrueTrajectory.of(T0_NS - 7 + 10_000_128 * np.arange(40), values)
+
+
+def assert_same_rig(actual: Calibration, expected: Calibration) -> None:
+    """Equal to the last bit."""
+    assert actual.imu == expected.imu
+    assert len(actual.cameras) == len(expected.cameras)
+    for one, other in zip(actual.cameras, expected.cameras, strict=True):
+        for name in ("name", "model", "time_offset_ns", "rotation_known"):
+            assert getattr(one, name) == getattr(other, name)
+        np.testing.assert_array_equal(one.R_BC, other.R_BC)
+        np.testing.assert_array_equal(one.p_BC, other.p_BC)
 
 
 def assert_equal(actual: Iterable[Measurement], expected: Iterable[Measurement]) -> None:
@@ -40,10 +96,11 @@ def assert_equal(actual: Iterable[Measurement], expected: Iterable[Measurement])
     actual, expected = list(actual), list(expected)
     assert [(type(m), m.t_ns) for m in actual] == [(type(m), m.t_ns) for m in expected]
     for one, other in zip(actual, expected, strict=True):
-        if isinstance(one, Frame):
-            assert one.image.dtype == np.uint8
-            assert not one.image.flags.writeable
-            np.testing.assert_array_equal(one.image, other.image)
+        if isinstance(one, FrameSet):
+            assert [image is None for image in one.images] == [image is None for image in other.images]
+            for image, expected_image in zip(one.images, other.images, strict=True):
+                assert image is None or (image.dtype == np.uint8 and not image.flags.writeable)
+                np.testing.assert_array_equal(image, expected_image)
         elif isinstance(one, ImuSample):
             np.testing.assert_array_equal(one.gyro_B, other.gyro_B)
             np.testing.assert_array_equal(one.accel_B, other.accel_B)

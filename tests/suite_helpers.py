@@ -12,8 +12,8 @@ from trajectory_helpers import disturbed, flight, write_run
 
 from vioframe.evaluation import evaluate
 from vioframe.geometry.trajectory import Trajectory
-from vioframe.report.matched_truth import write_matched_truth
 from vioframe.report.suite.results import Data, Kind, Labels, SuiteResults, load_results
+from vioframe.runs.evaluated import write_matched_truth
 from vioframe.runs.folder import RunFolder
 
 MACHINE = {"vioframe": "0.1.0", "commit": "abc", "cpu": "a processor", "cpu_count": 2, "versions": {"numpy": "2.0"}}

@@ -31,7 +31,7 @@ def test_projection_agrees_with_opencv(camera):
     rng = np.random.default_rng(0)
     p_C = rng.uniform([-2.0, -1.5, 2.0], [2.0, 1.5, 6.0], (100, 3))
     d, zero = np.array(camera.distortion), np.zeros(3)
-    if camera.model == "radtan":
+    if camera.distortion_model == "radtan":
         expected, _ = cv2.projectPoints(p_C, zero, zero, camera.K, d)
     else:
         expected, _ = cv2.fisheye.projectPoints(p_C[:, None], zero, zero, camera.K, d)

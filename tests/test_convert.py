@@ -7,13 +7,25 @@ import cv2
 import numpy as np
 import pytest
 from click.testing import CliRunner, Result
-from recordings import CALIBRATION, T0_NS, assert_equal, measurements
+from recordings import (
+    CALIBRATION,
+    PAIR,
+    T0_NS,
+    assert_equal,
+    assert_same_rig,
+    measurements,
+    pair_measurements,
+    true_trajectory,
+)
 
 from vioframe.cli import main
 from vioframe.errors import DatasetError
+from vioframe.geometry import so3
+from vioframe.geometry.trajectory import Trajectory
 from vioframe.interfaces import Dataset
 from vioframe.io.convert import Conversion, convert, format_of
-from vioframe.types import Frame, ImuSample, Measurement, Unreadable
+from vioframe.io.trajectories import TrueTrajectory
+from vioframe.types import FrameSet, ImuSample, Measurement, Unreadable
 from vioframe_euroc import EurocDataset
 from vioframe_rosbag import RosbagDataset
 
@@ -31,20 +43,57 @@ def visible(folder: Path) -> set[str]:
     return {path.name for path in folder.iterdir()}
 
 
+def again(source: Dataset, destination: Path) -> Dataset:
+    """What is read of ``source`` converted."""
+    convert(source.measurements(), source.calibration, destination, truth=source.ground_truth)
+    return read(destination)
+
+
+def assert_same_truth(actual: object, expected: object) -> None:
+    """Equal to the last bit."""
+    assert isinstance(actual, TrueTrajectory)
+    assert isinstance(expected, TrueTrajectory)
+    np.testing.assert_array_equal(actual.t_ns, expected.t_ns)
+    np.testing.assert_array_equal(actual.values, expected.values)
+    np.testing.assert_array_equal(actual.R_WB, expected.R_WB)
+
+
 @pytest.mark.parametrize("end", ["end", "end.bag", "end.ros2", "end.mcap"])
 @pytest.mark.parametrize("start", ["start", "start.bag", "start.ros2", "start.mcap"])
 def test_round_trips_are_exact(tmp_path: Path, start: str, end: str) -> None:
     counts = convert(measurements(), CALIBRATION, tmp_path / start)
-    assert counts == Conversion(frames=6, imu_samples=71, unreadable=0)
-    source = read(tmp_path / start)
-    assert convert(source.measurements(), source.calibration, tmp_path / end) == counts
-    result = read(tmp_path / end)
+    assert counts == Conversion(frames=6, imu_samples=71, true_poses=0, unreadable=0)
+    result = again(read(tmp_path / start), tmp_path / end)
     assert_equal(result.measurements(), measurements())
-    assert result.calibration.camera == CALIBRATION.camera
-    assert result.calibration.imu == CALIBRATION.imu
-    assert result.calibration.time_offset_ns == CALIBRATION.time_offset_ns
-    np.testing.assert_array_equal(result.calibration.R_BC, CALIBRATION.R_BC)
-    np.testing.assert_array_equal(result.calibration.p_BC, CALIBRATION.p_BC)
+    assert_same_rig(result.calibration, CALIBRATION)
+    assert result.ground_truth is None
+
+
+@pytest.mark.parametrize("columns", [7, 10, 16])
+def test_every_camera_and_the_truth_go_all_the_way_round(tmp_path: Path, columns: int) -> None:
+    """ASL, ROS 1, ROS 2, MCAP and back: images together and apart, a camera that falls silent, velocity and biases."""
+    source, truth = pair_measurements(), true_trajectory(columns)
+    counts = convert(source, PAIR, tmp_path / "start", truth=truth)
+    assert counts == Conversion(frames=8, imu_samples=71, true_poses=40, unreadable=0)
+    result = read(tmp_path / "start")
+    for name in ("a.bag", "a.ros2", "a.mcap", "end"):
+        result = again(result, tmp_path / name)
+        assert_equal(result.measurements(), source)
+        assert_same_rig(result.calibration, PAIR)
+        assert_same_truth(result.ground_truth, truth)
+    truth_csv = "mav0/state_groundtruth_estimate0/data.csv"
+    assert (tmp_path / "end" / truth_csv).read_text() == (tmp_path / "start" / truth_csv).read_text()
+    assert len((tmp_path / "end" / truth_csv).read_text().splitlines()[0].split(",")) == 1 + columns
+
+
+def test_a_truth_without_more_than_poses_is_written_too(tmp_path: Path) -> None:
+    truth = Trajectory(T0_NS + np.arange(3), np.tile(so3.exp([0.1, 0.2, 0.3]), (3, 1, 1)), np.ones((3, 3)))
+    for name in ("a", "a.bag"):
+        convert(measurements(), CALIBRATION, tmp_path / name, truth=truth)
+        back = read(tmp_path / name).ground_truth
+        assert back is not None
+        np.testing.assert_array_equal(back.t_ns, truth.t_ns)
+        np.testing.assert_allclose(back.R_WB, truth.R_WB, rtol=0.0, atol=1e-15)
 
 
 @pytest.mark.parametrize("name", ["odd", "odd.bag", "odd.ros2", "odd.mcap"])
@@ -57,9 +106,9 @@ def test_what_is_irregular_is_kept_as_it_is(tmp_path: Path, name: str) -> None:
     convert(source, CALIBRATION, tmp_path / name)
     result = list(read(tmp_path / name).measurements())
     imu = [m for m in source if isinstance(m, ImuSample)]
-    frames = [m for m in source if isinstance(m, Frame)]
+    frames = [m for m in source if isinstance(m, FrameSet)]
     assert_equal([m for m in result if isinstance(m, ImuSample)], imu)
-    assert_equal([m for m in result if isinstance(m, Frame)], frames)
+    assert_equal([m for m in result if isinstance(m, FrameSet)], frames)
 
 
 def test_the_layout_is_eurocs(tmp_path: Path) -> None:
@@ -68,7 +117,7 @@ def test_the_layout_is_eurocs(tmp_path: Path) -> None:
 
     convert(measurements(), CALIBRATION, tmp_path / "flight.bag")
     convert(measurements(), CALIBRATION, tmp_path / "flight")
-    sample, frame = measurements()[0], next(m for m in measurements() if isinstance(m, Frame))
+    sample, frame = measurements()[0], next(m for m in measurements() if isinstance(m, FrameSet))
     assert isinstance(sample, ImuSample)
     with AnyReader([tmp_path / "flight.bag"]) as reader:
         assert {topic: info.msgtype for topic, info in reader.topics.items()} == {
@@ -81,14 +130,14 @@ def test_the_layout_is_eurocs(tmp_path: Path) -> None:
     recorded_ns, image = first["/cam0/image_raw"]
     assert recorded_ns == frame.t_ns == image.header.stamp.sec * 10**9 + image.header.stamp.nanosec
     assert (image.encoding, image.height, image.width, image.step) == ("mono8", 48, 64, 64)
-    np.testing.assert_array_equal(image.data.reshape(48, 64), frame.image)
+    np.testing.assert_array_equal(image.data.reshape(48, 64), frame.images[0])
     recorded_ns, imu = first["/imu0"]
     assert recorded_ns == T0_NS == imu.header.stamp.sec * 10**9 + imu.header.stamp.nanosec
     assert [imu.angular_velocity.x, imu.angular_velocity.y, imu.angular_velocity.z] == sample.gyro_B.tolist()
     assert [imu.linear_acceleration.x, imu.linear_acceleration.z] == sample.accel_B[[0, 2]].tolist()
     mav0 = tmp_path / "flight" / "mav0"
     png = cv2.imread(str(mav0 / "cam0" / "data" / f"{frame.t_ns}.png"), cv2.IMREAD_UNCHANGED)
-    np.testing.assert_array_equal(png, frame.image)
+    np.testing.assert_array_equal(png, frame.images[0])
     assert (mav0 / "cam0" / "data.csv").read_text().splitlines()[1] == f"{frame.t_ns},{frame.t_ns}.png"
     row = (mav0 / "imu0" / "data.csv").read_text().splitlines()[1].split(",")
     assert int(row[0]) == T0_NS
@@ -121,9 +170,15 @@ def test_compression_must_be_one_of_the_format(tmp_path: Path) -> None:
     assert visible(tmp_path) == set()
 
 
+def flattened(frames: FrameSet) -> np.ndarray:
+    (image,) = frames.images
+    assert image is not None
+    return image // 255
+
+
 @pytest.mark.parametrize("compression", ["bz2", "lz4"])
 def test_compression_makes_a_smaller_bag(tmp_path: Path, compression: str) -> None:
-    flat = [Frame(m.t_ns, m.image // 255) if isinstance(m, Frame) else m for m in measurements()]
+    flat = [FrameSet(m.t_ns, (flattened(m),)) if isinstance(m, FrameSet) else m for m in measurements()]
     convert(flat, CALIBRATION, tmp_path / "plain.bag")
     convert(flat, CALIBRATION, tmp_path / "small.bag", compression=compression)
     assert (tmp_path / "small.bag").stat().st_size < 0.8 * (tmp_path / "plain.bag").stat().st_size
@@ -172,7 +227,7 @@ def test_a_stale_calibration_beside_the_destination_is_replaced(tmp_path: Path) 
 
 
 def test_a_source_without_frames_or_imu_is_an_error(tmp_path: Path) -> None:
-    for kind in (Frame, ImuSample):
+    for kind in (FrameSet, ImuSample):
         with pytest.raises(DatasetError, match="no readable frame or no IMU sample"):
             convert([m for m in measurements() if isinstance(m, kind)], CALIBRATION, tmp_path / "a.bag")
     assert visible(tmp_path) == set()
@@ -200,7 +255,7 @@ def test_command_line(tmp_path: Path) -> None:
     bag = tmp_path / "deep" / "down" / "flight.bag"
     result = run(tmp_path / "flight", bag, "--compression", "lz4")
     assert result.exit_code == 0, result.output
-    assert f"{bag}: ROS 1 bag, 5 frames, 71 IMU samples" in result.output
+    assert f"{bag}: ROS 1 bag, 5 frames, 71 IMU samples, no true poses" in result.output
     assert "left out: 1 frames or samples" in result.output
     expected = [m for m in EurocDataset(tmp_path / "flight").measurements() if not isinstance(m, Unreadable)]
     assert_equal(RosbagDataset(bag).measurements(), expected)
@@ -219,7 +274,7 @@ def test_command_line_mistakes_are_one_line_with_exit_code_2(tmp_path: Path) -> 
         ((tmp_path / "nowhere", tmp_path / "a.bag"), "nowhere does not exist"),
         ((source, tmp_path / "a.zip"), "tells no format"),
         ((source, source), "exists already"),
-        ((source, tmp_path / "a.bag", "-o", "kamera=cam1"), "no option 'kamera'"),
+        ((source, tmp_path / "a.bag", "-o", "kamera=cam1"), "-o kamera: no part has such an option"),
         ((source, tmp_path / "a.bag", "-o", "camera"), "-o takes key=value, got 'camera'"),
         ((source, tmp_path / "a.bag", "--compression", "zstd"), "ros1 offers no compression 'zstd'"),
     ):
@@ -231,11 +286,36 @@ def test_command_line_mistakes_are_one_line_with_exit_code_2(tmp_path: Path) -> 
     assert visible(tmp_path) == {"flight"}
 
 
+def test_command_line_with_several_cameras(tmp_path: Path) -> None:
+    convert(pair_measurements(), PAIR, tmp_path / "flight.bag", truth=true_trajectory())
+    result = run(tmp_path / "flight.bag", tmp_path / "both")
+    assert result.exit_code == 0, result.output
+    assert "ASL folder, as EuRoC's, 8 frames of 2 cameras, 71 IMU samples, 40 true poses" in result.output
+    assert_equal(read(tmp_path / "both").measurements(), pair_measurements())
+    for option, name in (("cameras=[cam0,cam1]", "listed"), ("cameras=cam1", "second")):
+        assert run(tmp_path / "flight.bag", tmp_path / name, "-o", option).exit_code == 0
+    assert visible(tmp_path / "listed" / "mav0") == {"cam0", "cam1", "imu0", "state_groundtruth_estimate0"}
+    assert visible(tmp_path / "second" / "mav0") == {"cam1", "imu0", "state_groundtruth_estimate0"}
+
+
 def test_a_real_recording(shared_data: Path, tmp_path: Path) -> None:
-    source = EurocDataset(shared_data / "euroc" / "V1_01_easy_rest")
-    counts = convert(source.measurements(), source.calibration, tmp_path / "rest.bag")
-    assert counts == Conversion(frames=95, imu_samples=29120, unreadable=0)
-    bag = RosbagDataset(tmp_path / "rest.bag")
-    assert_equal(bag.measurements(), source.measurements())
-    assert bag.calibration.camera == source.calibration.camera
-    np.testing.assert_allclose(bag.calibration.R_BC, source.calibration.R_BC, rtol=0.0, atol=1e-15)
+    """Two cameras, of which the second ends after two thirds of the flight, and EuRoC's truth."""
+    source = EurocDataset(shared_data / "euroc" / "MH_01_easy_15s")
+    result: Dataset = source
+    for name in ("flight.bag", "flight.ros2", "flight.mcap", "flight"):
+        result = again(result, tmp_path / name)
+    assert isinstance(result, EurocDataset)
+    assert result.frame_count == source.frame_count == 300
+    assert [camera.name for camera in result.calibration.cameras] == ["cam0", "cam1"]
+    assert_same_rig(result.calibration, source.calibration)
+    assert_same_truth(result.ground_truth, source.ground_truth)
+    assert_equal(result.measurements(), source.measurements())
+    complete = [all(image is not None for image in m.images) for m in result.measurements() if isinstance(m, FrameSet)]
+    assert complete == [True] * 200 + [False] * 100
+    # Number for number as the files that it began with.
+    for file in ("imu0/data.csv", "state_groundtruth_estimate0/data.csv"):
+        first, last = (
+            np.loadtxt(folder / "mav0" / file, delimiter=",")
+            for folder in (shared_data / "euroc" / "MH_01_easy_15s", tmp_path / "flight")
+        )
+        np.testing.assert_array_equal(first, last)

@@ -9,6 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from initialization_helpers import Errors, Motion, first_estimate, judge, seen_by, velocity_of, without_points
+from vioframe.simulation.poses import interpolate_poses
+from vioframe.simulation.synthetic import simulated_sequence
 
 from vioframe.bench.april import april_sequence
 from vioframe.estimation.initialization import InitialEstimate, Initializer
@@ -18,10 +20,7 @@ from vioframe.geometry.trajectory import Trajectory
 from vioframe.incidents import Incidents
 from vioframe.io.synchronise import synchronise
 from vioframe.io.trajectories import load_trajectory
-from vioframe.simulation import real_motion_sequence
-from vioframe.simulation.poses import interpolate_poses
-from vioframe.simulation.sequence import Packet, TrackSequence
-from vioframe.simulation.synthetic import simulated_sequence
+from vioframe.simulation import Packet, TrackSequence, real_motion_sequence
 from vioframe.types import DP, DTHETA, GRAVITY_M_S2, Calibration
 from vioframe_euroc import EurocDataset
 from vioframe_shi_tomasi import ShiTomasi

@@ -17,7 +17,7 @@ from vioframe.evaluation import evaluate
 from vioframe.geometry import so3
 from vioframe.geometry.so3 import rotation_z
 from vioframe.incidents import Incidents
-from vioframe.report.evaluated import Evaluated
+from vioframe.runs.evaluated import Evaluated
 from vioframe.runs.folder import RunFolder
 from vioframe.runs.recorder import Recorder
 from vioframe.testing import check_loop_closer

@@ -12,11 +12,12 @@ from trajectory_helpers import disturbed, flight, moved, write_run
 from vioframe.cli import main
 from vioframe.errors import ConfigError, RunError
 from vioframe.evaluation.landmarks import belonging, read_landmarks
+from vioframe.evaluation.map_quality import MapQuality
 from vioframe.geometry import so3
 from vioframe.geometry.meshes import distances, read_mesh
 from vioframe.io.trajectories import write_tum
-from vioframe.report.evaluated import evaluate_path
-from vioframe.report.map_quality import MapQuality, measure_maps, simulated_world
+from vioframe.report.map_quality import measure_maps, simulated_world
+from vioframe.runs.evaluated import evaluate_path
 from vioframe.runs.folder import RunFolder
 from vioframe.runs.recorder import write_ply
 
@@ -112,7 +113,7 @@ def test_the_table_and_the_json_hold_the_map(tmp_path):
     table = evaluate(run, other).stdout
     rows = {line.split("│")[0].strip(): line.split("│")[1:] for line in table.splitlines() if "│" in line}
     assert [cell.strip() for cell in rows["90 % are within"]] == ["0.3000", "–"]
-    assert [cell.strip() for cell in rows["within 5, 10, 20 cm [%]"]] == ["40.0, 60.0, 80.0", "–"]
+    assert [cell.strip() for cell in rows["within 5, 10, 20 cm"]] == ["40.0%, 60.0%, 80.0%", "–"]
     figures = json.loads(evaluate(run, "--format", "json").stdout)[0]["map"]
     assert figures["landmarks"] == 5
     assert figures["median_m"] == pytest.approx(0.08, abs=1e-5)

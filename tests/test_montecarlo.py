@@ -20,13 +20,13 @@ from plugin_helpers import install
 from scipy.stats import chi2
 
 from vioframe.bench import run_backend
-from vioframe.bench.consistency import PARTS, Outcome, Trial, average_band
 from vioframe.bench.contenders import Contender, parse_contenders
 from vioframe.bench.montecarlo import Setup, nees_by_stretch, run_montecarlo
 from vioframe.bench.processes import installed, usable_cores
 from vioframe.cli import main
 from vioframe.errors import ConfigError, PluginError
 from vioframe.evaluation import evaluate
+from vioframe.evaluation.consistency import PARTS, Outcome, Trial, average_band
 from vioframe.geometry import so3
 from vioframe.geometry.so3 import rotation_z
 from vioframe.parts import registry

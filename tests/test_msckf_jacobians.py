@@ -35,7 +35,9 @@ def test_observation_jacobian_is_the_derivative_on_the_manifold(camera):
         R_B, p_B = R_WB @ so3.exp(d[15:18]), p_WB + d[18:21]
         point = R_C.T @ (R_B.T @ (p_WF + d[21:24] - p_B) - p_C)
         perturbed = k + d[7:15]
-        return Camera(*perturbed[:4], tuple(perturbed[4:]), camera.resolution, camera.model).project(point[None])[0]
+        return Camera(*perturbed[:4], tuple(perturbed[4:]), camera.resolution, camera.distortion_model).project(
+            point[None]
+        )[0]
 
     xy = predicted(np.zeros(24)) + np.array([0.3, -0.2])
     blocks, residual = measurement._observations(

@@ -5,7 +5,7 @@ import pytest
 from filterpy.kalman import KalmanFilter
 from msckf_helpers import random_covariance, random_state
 
-from vioframe.estimation.recovery import DivergedError
+from vioframe.errors import DivergedError
 from vioframe.geometry import so3
 from vioframe.types import DBA, DBG, DP, DTHETA, DV, NS_PER_S, Float, ImuNoise, ImuSegment
 from vioframe_msckf.state import CALIBRATION, CLONES, IMU, OFFSET, FilterState, compress

@@ -8,8 +8,8 @@ from vioframe.evaluation import evaluate
 from vioframe.geometry.trajectory import Trajectory
 from vioframe.io.trajectories import write_tum
 from vioframe.report import plot_cost, plot_errors, plot_paths
-from vioframe.report.evaluated import evaluate_path, evaluate_paths
 from vioframe.report.figures import write_figures
+from vioframe.runs.evaluated import evaluate_path, evaluate_paths
 
 EVERYTHING = {
     "path_3d",
@@ -139,7 +139,7 @@ def test_no_line_is_drawn_across_a_gap():
 
 
 def evaluate_run(estimate, truth):
-    from vioframe.report.evaluated import Evaluated
+    from vioframe.runs.evaluated import Evaluated
 
     return Evaluated("holed", None, estimate, truth, evaluate(estimate, truth))
 

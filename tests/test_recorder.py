@@ -87,7 +87,7 @@ def test_the_files_hold_what_the_steps_said(tmp_path):
     states = np.loadtxt(run.path / "states.csv", delimiter=",", skiprows=1)
     np.testing.assert_allclose(states[2, 1:10], [2.0, 0.0, 0.0, *[1e-3] * 3, *[2e-2] * 3])
     np.testing.assert_allclose(states[2, 10:], np.arange(1.0, 16.0) + 0.5)
-    counts = run.track_counts()
+    counts = run.tracks()
     assert counts.tracked.tolist() == [2] * 5
     assert counts.new.tolist() == [2, 0, 0, 0, 0]
 

@@ -16,13 +16,13 @@ from trajectory_helpers import flight
 from vioframe.evaluation import evaluate
 from vioframe.geometry.trajectory import Trajectory
 from vioframe.io.trajectories import write_tum
-from vioframe.report.matched_truth import write_matched_truth
 from vioframe.report.suite.flights import Flight, Outcome
 from vioframe.report.suite.pooled import BAND_M, inside_band, pool_relative
 from vioframe.report.suite.results import Data, Kind, SuiteResults
 from vioframe.report.suite.statistics import Spread, averages, expected_tasks, groups, unplaced
 from vioframe.report.suite.stress import baseline_of, curves, duels, wilson
 from vioframe.report.suite.tables_about import evo_command
+from vioframe.runs.evaluated import write_matched_truth
 from vioframe.runs.folder import RunFolder
 
 

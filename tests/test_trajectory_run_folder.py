@@ -32,7 +32,7 @@ def test_reads_what_a_run_wrote(run):
 
 
 def test_counts_tracked_and_new_features(run):
-    counts = RunFolder.open(run[0]).track_counts()
+    counts = RunFolder.open(run[0]).tracks()
     np.testing.assert_array_equal(counts.tracked, np.full(60, 120))
     np.testing.assert_array_equal(counts.new, [120, *[3] * 59])
 
@@ -41,7 +41,7 @@ def test_a_frame_without_features_counts_as_zero(run):
     path, estimate, _ = run
     lines = (path / "tracks.csv").read_text().splitlines(keepends=True)
     (path / "tracks.csv").write_text("".join(line for line in lines if not line.startswith(str(estimate.t_ns[7]))))
-    counts = RunFolder.open(path).track_counts()
+    counts = RunFolder.open(path).tracks()
     assert counts.tracked[7] == 0
     assert counts.new[8] == 6
 
@@ -71,7 +71,7 @@ def test_a_last_line_cut_short_is_ignored(run, name):
     assert len(folder.trajectory()) == (49 if name == "trajectory.tum" else 50)
     assert np.isfinite(folder.trajectory().cov_pose).all(axis=(1, 2)).sum() >= 49
     assert len(folder.timings().t_ns) == (59 if name == "timings.csv" else 60)
-    assert folder.track_counts() is not None
+    assert folder.tracks() is not None
 
 
 def test_only_the_trajectory_is_needed(run):
@@ -81,7 +81,7 @@ def test_only_the_trajectory_is_needed(run):
             file.unlink()
     folder = RunFolder.open(path)
     assert folder.trajectory().cov_pose is None
-    assert (folder.timings(), folder.track_counts(), folder.ground_truth(), folder.summary) == (None, None, None, {})
+    assert (folder.timings(), folder.tracks(), folder.ground_truth(), folder.summary) == (None, None, None, {})
 
 
 def test_a_run_that_never_initialised_has_no_trajectory(tmp_path):

@@ -1,13 +1,13 @@
-"""``vioframe view``: what is drawn, where, and what is said when it cannot be."""
+"""``vioframe view``: what is in the recording, where, and what is said when it cannot be."""
 
-import os
-import subprocess
 import sys
 
+import cv2
 import numpy as np
 import pytest
 from click.testing import CliRunner
 from map_helpers import box, write_ply_mesh
+from recordings import CALIBRATION, measurements
 from trajectory_helpers import disturbed, flight, moved, write_run
 
 from vioframe.cli import main
@@ -15,19 +15,18 @@ from vioframe.evaluation.landmarks import read_landmarks
 from vioframe.geometry import so3
 from vioframe.geometry.trajectory import Trajectory
 from vioframe.io.calibration import packaged_calibration, write_calibration
+from vioframe.io.convert import convert
 from vioframe.io.trajectories import write_tum
-from vioframe.report.evaluated import evaluate_paths
-from vioframe.report.scene import Flight, Scene, scene_of
-from vioframe.report.scene_drawing import TRUTH_RGB, cameras, draw, rgb
-from vioframe.report.scene_grid import ground_grid
-from vioframe.report.scene_picture import render
-from vioframe.report.scene_shapes import balls, creases, dashes, facing, polyline, rods, thinned
-from vioframe.report.scene_view import best_azimuth_deg, view_of
-from vioframe.report.viewing import choose_view
+from vioframe.report.style import colour
 from vioframe.runs.recorder import write_ply
+from vioframe.types import Frame
 
-SIZE = (480, 320)
+pytest.importorskip("rerun")
+# rerun warns, and goes on, where it is given what it cannot take.
+pytestmark = pytest.mark.filterwarnings("error")
+
 YAW_M = so3.exp(np.array([0.0, 0.0, 0.7])), np.array([4.0, -3.0, 1.0])
+SIGMA_M = 0.1
 
 
 @pytest.fixture(autouse=True)
@@ -49,7 +48,9 @@ def run(tmp_path_factory, landmarks):
     """A run folder in a world of its own, turned and shifted against the ground truth's."""
     folder = tmp_path_factory.mktemp("view") / "a run"
     truth = flight()
-    write_run(folder, moved(truth, *YAW_M), truth)
+    cov = np.tile(np.diag([1e-4] * 3 + [SIGMA_M**2] * 3), (len(truth), 1, 1))
+    estimate = moved(truth, *YAW_M)
+    write_run(folder, Trajectory(estimate.t_ns, estimate.R_WB, estimate.p_WB, cov), truth)
     write_ply(folder / "map.ply", {10 * i: YAW_M[0] @ p + YAW_M[1] for i, p in enumerate(landmarks)})
     write_calibration(packaged_calibration("euroc"), folder / "calibration")
     return folder
@@ -67,79 +68,135 @@ def one_line(*arguments):
     return error
 
 
-def picture(path):
-    from matplotlib.image import imread
+def recorded(path):
+    """Values by entity and component, a row a time, and the times in ns, of a recording."""
+    from rerun.chunk import RrdReader
 
-    return imread(path)[..., :3].astype(float)
-
-
-def share_of_colour(image, xy, colour):
-    """How many of the pixels (N, 2) hold ``colour``, which is darker where a shape is seen at a slant."""
-    near = np.round(xy).astype(int)
-    shades = np.linspace(0.55, 1.0, 46)[:, None, None] * np.asarray(colour)
-    return np.mean(np.abs(image[near[:, 1], near[:, 0]] - shades).max(axis=2).min(axis=0) < 0.06)
-
-
-def test_the_paths_are_where_they_project_to_in_their_colours(tmp_path):
-    pytest.importorskip("open3d")
-    first = flight()
-    second = moved(first, np.eye(3), np.array([0.0, 0.0, 4.0]))
-    for name, trajectory in (("first", first), ("second", second)):
-        write_tum(trajectory, tmp_path / f"{name}.tum")
-    files = [tmp_path / "first.tum", tmp_path / "second.tum"]
-    result = view(*files, "--save", tmp_path / "out" / "picture.png", "--size", "480x320")
-    assert result.stdout.splitlines() == [str(tmp_path / "out" / "picture.png")]
-    image = picture(tmp_path / "out" / "picture.png")
-    assert image.shape == (320, 480, 3)
-    scene = scene_of(evaluate_paths(files))
-    _, seen_from = choose_view(scene, SIZE)
-    for number, trajectory in enumerate((first, second)):
-        xy = seen_from.project(trajectory.p_WB)
-        assert share_of_colour(image, xy, rgb(number)) > 0.9
-        assert share_of_colour(image, xy, rgb(1 - number)) < 0.1
+    values, times = {}, {}
+    for chunk in RrdReader(path).stream().to_chunks():
+        batch = chunk.to_record_batch()
+        for name, column in zip(batch.schema.names, batch.columns, strict=True):
+            if ":" in name:
+                values.setdefault((chunk.entity_path, name), []).extend(column.to_pylist())
+            elif name == "time":
+                times.setdefault(chunk.entity_path, []).extend(column.cast("int64").to_pylist())
+    return values, times
 
 
-def test_estimate_and_dashed_truth_share_the_line(run, tmp_path):
-    pytest.importorskip("open3d")
-    view(run, "--save", tmp_path / "p.png", "--size", "480x320")
-    scene = scene_of(evaluate_paths([run]))
-    xy = choose_view(scene, SIZE)[1].project(flight().p_WB[10:])
-    image = picture(tmp_path / "p.png")
-    assert share_of_colour(image, xy, rgb(0)) > 0.3
-    assert share_of_colour(image, xy, TRUTH_RGB) > 0.2
-    assert share_of_colour(image, xy, (1.0, 1.0, 1.0)) < 0.01  # the estimate fills the gaps of the dashes
+def test_a_run_is_shown_in_the_world_of_the_ground_truth(run, tmp_path, landmarks):
+    result = view(run, "--save", tmp_path / "out" / "v.rrd")
+    assert result.stdout.splitlines() == [str(tmp_path / "out" / "v.rrd")]
+    values, times = recorded(tmp_path / "out" / "v.rrd")
+    at = r"/world/a\ run"
+    body = np.array(values[f"{at}/body", "Transform3D:translation"])[:, 0]
+    np.testing.assert_allclose(body, flight().p_WB[10:], atol=1e-5)
+    assert times[f"{at}/body"] == (flight().t_ns[10:] - flight().t_ns[0]).tolist()
+    truth = np.array(values[r"/world/ground\ truth/body", "Points3D:positions"])[:, 0]
+    np.testing.assert_allclose(truth, flight().p_WB, atol=1e-5)
+    (shown,) = values[f"{at}/landmarks", "Points3D:positions"]
+    np.testing.assert_allclose(shown, landmarks[:400], atol=1e-4)
+    # The features of frame k are called 3 k to 3 k + 119, the landmarks 0, 10, 20 ...
+    np.testing.assert_allclose(
+        values[f"{at}/landmarks\\ in\\ view", "Points3D:positions"][7], landmarks[3:15], atol=1e-4
+    )
+    half_sizes = np.array(values[f"{at}/3\\ sigma", "Ellipsoids3D:half_sizes"])
+    np.testing.assert_allclose(half_sizes, 3.0 * SIGMA_M, rtol=1e-5)
 
 
-def test_equal_runs_give_equal_pictures(run, tmp_path):
-    pytest.importorskip("open3d")
-    for name in ("1.png", "2.png"):
-        view(run, "--save", tmp_path / name, "--size", "240x160")
-    assert (tmp_path / "1.png").read_bytes() == (tmp_path / "2.png").read_bytes()
+def test_errors_stand_between_their_bounds(run, tmp_path):
+    view(run, "--save", tmp_path / "v.rrd")
+    values, _ = recorded(tmp_path / "v.rrd")
+    for axis in "xyz":
+        error, low, high = np.array(values[rf"/position/{axis}/a\ run", "Scalars:scalars"]).T
+        np.testing.assert_allclose(error, 0.0, atol=1e-6)
+        np.testing.assert_allclose([low, high], np.outer([-3.0 * SIGMA_M, 3.0 * SIGMA_M], np.ones(len(low))), rtol=1e-6)
+        assert len(values[rf"/rotation/{axis}/a\ run", "Scalars:scalars"]) == 390
+        assert (np.array(values[rf"/bias_gyro/{axis}/a\ run", "Scalars:scalars"]) == [0.0, -3.0, 3.0]).all()
+    spent = values[r"/time/a\ run", "Scalars:scalars"][-1][0]
+    stages = [rows[-1][0] for (path, name), rows in values.items() if "/stages/" in path and "scalars" in name]
+    assert spent == pytest.approx(sum(stages))
+    assert values[r"/features/a\ run/tracked", "Scalars:scalars"] == [[120.0]] * 400
 
 
-def test_a_run_is_shown_in_the_world_of_the_ground_truth(run, landmarks):
-    scene = scene_of(evaluate_paths([run]))
-    (shown,) = scene.flights
-    np.testing.assert_allclose(shown.estimate.p_WB, flight().p_WB[10:], atol=1e-6)
-    np.testing.assert_allclose(shown.landmarks.p_WF, landmarks[:400], atol=1e-5)
-    np.testing.assert_array_equal(shown.landmarks.ids, 10 * np.arange(400))
-    assert len(scene.truths) == 1
+def test_nothing_is_drawn_where_nothing_was_estimated(tmp_path):
+    gap = flight().select(np.r_[0:100, 200:400])
+    write_tum(gap, tmp_path / "gap.tum")
+    write_tum(flight(), tmp_path / "truth.tum")
+    view(tmp_path / "gap.tum", "--ground-truth", tmp_path / "truth.tum", "--save", tmp_path / "v.rrd")
+    values, times = recorded(tmp_path / "v.rrd")
+    assert [len(strip) for strip in values["/world/gap/path", "LineStrips3D:strips"][0]] == [100, 200]
+    error = np.array(values["/position/x/gap", "Scalars:scalars"])[:, 0]
+    assert np.flatnonzero(np.isnan(error)).tolist() == [100]
+    assert np.all(np.diff(times["/position/x/gap"]) > 0)
 
 
-def test_runs_of_one_flight_share_their_ground_truth(run, tmp_path):
+def test_runs_of_one_flight_share_the_truth_and_keep_their_colours(run, tmp_path):
     write_run(tmp_path / "b", disturbed(flight(), 0.05, 0.01), flight())
-    scene = scene_of(evaluate_paths([run, tmp_path / "b"]))
-    assert [flight.name for flight in scene.flights] == ["a run", "b"]
-    assert len(scene.truths) == 1
-
-
-def test_a_run_without_a_pose_keeps_the_colours_of_the_others(run, tmp_path):
     write_run(tmp_path / "never", flight(30), flight(30), waiting=30)
-    assert [f.number for f in scene_of(evaluate_paths([tmp_path / "never", run])).flights] == [1]
+    view(tmp_path / "never", run, tmp_path / "b", "--save", tmp_path / "v.rrd")
+    values, _ = recorded(tmp_path / "v.rrd")
+    paths = {path: rows[0] for (path, name), rows in values.items() if name == "LineStrips3D:colors"}
+    expected = {r"/world/a\ run/path": colour(1), "/world/b/path": colour(2), r"/world/ground\ truth": "#b0b0b0"}
+    assert paths == {path: [int(f"{each[1:]}FF", 16)] for path, each in expected.items()}
+    assert not any("never/body/camera" in path and "Pinhole" in name for path, name in values)
+
+
+def test_images_are_those_of_the_recording_while_it_is_there(run, tmp_path):
+    sent = measurements(6)
+    frames = [m for m in sent if isinstance(m, Frame)]
+    convert(sent, CALIBRATION, tmp_path / "flight", format="asl")
+    t_ns = np.array([frame.t_ns for frame in frames[:4]])
+    for name in ("first", "second"):
+        write_run(tmp_path / name, Trajectory(t_ns, np.tile(np.eye(3), (4, 1, 1)), np.zeros((4, 3))), waiting=1)
+        (tmp_path / name / "config.yaml").write_text(f"dataset: {{path: {tmp_path / 'flight'}, reader: euroc}}\n")
+    view(tmp_path / "first", tmp_path / "second", "--save", tmp_path / "v.rrd")
+    values, times = recorded(tmp_path / "v.rrd")
+    # Once for both, and no image that was not flown.
+    assert [path for path, name in values if name == "EncodedImage:blob"] == ["/world/first/body/camera/image"]
+    assert times["/world/first/body/camera/image"] == (t_ns - t_ns[0]).tolist()
+    for (jpeg,), frame in zip(values["/world/first/body/camera/image", "EncodedImage:blob"], frames, strict=False):
+        shown = cv2.imdecode(np.array(jpeg, np.uint8), cv2.IMREAD_GRAYSCALE)
+        assert np.corrcoef(shown.ravel(), frame.image.ravel())[0, 1] > 0.9
+    for name in ("first", "second"):
+        points = values[f"/world/first/body/camera/tracks/{name}", "Points2D:positions"]
+        assert [len(each) for each in points] == [120] * 4
+    (tmp_path / "flight").rename(tmp_path / "gone")
+    view(tmp_path / "first", "--save", tmp_path / "v.rrd")
+    assert not any(name == "EncodedImage:blob" for _, name in recorded(tmp_path / "v.rrd")[0])
+
+
+def test_the_cameras_are_where_the_calibration_has_them(run, tmp_path):
+    view(run, "--save", tmp_path / "v.rrd")
+    values, _ = recorded(tmp_path / "v.rrd")
+    calibration, camera = packaged_calibration("euroc"), r"/world/a\ run/body/camera"
+    np.testing.assert_allclose(values[camera, "Transform3D:translation"][0][0], calibration.p_BC, rtol=1e-6)
+    np.testing.assert_allclose(
+        np.reshape(values[camera, "Transform3D:mat3x3"][0][0], (3, 3)).T, calibration.R_BC, atol=1e-6
+    )
+    assert values[camera, "Pinhole:resolution"][0][0] == [752.0, 480.0]
+
+
+def test_a_world_is_shown_around_the_flight(run, tmp_path):
+    pytest.importorskip("open3d")
+    hall = box((-9.0, -8.0, -3.0), (9.0, 8.0, 3.0))
+    view(run, "--save", tmp_path / "v.rrd", "--world", write_ply_mesh(tmp_path / "hall.ply", hall))
+    (vertices,) = recorded(tmp_path / "v.rrd")[0]["/world/mesh", "Mesh3D:vertex_positions"]
+    np.testing.assert_allclose(vertices, hall.reshape(-1, 3))
+
+
+def test_a_body_at_rest_can_be_seen(tmp_path):
+    still = flight(40)
+    still = Trajectory(still.t_ns, still.R_WB, np.zeros((40, 3)))
+    for name, trajectory in (("still", still), ("single", still.select(slice(0, 1)))):
+        write_tum(trajectory, tmp_path / f"{name}.tum")
+        view(tmp_path / f"{name}.tum", "--save", tmp_path / "v.rrd")
+        values, _ = recorded(tmp_path / "v.rrd")
+        assert len(values[f"/world/{name}/body", "Transform3D:translation"]) == len(trajectory)
 
 
 def test_the_map_is_written_without_its_outliers(run, tmp_path, landmarks, monkeypatch):
-    monkeypatch.setitem(sys.modules, "open3d", None)  # which is not needed for this
+    for module in ("open3d", "rerun"):
+        monkeypatch.setitem(sys.modules, module, None)  # which are not needed for this
     result = view(run, "--map", tmp_path / "maps" / "clean.ply")
     assert result.stdout.strip() == f"{tmp_path / 'maps' / 'clean.ply'}: 400 landmarks"
     written = read_landmarks(tmp_path / "maps" / "clean.ply")
@@ -148,217 +205,35 @@ def test_the_map_is_written_without_its_outliers(run, tmp_path, landmarks, monke
     assert len(read_landmarks(run / "map.ply")) == 403
 
 
-@pytest.mark.parametrize("azimuth", [-170.0, 0.0, 65.0])
-@pytest.mark.parametrize("elevation", [-30.0, 0.0, 28.0, 89.0])
-@pytest.mark.parametrize("size", [(400, 300), (300, 600)])
-def test_everything_is_in_the_picture_and_fills_it(azimuth, elevation, size):
-    points = flight().p_WB + np.array([50.0, -20.0, 3.0])
-    seen_from = view_of(points, azimuth, elevation, size)
-    np.testing.assert_allclose(seen_from.R_VW @ seen_from.R_VW.T, np.eye(3), atol=1e-12)
-    assert np.linalg.det(seen_from.R_VW) == pytest.approx(1.0)
-    assert seen_from.depth(points).min() > 0.0
-    xy = seen_from.project(points) + 0.5
-    low, high = xy.min(axis=0) / size, 1.0 - xy.max(axis=0) / size
-    assert min(low.min(), high.min()) == pytest.approx(0.04)
-    np.testing.assert_allclose(low, high, atol=1e-4)  # in the middle
-    up_V = seen_from.R_VW[:, 2]
-    assert up_V[0] == pytest.approx(0.0)
-    assert up_V[1] < 0.0
-
-
-def test_rays_go_through_the_pixels_that_points_project_to():
-    points = flight(50).p_WB
-    seen_from = view_of(points, 30.0, 20.0, SIZE)
-    ahead = seen_from.directions(seen_from.project(points)) * seen_from.depth(points)[:, None]
-    np.testing.assert_allclose(seen_from.eye + ahead, points, atol=1e-9)
-
-
-@pytest.mark.parametrize("behind", [-5.0, 5.0])
-def test_a_path_is_looked_at_broadside_with_the_scenery_behind(behind):
-    path = np.column_stack([np.linspace(-4.0, 4.0, 50), np.zeros(50), np.zeros(50)])
-    scenery = path + np.array([0.0, behind, 0.0])
-    azimuth = np.radians(best_azimuth_deg(path, scenery))
-    assert np.sign(np.sin(azimuth)) == -np.sign(behind)
-    assert abs(np.cos(azimuth)) < 0.5
-
-
-def test_a_body_at_rest_can_be_seen(tmp_path):
-    pytest.importorskip("open3d")
-    still = flight(40)
-    still = Trajectory(still.t_ns, still.R_WB, np.zeros((40, 3)))
-    for name, trajectory in (("still", still), ("single", still.select(slice(0, 1)))):
-        write_tum(trajectory, tmp_path / f"{name}.tum")
-        view(tmp_path / f"{name}.tum", "--save", tmp_path / "p.png", "--size", "240x160")
-        scene = scene_of(evaluate_paths([tmp_path / f"{name}.tum"]))
-        xy = choose_view(scene, (240, 160))[1].project(np.zeros((1, 3)))
-        assert share_of_colour(picture(tmp_path / "p.png"), xy, rgb(0)) == 1.0
-
-
-def test_a_wall_before_the_flight_does_not_hide_it_and_one_behind_is_seen():
-    pytest.importorskip("open3d")
-    path = flight()
-    scene = Scene([Flight(0, "a", path, None, None)], [], box((-9.0, -8.0, -3.0), (9.0, 8.0, 3.0)))
-    grid, seen_from = choose_view(scene, SIZE)
-    image = render(draw(scene, grid, seen_from), seen_from) / 255.0
-    # One pane of glass at most lies before it.
-    behind_glass = 0.95 * np.array(rgb(0)) + 0.05 * 0.88
-    assert share_of_colour(image, seen_from.project(path.p_WB), behind_glass) > 0.9
-    beyond = -seen_from.eye * [1.0, 1.0, 0.0]
-    far_wall = np.array([[0.0, np.copysign(8.0, beyond[1]), 1.7]])
-    assert 0.75 < image[tuple(np.round(seen_from.project(far_wall)[0]).astype(int)[::-1])].mean() < 0.95
-    assert image[2, -3].mean() == 1.0
-
-
-def test_the_cameras_look_where_the_camera_looked():
-    calibration, path = packaged_calibration("euroc"), flight()
-    corners = cameras(Flight(0, "a", path, None, calibration), calibration, 0.02).corners
-    p_WC = path.p_WB + path.R_WB @ calibration.p_BC
-    ahead_W = path.R_WB @ calibration.R_BC[:, 2]
-    rods_each = 16 * 8
-    assert 10 <= len(corners) / rods_each <= 23
-    for camera in corners.reshape(-1, rods_each, 3, 3):
-        # The first four of the eight rods come from the apex, the others are around the image.
-        apex = camera[:64].reshape(4, 16, 9)[:, :, :3].mean(axis=(0, 1))
-        base = camera[64:].reshape(-1, 3).mean(axis=0)
-        nearest = np.argmin(np.linalg.norm(p_WC - apex, axis=1))
-        assert np.linalg.norm(p_WC[nearest] - apex) < 0.02
-        assert (base - apex) @ ahead_W[nearest] / np.linalg.norm(base - apex) > 0.98
-
-
-def test_a_run_folder_without_calibration_is_shown_without_cameras(run, tmp_path):
-    write_run(tmp_path / "b", flight(), flight())
-    with_, without = (scene_of(evaluate_paths([path])).flights[0].calibration for path in (run, tmp_path / "b"))
-    assert without is None
-    np.testing.assert_allclose(with_.R_BC, packaged_calibration("euroc").R_BC, atol=1e-12)
-
-
-def test_a_grid_has_round_lines_around_all_that_is_of_interest(run):
-    scene = scene_of(evaluate_paths([run]))
-    grid = ground_grid(scene)
-    assert grid.step_m == 2.0
-    for axis in (0, 1):
-        np.testing.assert_allclose(grid.ticks(axis) % 2.0, 0.0, atol=1e-9)
-        assert grid.ticks(axis)[0] <= scene.of_interest[:, axis].min()
-        assert grid.ticks(axis)[-1] >= scene.of_interest[:, axis].max()
-    assert grid.z_m <= scene.path[:, 2].min()
-
-
-def test_landmarks_far_away_do_not_make_the_flight_small(run):
-    scene = scene_of(evaluate_paths([run]))
-    far = Scene(scene.flights, scene.truths)
-    reach = np.linalg.norm(far.of_interest - scene.path.mean(axis=0), axis=1).max()
-    assert reach < 2.0 * np.linalg.norm(scene.path - scene.path.mean(axis=0), axis=1).max()
-
-
-def outward(corners, middle):
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    return np.sum(normals * (corners.mean(axis=1) - middle), axis=1)
-
-
-def test_shapes_turn_their_outside_outwards():
-    for fine, facets in ((False, 20), (True, 320)):
-        ball = balls(np.array([[1.0, 2.0, 3.0]]), 0.5, (1.0, 0.0, 0.0), fine=fine).corners
-        assert len(ball) == facets
-        assert (outward(ball, np.array([1.0, 2.0, 3.0])) > 0.0).all()
-        np.testing.assert_allclose(np.linalg.norm(ball - [1.0, 2.0, 3.0], axis=2), 0.5)
-    for end in np.concatenate([np.eye(3), -np.eye(3), [[1.0, -2.0, 0.5]]]):
-        rod = rods(np.zeros((1, 3)), end[None], 0.1, (1.0, 0.0, 0.0)).corners
-        middle = rod.mean(axis=1) @ end / (end @ end)
-        assert (outward(rod, middle[:, None] * end) > 0.0).all()
-
-
-def test_lines_keep_to_the_points():
-    points = np.array([[0.0, 0.0, 0.0], [0.001, 0.0, 0.0], [1.0, 0.0, 0.0], [1.0, 1.0, 0.0], [1.0, 1.0, 0.0]])
-    np.testing.assert_array_equal(thinned(points, 0.5), points[[0, 2, 3, 4]])
-    tube = polyline(points, 0.1, (0.0, 0.0, 0.0)).corners.reshape(-1, 3)
-    on_first, on_second = np.hypot(tube[:, 1], tube[:, 2]), np.hypot(tube[:, 0] - 1.0, tube[:, 2])
-    assert np.minimum(on_first, on_second).max() <= 0.1 + 1e-12
-    dash = dashes(np.array([[0.0, 0.0, 0.0], [8.0, 0.0, 0.0]]), 0.1, 1.0, (0.0, 0.0, 0.0)).corners[..., 0]
-    assert np.all(dash % 1.0 <= 0.5)
-
-
-def test_a_box_has_twelve_edges():
-    a, b = creases(box((0.0, 0.0, 0.0), (1.0, 2.0, 3.0)))
-    assert sorted(np.linalg.norm(b - a, axis=1).tolist()) == [1.0] * 4 + [2.0] * 4 + [3.0] * 4
-    assert len(creases(box((0.0, 0.0, 0.0), (1.0, 2.0, 3.0))[:2])[0]) == 4  # a lone sheet: what bounds it
-
-
-def test_faces_are_turned_to_the_flight():
-    hall = box((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
-    assert (outward(facing(hall, np.zeros(3)), np.zeros(3)) < 0.0).all()
-
-
-def test_the_window_shows_the_same(run):
-    """Open3D's window, off screen, in a process of its own: a graphics driver may take its process with it."""
-    pytest.importorskip("open3d")
-    code = f"""
-import sys
-import numpy as np, open3d
-from vioframe.report.evaluated import evaluate_paths
-from vioframe.report.scene import scene_of
-from vioframe.report.scene_window import fill
-from vioframe.report.viewing import choose_view
-window = open3d.visualization.Visualizer()
-if not window.create_window("test", 480, 320, visible=False):
-    sys.exit(77)
-scene = scene_of(evaluate_paths([{str(run)!r}]))
-grid, view = choose_view(scene, (480, 320))
-fill(window, scene, grid, view)
-image = np.asarray(window.capture_screen_float_buffer(True))
-xy = np.round(view.project(scene.flights[0].estimate.p_WB)).astype(int)
-print("white", (image[xy[:, 1], xy[:, 0]].min(axis=1) > 0.9).mean(), (image.min(axis=2) > 0.9).mean())
-"""
-    code = code.replace(f"[{str(run)!r}]", f"[__import__('pathlib').Path({str(run)!r})]")
-    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
-    if result.returncode != 0:
-        pytest.skip(f"no graphics driver that works here: {result.stderr[-200:]}")
-    on_path, everywhere = map(float, result.stdout.splitlines()[-1].split()[1:])
-    assert on_path < 0.05
-    assert everywhere > 0.6
-
-
-def test_without_a_display_the_remedy_is_named(run, monkeypatch):
-    assert "no display" in (error := one_line(run))
-    assert "--save FILE.png" in error
-    # A display that is named and cannot be reached, as of a connection that is gone.
-    monkeypatch.setenv("DISPLAY", ":4711")
-    monkeypatch.setenv("WAYLAND_DISPLAY", "wayland-9")
-    monkeypatch.setenv("XDG_RUNTIME_DIR", os.devnull)
-    assert "--save FILE.png" in one_line(run)
-
-
-def test_without_open3d_the_remedy_is_named(run, tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "open3d", None)
-    error = one_line(run, "--save", tmp_path / "p.png")
-    assert "pip install 'vioframe[open3d]'" in error
+def test_what_is_missing_is_said_with_its_remedy(run, tmp_path, monkeypatch):
+    error = one_line(run)
+    assert "no display" in error
+    assert "--save FILE.rrd" in error
+    with monkeypatch.context() as without:
+        without.setitem(sys.modules, "open3d", None)
+        world = write_ply_mesh(tmp_path / "hall.ply", box((0, 0, 0), (1, 1, 1)))
+        assert "pip install 'vioframe[open3d]'" in one_line(run, "--save", tmp_path / "v.rrd", "--world", world)
+    monkeypatch.setitem(sys.modules, "rerun", None)
+    assert "pip install 'vioframe[view]'" in one_line(run, "--save", tmp_path / "v.rrd")
 
 
 def test_bad_input_is_one_line(run, tmp_path):
-    pytest.importorskip("open3d")
-    save = ("--save", tmp_path / "p.png", "--size", "240x160")
+    save = ("--save", tmp_path / "v.rrd")
     write_run(tmp_path / "never", flight(30), flight(30), waiting=30)
-    result = view(tmp_path / "never", *save, code=2)
-    assert "nothing to show" in result.stderr.splitlines()[-1]
+    assert "nothing to show" in view(tmp_path / "never", *save, code=2).stderr.splitlines()[-1]
     write_tum(flight(), tmp_path / "bare.tum")
     assert "no landmarks" in view(tmp_path / "bare.tum", "--map", tmp_path / "m.ply", code=2).stderr
     assert "there is no mesh" in one_line(run, *save, "--world", tmp_path / "none.ply")
-    flat = write_ply_mesh(tmp_path / "flat.ply", np.full((1, 3, 3), np.nan))
-    assert "holds no triangles" in one_line(run, *save, "--world", flat)
     (tmp_path / "file").write_text("")
-    assert "cannot write" in one_line(run, "--save", tmp_path / "file" / "p.png", "--size", "240x160")
+    assert "cannot write" in one_line(run, "--save", tmp_path / "file" / "v.rrd")
     assert "cannot write" in one_line(run, "--map", tmp_path / "file" / "m.ply")
     assert "is not a run folder" in one_line(tmp_path, *save)
+    assert not (tmp_path / "v.rrd").exists()
 
 
 @pytest.mark.parametrize(
     ("arguments", "says"),
-    [
-        (["--size", "1600"], "not a size such as 1600x1000"),
-        (["--size", "20x20"], "100 to 8000 pixels"),
-        (["--save", "p.jpg"], "does not end in .png"),
-        (["again", "--map", "m.ply"], "a single RUN"),
-        (["--elevation", "120"], "-89.0<=x<=89.0"),
-    ],
+    [(["--save", "p.png"], "does not end in .rrd"), (["again", "--map", "m.ply"], "a single RUN")],
 )
 def test_bad_options_are_refused(run, arguments, says):
     assert says in view(run, *arguments, code=2).stderr

@@ -25,5 +25,9 @@ class TrajectoryError(VioframeError):
     """A trajectory file is malformed, or two trajectories cannot be compared."""
 
 
+class DivergedError(VioframeError):
+    """An estimate can no longer be believed; the message says why. The life cycle takes it and begins anew."""
+
+
 class RunError(VioframeError):
     """A run folder exists already, is incomplete, or cannot be written."""

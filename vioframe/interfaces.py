@@ -18,6 +18,7 @@ from vioframe.types import (
     Measurement,
     Mesh,
     Motion,
+    Start,
     Step,
     TrainingStep,
 )
@@ -25,7 +26,6 @@ from vioframe.types import (
 if TYPE_CHECKING:
     from vioframe.evaluation import Comparison
     from vioframe.geometry.trajectory import Trajectory
-    from vioframe.types import Mesh, Motion
 
 
 @runtime_checkable
@@ -39,10 +39,22 @@ class Detector(Protocol):
 
 @runtime_checkable
 class Backend(Protocol):
-    """Estimates motion from inertial segments and feature tracks, one frame at a time."""
+    """Estimates motion from inertial segments and feature tracks, one frame at a time.
 
-    def process(self, imu: ImuSegment, tracks: FrameTracks) -> Estimate:
-        """Take the readings since the last frame and the tracks of this one; say what is known now."""
+    Its life is the core's (:mod:`vioframe.estimation.lifecycle`): when it begins, is lost and begins anew.
+    """
+
+    def begin(self, start: Start) -> None:
+        """Forget all that was before, and begin at ``start``."""
+        ...
+
+    def process(self, imu: ImuSegment, tracks: FrameTracks, still: bool) -> Estimate:
+        """Take the readings since the last frame and the tracks of this one; say what is known now.
+
+        ``still`` says that the images show a body at rest; the readings may yet contradict it. Raises
+        :class:`~vioframe.errors.DivergedError`, saying why, where the estimate can no longer be believed: it is begun
+        anew then.
+        """
         ...
 
 
@@ -73,21 +85,27 @@ class Dataset(Protocol):
 
     @property
     def calibration(self) -> Calibration:
-        """Calibration of the camera and IMU that are read."""
+        """The cameras that are read, in the order of the images in a frame set, and the IMU."""
         ...
 
     @property
     def frame_count(self) -> int | None:
-        """Number of images, for progress bars; None where it is not known."""
+        """Number of frame sets, for progress bars; None where it is not known."""
         ...
 
     @property
     def ground_truth(self) -> Trajectory | None:
-        """The body's true trajectory where the data set itself brings one in the body frame, else None."""
+        """The body's true trajectory where the data set itself brings one in the body frame, else None.
+
+        Where velocity and biases are known too, it may be a :class:`vioframe.io.trajectories.TrueTrajectory`.
+        """
         ...
 
     def measurements(self) -> Iterator[Measurement]:
-        """IMU samples and frames in roughly ascending order of their header stamps, and what could not be read."""
+        """IMU samples and frame sets in roughly ascending order of their stamps, and what could not be read.
+
+        Images of one stamp come in one set, those with stamps of their own in sets of their own.
+        """
         ...
 
 

@@ -1,54 +1,184 @@
-"""The main loop: one camera frame at a time, from measurements to an estimate.
+"""A run put together: a configuration and the installed parts in, a recorded run folder out.
 
-    bag -> measurements -> packets -> tracks -> estimate -> files -> report
-
-Nothing flows back from the back-end to the front-end. A live view, a progress bar and the recorder are consumers of the
-:class:`~vioframe.types.Step` objects that :func:`run` yields.
+The command line and the benchmarks both come through here; :class:`vioframe.odometry.Odometry` is the loop itself.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, replace
+from itertools import chain
+from pathlib import Path
 from time import perf_counter
+from typing import Any
 
-from vioframe.errors import PluginError
-from vioframe.frontend import Frontend, FrontendOptions
+from vioframe.errors import DatasetError, RunError
+from vioframe.geometry.trajectory import Trajectory
 from vioframe.incidents import Incidents
-from vioframe.interfaces import Backend, Dataset, Detector
-from vioframe.io.synchronise import synchronise
-from vioframe.types import Estimate, Step
+from vioframe.interfaces import Dataset, LoopCloser
+from vioframe.io.calibration import write_calibration
+from vioframe.io.synchronise import played
+from vioframe.io.trajectories import load_trajectory, write_tum
+from vioframe.odometry import Odometry, limited_threads
+from vioframe.parts import config as configuration
+from vioframe.parts.config import Config
+from vioframe.parts.registry import BACKEND, DATASET, DETECTOR, LOOP_CLOSER, Registry
+from vioframe.runs import machine
+from vioframe.runs.recorder import Recorder, new_run_folder, write_json
+from vioframe.types import LoopClosure, Step
 
 
 def run(
-    dataset: Dataset,
-    detector: Detector,
-    backend: Backend,
-    options: FrontendOptions | None = None,
-    *,
-    start_s: float = 0.0,
-    duration_s: float | None = None,
-    incidents: Incidents | None = None,
+    dataset: Dataset, odometry: Odometry, *, start_s: float = 0.0, duration_s: float | None = None
 ) -> Iterator[Step]:
-    """Estimate motion along ``dataset``, yielding one :class:`Step` a frame.
+    """Push a data set through ``odometry``, yielding one :class:`~vioframe.types.Step` a frame.
 
     ``start_s`` seconds are skipped, counted from the first frame's stamp; ``duration_s`` is how much is then played.
-    ``incidents`` collects what was handled on the way (dropped samples, unusable images, failing detectors).
     """
-    incidents = Incidents() if incidents is None else incidents
-    frontend = Frontend(detector, dataset.calibration.camera, options or FrontendOptions(), incidents)
-    packets = synchronise(
-        dataset.measurements(),
-        time_offset_ns=dataset.calibration.time_offset_ns,
-        start_s=start_s,
-        duration_s=duration_s,
-        incidents=incidents,
+    return odometry.follow(played(dataset.measurements(), start_s, duration_s))
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """A data set, the odometry to push it through and what it is compared with. ``config`` is complete."""
+
+    config: Config
+    registry: Registry
+    dataset: Dataset
+    odometry: Odometry
+    ground_truth: Trajectory | None
+    loop_closer: LoopCloser | None = None
+
+    @property
+    def name(self) -> str:
+        return f"{self.dataset.name}_{self.config.detector.name}_{self.config.backend.name}"
+
+    @property
+    def incidents(self) -> Incidents:
+        return self.odometry.incidents
+
+    def steps(self) -> Iterator[Step]:
+        """The main loop, the loop closer taking part; what a plug-in raises comes out as an error that names it."""
+        with limited_threads(), self.registry.blaming():
+            for step in run(
+                self.dataset, self.odometry, start_s=self.config.start_s, duration_s=self.config.duration_s
+            ):
+                if self.loop_closer is None:
+                    yield step
+                    continue
+                begin = perf_counter()
+                self.loop_closer.add(step)
+                yield replace(step, stage_seconds={**step.stage_seconds, "loop_closure": perf_counter() - begin})
+
+    def close_loops(self) -> LoopClosure | None:
+        """What the loop closer, if any, made of all steps; to be called once they are through."""
+        if self.loop_closer is None:
+            return None
+        with limited_threads(), self.registry.blaming():
+            return self.loop_closer.finish()
+
+
+def prepare(config: Config, registry: Registry) -> Experiment:
+    """Check the whole of ``config``, then open the data set and create the parts."""
+    config = configuration.complete(config, registry)
+    if config.dataset.path is None:
+        raise DatasetError("no data set given; name a bag or folder, or set dataset.path in the configuration")
+    dataset, options = _one_camera(registry, config)
+    config = config.model_copy(update={"dataset": config.dataset.model_copy(update={"options": options})})
+    odometry = Odometry(
+        dataset.calibration,
+        config.detector.name,
+        config.backend.name,
+        detector_options=config.detector.options,
+        backend_options=config.backend.options,
+        frontend=config.frontend_options,
+        estimation=config.estimation_options,
+        wait_ms=config.wait_ms,
+        installed=registry,
     )
-    for imu, frame in packets:
-        tracks = frontend.track(imu, frame, dataset.calibration.R_BC)
-        begin = perf_counter()
-        estimate = backend.process(imu, tracks)
-        backend_s = perf_counter() - begin
-        if not isinstance(estimate, Estimate):
-            raise PluginError(f"the back-end returned a {type(estimate).__name__}, not an Estimate; repair the plug-in")
-        within = {f"backend.{stage}": seconds for stage, seconds in estimate.stage_seconds.items()}
-        yield Step(frame, tracks, estimate, {**frontend.stage_seconds, "backend": backend_s, **within})
+    return Experiment(
+        config,
+        registry,
+        dataset,
+        odometry,
+        dataset.ground_truth if config.ground_truth is None else load_trajectory(config.ground_truth),
+        None
+        if config.loop_closure is None
+        else registry.create_loop_closer(config.loop_closure.name, dataset.calibration, config.loop_closure.options),
+    )
+
+
+def _one_camera(registry: Registry, config: Config) -> tuple[Dataset, dict[str, Any]]:
+    """The data set, of a rig its first camera where nothing is said: front-end and back-ends take one for now."""
+    path, reader, options = config.dataset.path, config.dataset.reader, dict(config.dataset.options)
+    assert path is not None
+    dataset = registry.open_dataset(path, reader, options)
+    cameras = dataset.calibration.cameras
+    if len(cameras) > 1 and "cameras" in options and options["cameras"] is None:
+        options["cameras"] = [cameras[0].name]
+        dataset = registry.open_dataset(path, reader, options)
+    return dataset, options
+
+
+def record(
+    experiment: Experiment,
+    folder: Path,
+    *,
+    overwrite: bool = False,
+    on_step: Callable[[Step], None] = lambda step: None,
+) -> dict[str, Any]:
+    """Run ``experiment`` and write ``folder`` as it goes; returns the summary.
+
+    Nothing is created or replaced before the first frame has gone through; after that the folder is completed
+    however the run ends.
+    """
+    begin_s = perf_counter()
+    steps = experiment.steps()
+    first = next(steps, None)
+    if first is None:
+        raise DatasetError(f"{experiment.dataset.name} has no image to process; check --start and --duration")
+    new_run_folder(folder, overwrite=overwrite)
+    try:
+        return _write(experiment, folder, chain([first], steps), begin_s, on_step)
+    except OSError as error:
+        raise RunError(f"cannot write to {folder}: {error.strerror}; is the disk full?") from error
+
+
+def _write(
+    experiment: Experiment, folder: Path, steps: Iterable[Step], begin_s: float, on_step: Callable[[Step], None]
+) -> dict[str, Any]:
+    config, registry = experiment.config, experiment.registry
+    (folder / "config.yaml").write_text(configuration.render(config, registry), encoding="utf-8")
+    write_json(folder / "machine.json", machine.describe())
+    write_calibration(experiment.dataset.calibration, folder / "calibration")
+    if experiment.ground_truth is not None:
+        write_tum(experiment.ground_truth, folder / "ground_truth.tum")
+    with Recorder(folder, _about(experiment), experiment.incidents, begin_s) as recorder:
+        try:
+            for step in steps:
+                recorder.add(step)
+                on_step(step)
+            if (loop_closure := experiment.close_loops()) is not None:
+                recorder.add_loop_closure(loop_closure)
+        except BaseException as error:
+            error.add_note(f"what was estimated until then is in {folder}")
+            raise
+    return recorder.summary
+
+
+def _about(experiment: Experiment) -> dict[str, Any]:
+    config = experiment.config
+    chosen = {DATASET: config.dataset.reader or "", DETECTOR: config.detector.name, BACKEND: config.backend.name}
+    if config.loop_closure is not None:
+        chosen[LOOP_CLOSER] = config.loop_closure.name
+    return {
+        "name": experiment.name,
+        "dataset": experiment.dataset.name,
+        "cameras": [camera.name for camera in experiment.dataset.calibration.cameras],
+        "detector": config.detector.name,
+        "backend": config.backend.name,
+        "loop_closer": None if config.loop_closure is None else config.loop_closure.name,
+        "plugins": {kind.name: str(experiment.registry.find(kind, name).source) for kind, name in chosen.items()},
+        "start_s": config.start_s,
+        "duration_s": config.duration_s,
+    }

@@ -11,11 +11,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from vioframe.arrays import Float, Image, Int
+from vioframe.arrays import Bool, Float, Image, Int
+from vioframe.errors import CalibrationError, ConfigError
 from vioframe.geometry.cameras import Camera
 from vioframe.geometry.trajectory import Trajectory
 
@@ -48,11 +50,15 @@ class ImuSample:
 
 
 @dataclass(frozen=True, slots=True)
-class Frame:
-    """One image, (H, W) uint8 and read-only, with the stamp of its exposure."""
+class FrameSet:
+    """The images that a rig's cameras took at one instant, the stamp of their exposure.
+
+    ``images`` has a place for each camera of the rig, in its order: (H, W) uint8 and read-only, or None where a camera
+    brings none. Cameras that are triggered together come in one set; those with stamps of their own in sets of one.
+    """
 
     t_ns: int
-    image: Image
+    images: tuple[Image | None, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,7 +73,7 @@ class Unreadable:
     detail: str
 
 
-Measurement = ImuSample | Frame | Unreadable
+Measurement = ImuSample | FrameSet | Unreadable
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,21 +113,114 @@ class Keypoints:
 
 @dataclass(frozen=True, slots=True)
 class FrameTracks:
-    """The features seen in one frame: ``ids`` (N,) unique, ``xy`` (N, 2) px, ``xy_normalised`` (N, 2) with z = 1."""
+    """The features seen in one frame: ``ids`` (N,), ``xy`` (N, 2) px, ``xy_normalised`` (N, 2) with z = 1.
+
+    ``camera`` (N,) is the place in the rig of the camera that saw each. An id is unique within a camera; the same id in
+    two cameras is the same landmark.
+    """
 
     t_ns: int
     ids: Int
+    camera: Int
     xy: Float
     xy_normalised: Float
 
-    def only(self, keep: NDArray[np.bool_]) -> FrameTracks:
+    @classmethod
+    def none(cls, t_ns: int) -> FrameTracks:
+        """A frame in which nothing is seen."""
+        return cls(t_ns, np.empty(0, np.int64), np.empty(0, np.int64), np.empty((0, 2)), np.empty((0, 2)))
+
+    def only(self, keep: Bool) -> FrameTracks:
         """The features ``keep`` (N,)."""
-        return FrameTracks(self.t_ns, self.ids[keep], self.xy[keep], self.xy_normalised[keep])
+        return FrameTracks(self.t_ns, self.ids[keep], self.camera[keep], self.xy[keep], self.xy_normalised[keep])
 
     def finite(self) -> FrameTracks:
         """Without the points that could not be undistorted."""
         good = np.asarray(np.isfinite(self.xy_normalised).all(axis=1))
         return self if good.all() else self.only(good)
+
+
+@dataclass(frozen=True, slots=True)
+class ImuNoise:
+    """Continuous-time noise densities of an IMU, as Kalibr and EuRoC state them; ``rate_hz`` is its nominal rate."""
+
+    gyro_density: float
+    """White noise of the gyroscope, rad/s/sqrt(Hz)."""
+    accel_density: float
+    """White noise of the accelerometer, m/s^2/sqrt(Hz)."""
+    gyro_walk: float
+    """Diffusion of the gyroscope's bias, rad/s^2/sqrt(Hz)."""
+    accel_walk: float
+    """Diffusion of the accelerometer's bias, m/s^3/sqrt(Hz)."""
+    rate_hz: float = 200.0
+
+    def in_flight(self, factor: float) -> ImuNoise:
+        """With ``factor`` times the white noise: in flight, vibration adds to the sensor's own."""
+        return replace(self, gyro_density=factor * self.gyro_density, accel_density=factor * self.accel_density)
+
+
+@dataclass(frozen=True, slots=True)
+class CameraOnBody:
+    """A camera and how it sits on the body: ``p_B = R_BC @ p_C + p_BC`` and ``t_imu = t_cam + time_offset_ns``.
+
+    Where nobody knows how the camera is turned, ``rotation_known`` is False and ``R_BC`` (3, 3) means nothing: it is
+    found while initialising. ``name`` is that of its folder or topic, such as ``cam0``.
+    """
+
+    name: str
+    model: Camera
+    R_BC: Float
+    p_BC: Float
+    time_offset_ns: int = 0
+    rotation_known: bool = True
+
+
+@dataclass(frozen=True, slots=True)
+class Calibration:
+    """A rig: its cameras, in the order in which frames and tracks refer to them, and the IMU's noise."""
+
+    cameras: tuple[CameraOnBody, ...]
+    imu: ImuNoise
+
+    def __post_init__(self) -> None:
+        names = [camera.name for camera in self.cameras]
+        if not names or len(set(names)) < len(names):
+            raise CalibrationError(f"a rig needs cameras with names of their own, got {names}")
+
+    def single(self, user: str) -> CameraOnBody:
+        """The only camera; raises :class:`ConfigError` naming ``user``, who takes one, where there are more."""
+        if len(self.cameras) > 1:
+            names = ", ".join(camera.name for camera in self.cameras)
+            raise ConfigError(f"{user} takes one camera for now, the calibration has {names}; choose one of them")
+        return self.cameras[0]
+
+    def with_camera(self, index: int, **changes: Any) -> Calibration:
+        """The same rig with fields of one camera changed."""
+        cameras = list(self.cameras)
+        cameras[index] = replace(cameras[index], **changes)
+        return replace(self, cameras=tuple(cameras))
+
+
+@dataclass(frozen=True, slots=True)
+class CameraSigma:
+    """Standard deviations of a camera's calibration; zero is what is taken as given and not estimated.
+
+    ``rotation`` (3,) rad and ``position`` (3,) m of the camera on the body, right perturbation; ``time_offset_s``;
+    ``intrinsics`` (8,) of fx fy cx cy px and of the four distortion coefficients.
+    """
+
+    rotation: Float
+    position: Float
+    time_offset_s: float
+    intrinsics: Float
+
+
+@dataclass(frozen=True, slots=True)
+class CalibrationEstimate:
+    """What a back-end believes of the rig's calibration by now, and how sure it is of each camera's."""
+
+    calibration: Calibration
+    sigma: tuple[CameraSigma, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,6 +238,21 @@ class NavState:
     bias_gyro_B: Float
     bias_accel_B: Float
     cov: Float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Start:
+    """Where a back-end begins: ``state``, with covariance, at the frame that shows ``tracks`` and ends ``imu``.
+
+    ``calibration`` is the prior of what may be calibrated on the way; its noise is that of the IMU in flight, and
+    ``noise_at_rest`` that of a body that stands still.
+    """
+
+    state: NavState
+    calibration: CalibrationEstimate
+    noise_at_rest: ImuNoise
+    imu: ImuSegment
+    tracks: FrameTracks
 
 
 class Status(StrEnum):
@@ -163,7 +277,8 @@ class Estimate:
 
     ``landmark_ids`` (M,) and ``p_WF`` (M, 3) m are the landmarks estimated or refined at this frame. ``events`` are
     one-line notes worth keeping (an initialisation refused and why, a reset); ``stage_seconds`` is the back-end's own
-    breakdown of its time.
+    breakdown of its time. ``calibration`` is what it has learned of the rig, None where it learns nothing.
+    ``corrected`` says whether what was seen had a part in it, or the readings alone led here.
     """
 
     status: Status
@@ -171,18 +286,20 @@ class Estimate:
     landmark_ids: Int = field(default_factory=_no_ids)
     p_WF: Float = field(default_factory=_no_points)
     is_keyframe: bool = False
+    corrected: bool = True
+    calibration: CalibrationEstimate | None = None
     events: tuple[str, ...] = ()
     stage_seconds: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """One turn of the main loop: the frame, its tracks, the estimate, and seconds spent by stage.
+    """One turn of the main loop: the images, their tracks, the estimate, and seconds spent by stage.
 
     A stage named ``a.b`` is a part of ``a``: a back-end's own breakdown is found below ``backend``.
     """
 
-    frame: Frame
+    frames: FrameSet
     tracks: FrameTracks
     estimate: Estimate
     stage_seconds: Mapping[str, float]
@@ -216,36 +333,6 @@ class LoopClosure:
     keyframe_t_ns: Int
     loops: tuple[Loop, ...] = ()
     stage_seconds: Mapping[str, float] = field(default_factory=dict)
-
-
-@dataclass(frozen=True, slots=True)
-class ImuNoise:
-    """Continuous-time noise densities of an IMU, as Kalibr and EuRoC state them; ``rate_hz`` is its nominal rate."""
-
-    gyro_density: float
-    """White noise of the gyroscope, rad/s/sqrt(Hz)."""
-    accel_density: float
-    """White noise of the accelerometer, m/s^2/sqrt(Hz)."""
-    gyro_walk: float
-    """Diffusion of the gyroscope's bias, rad/s^2/sqrt(Hz)."""
-    accel_walk: float
-    """Diffusion of the accelerometer's bias, m/s^3/sqrt(Hz)."""
-    rate_hz: float = 200.0
-
-    def in_flight(self, factor: float) -> ImuNoise:
-        """With ``factor`` times the white noise: in flight, vibration adds to the sensor's own."""
-        return replace(self, gyro_density=factor * self.gyro_density, accel_density=factor * self.accel_density)
-
-
-@dataclass(frozen=True, slots=True)
-class Calibration:
-    """One camera and one IMU: ``p_B = R_BC @ p_C + p_BC`` and ``t_imu = t_cam + time_offset_ns``."""
-
-    camera: Camera
-    R_BC: Float
-    p_BC: Float
-    imu: ImuNoise
-    time_offset_ns: int = 0
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,17 +9,14 @@ from collections.abc import Mapping
 from vioframe.interfaces import Backend, BackendFactory
 from vioframe.parts.hooks import hookimpl
 from vioframe.parts.options import plugin_factory
-from vioframe.types import Calibration
 from vioframe_loose_ekf.options import LooseEkfOptions
 
 
-def loose_ekf(calibration: Calibration, options: LooseEkfOptions) -> Backend:
+def loose_ekf(options: LooseEkfOptions) -> Backend:
     """Loosely coupled: a visual odometry's poses up to scale, fused with the IMU by an extended Kalman filter."""
     from vioframe_loose_ekf.backend import LooseEkf
-    from vioframe_loose_ekf.warm_up import warm_up
 
-    warm_up(calibration)
-    return LooseEkf(calibration, options)
+    return LooseEkf(options)
 
 
 @hookimpl

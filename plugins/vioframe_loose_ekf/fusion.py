@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 from filterpy.kalman import ExtendedKalmanFilter
 
+from vioframe.errors import DivergedError
 from vioframe.estimation.inertial.propagation import propagate
-from vioframe.estimation.recovery import DivergedError
 from vioframe.estimation.standstill import STANDSTILL_GATE, Standstill
 from vioframe.geometry import so3
 from vioframe.types import DBA, DBG, DP, DTHETA, Calibration, Float, ImuNoise, ImuSegment, NavState
@@ -78,7 +78,7 @@ class Fusion:
         self._predict(np.eye(SIZE), Q)
 
     def _tie(self, measured: VisionPose, cov: Float) -> None:
-        s, R_BC, p_BC = self.state, self._calibration.R_BC, self._calibration.p_BC
+        s, R_BC, p_BC = self.state, self._calibration.cameras[0].R_BC, self._calibration.cameras[0].p_BC
         R_VC = measured.R_VC
         R_WV = s.R_WB @ R_BC @ R_VC.T
         self.state = replace(s, R_WV=R_WV, p_WA=s.p_WB + s.R_WB @ p_BC, p_VA=measured.p_VC)
@@ -94,7 +94,7 @@ class Fusion:
     def begin_scale(self, p_VC: Float) -> bool:
         """Take the scale from how far the readings say the camera has come; False where they say nothing like it."""
         s = self.state
-        p_AC = s.R_WV.T @ (s.p_WB + s.R_WB @ self._calibration.p_BC - s.p_WA)
+        p_AC = s.R_WV.T @ (s.p_WB + s.R_WB @ self._calibration.cameras[0].p_BC - s.p_WA)
         moved_V = p_VC - s.p_VA
         along = float(p_AC @ moved_V) / float(moved_V @ moved_V)
         if along * np.linalg.norm(moved_V) < _LEAST_AGREEMENT * np.linalg.norm(p_AC):

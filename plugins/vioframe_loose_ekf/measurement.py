@@ -28,8 +28,8 @@ class VisionPose:
 def predicted_pose(state: FilterState, calibration: Calibration) -> VisionPose:
     """The camera's pose in V as ``state`` has it."""
     R_VB = state.R_WV.T @ state.R_WB
-    p_WC = state.p_WB + state.R_WB @ calibration.p_BC
-    return VisionPose(R_VB @ calibration.R_BC, state.p_VA + state.scale * state.R_WV.T @ (p_WC - state.p_WA))
+    p_WC = state.p_WB + state.R_WB @ calibration.cameras[0].p_BC
+    return VisionPose(R_VB @ calibration.cameras[0].R_BC, state.p_VA + state.scale * state.R_WV.T @ (p_WC - state.p_WA))
 
 
 def residual(measured: VisionPose, predicted: VisionPose) -> Float:
@@ -42,11 +42,11 @@ def residual(measured: VisionPose, predicted: VisionPose) -> Float:
 def jacobian(state: FilterState, calibration: Calibration) -> Float:
     """(6, 22) of the predicted pose, in the tangent space of :func:`residual`, by the error state."""
     scale, R_VW = state.scale, state.R_WV.T
-    p_AC = R_VW @ (state.p_WB + state.R_WB @ calibration.p_BC - state.p_WA)  # m, in the axes of V
+    p_AC = R_VW @ (state.p_WB + state.R_WB @ calibration.cameras[0].p_BC - state.p_WA)  # m, in the axes of V
     H = np.zeros((6, SIZE))
-    H[0:3, DTHETA] = calibration.R_BC.T
-    H[0:3, DTHETA_WV] = -(R_VW @ state.R_WB @ calibration.R_BC).T
-    H[3:6, DTHETA] = -scale * R_VW @ state.R_WB @ so3.hat(calibration.p_BC)
+    H[0:3, DTHETA] = calibration.cameras[0].R_BC.T
+    H[0:3, DTHETA_WV] = -(R_VW @ state.R_WB @ calibration.cameras[0].R_BC).T
+    H[3:6, DTHETA] = -scale * R_VW @ state.R_WB @ so3.hat(calibration.cameras[0].p_BC)
     H[3:6, DP] = scale * R_VW
     H[3:6, LOG_SCALE] = scale * p_AC[:, None]
     H[3:6, DTHETA_WV] = scale * so3.hat(p_AC)

@@ -67,7 +67,7 @@ class VisualOdometry:
     """One frame at a time; lengths are in units of its own, which change with each new vision frame."""
 
     def __init__(self, calibration: Calibration, options: LooseEkfOptions) -> None:
-        focal_px = calibration.camera.focal_px
+        focal_px = calibration.cameras[0].model.focal_px
         self._options = options
         self._sigma = options.pixel_sigma / focal_px
         self._parallax = options.keyframe_parallax_px / focal_px

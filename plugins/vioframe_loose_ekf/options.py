@@ -27,18 +27,8 @@ class LooseEkfOptions:
     """Drift of the vision frame's orientation from one keyframe to the next, standard deviation."""
     drift_position: float = 0.01
     """Drift of the vision frame's position from one keyframe to the next, part of the distance between them."""
-    imu_noise_factor: float = 4.0
-    """How many times the calibration's IMU noise is assumed: in flight, vibration adds to the sensor's own."""
     gate_quantile: float = 0.99
     """Quantile of the chi2 distribution below which a pose of the visual odometry is accepted."""
-    unknown_camera_rotation: bool = False
-    """The camera's rotation on the body is not known: find it while initialising, whatever the calibration says."""
-    zero_velocity_update: bool = True
-    """Recognise standstill and use it."""
-    standstill_disparity_px: float = 0.7
-    """Median image motion over half a second below which the camera may be standing still."""
-    max_blind_s: float = 4.0
-    """Seconds without an accepted pose after which the filter calls itself lost and starts again."""
 
     def __post_init__(self) -> None:
         if self.keyframes < 3 or self.adjusted_keyframes < 1 or self.adjustments < 0:
@@ -48,8 +38,6 @@ class LooseEkfOptions:
             "bootstrap_parallax_px",
             "keyframe_parallax_px",
             "vision_noise_factor",
-            "imu_noise_factor",
-            "max_blind_s",
         ):
             if not getattr(self, name) > 0.0:
                 raise ValueError(f"needs {name} > 0, got {getattr(self, name):g}")

@@ -5,17 +5,14 @@ from collections.abc import Mapping
 from vioframe.interfaces import Backend, BackendFactory
 from vioframe.parts.hooks import hookimpl
 from vioframe.parts.options import plugin_factory
-from vioframe.types import Calibration
 from vioframe_msckf.options import MsckfOptions
 
 
-def msckf(calibration: Calibration, options: MsckfOptions) -> Backend:
+def msckf(options: MsckfOptions) -> Backend:
     """Multi-state constraint Kalman filter with first-estimate Jacobians and in-state landmarks."""
     from vioframe_msckf.backend import Msckf
-    from vioframe_msckf.warm_up import warm_up
 
-    warm_up(calibration)
-    return Msckf(calibration, options)
+    return Msckf(options)
 
 
 @hookimpl

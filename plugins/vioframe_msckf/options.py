@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MsckfOptions:
-    """Defaults follow the published settings of OpenVINS for EuRoC where they name one, but for the IMU's noise."""
+    """Defaults follow the published settings of OpenVINS for EuRoC where they name one."""
 
     max_clones: int = 11
     """Past poses kept in the state."""
@@ -17,32 +17,19 @@ class MsckfOptions:
     """Long-lived landmarks kept in the state; 0 makes this a pure MSCKF."""
     pixel_sigma: float = 1.0
     """Standard deviation of a tracked feature's position, px."""
-    imu_noise_factor: float = 4.0
-    """How many times the calibration's IMU noise is assumed: in flight, vibration adds to the sensor's own."""
     gate_quantile: float = 0.95
     """Quantile of the chi2 distribution below which a feature's residual is accepted."""
     first_estimate_jacobians: bool = True
     """Evaluate Jacobians at first estimates, so that yaw and position stay unobservable."""
-    unknown_camera_rotation: bool = False
-    """Find how the camera is turned on the body before anything else (hand-eye calibration), whatever the calibration
-    says; needs turns about two axes. With frontend.predict_with_gyro=false the front-end makes no wrong guesses."""
     calibrate_extrinsics: bool = True
     """Estimate the camera's pose on the body."""
     calibrate_time_offset: bool = True
     """Estimate what is left of the time offset between camera and IMU."""
     calibrate_intrinsics: bool = True
     """Estimate focal lengths, principal point and distortion."""
-    zero_velocity_update: bool = True
-    """Recognise standstill and hold the state there."""
-    standstill_disparity_px: float = 0.7
-    """Median image motion over half a second below which the camera may be standing still."""
-    max_blind_s: float = 4.0
-    """Seconds without an accepted update after which the filter calls itself lost and starts again."""
 
     def __post_init__(self) -> None:
         if self.max_clones < 3 or self.max_features < 1 or self.min_track_length < 2 or self.max_slam_features < 0:
             raise ValueError("needs max_clones >= 3, max_features >= 1, min_track_length >= 2, max_slam_features >= 0")
-        if not (
-            min(self.pixel_sigma, self.imu_noise_factor, self.max_blind_s) > 0.0 and 0.0 < self.gate_quantile < 1.0
-        ):
-            raise ValueError("needs pixel_sigma, imu_noise_factor and max_blind_s > 0, and 0 < gate_quantile < 1")
+        if not (self.pixel_sigma > 0.0 and 0.0 < self.gate_quantile < 1.0):
+            raise ValueError("needs pixel_sigma > 0 and 0 < gate_quantile < 1")

@@ -7,25 +7,35 @@ Parts of the calibration that are not estimated have zero covariance and so are 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from filterpy.kalman import KalmanFilter
 from numpy.typing import NDArray
 from scipy.linalg.lapack import dgeqrf, dpotrf, dtrtrs
 
+from vioframe.errors import DivergedError
 from vioframe.estimation.inertial.propagation import propagate, yaw_consistent_transition
-from vioframe.estimation.recovery import DivergedError
 from vioframe.geometry import kernels, so3
-from vioframe.types import DBA, DBG, DP, DTHETA, DV, Calibration, Float, ImuNoise, ImuSegment, NavState
+from vioframe.types import (
+    DBA,
+    DBG,
+    DP,
+    DTHETA,
+    DV,
+    NS_PER_S,
+    CalibrationEstimate,
+    CameraSigma,
+    Float,
+    ImuNoise,
+    ImuSegment,
+    NavState,
+)
 
 IMU = 15
 CALIBRATION = slice(15, 30)
 EXTRINSICS, OFFSET, INTRINSICS = slice(15, 21), slice(21, 22), slice(22, 30)
 CLONES = 30  # where the clones begin
-
-# Prior standard deviations of the calibration (rad, m, s, px, distortion), as published for OpenVINS on EuRoC.
-_SIGMA_ROTATION, _SIGMA_TRANSLATION, _SIGMA_OFFSET, _SIGMA_PIXELS, _SIGMA_DISTORTION = 0.005, 0.015, 0.01, 1.0, 0.005
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,7 +72,7 @@ class FilterState:
     """Mean, first estimates and covariance of the error-state filter."""
 
     def __init__(
-        self, initial: NavState, calibration: Calibration, *, extrinsics: bool, offset: bool, intrinsics: bool
+        self, initial: NavState, prior: CalibrationEstimate, *, extrinsics: bool, offset: bool, intrinsics: bool
     ):
         assert initial.cov is not None
         self.R_WB, self.p_WB, self.v_WB = initial.R_WB.copy(), initial.p_WB.copy(), initial.v_WB.copy()
@@ -70,9 +80,11 @@ class FilterState:
         self.first = (self.R_WB, self.p_WB, self.v_WB)
         """Orientation, position and velocity as propagated to the newest frame, before its updates."""
 
-        self.R_BC, self.p_BC = calibration.R_BC.copy(), calibration.p_BC.copy()
+        self._given = prior.calibration
+        (camera,), (known,) = prior.calibration.cameras, prior.sigma
+        self.R_BC, self.p_BC = camera.R_BC.copy(), camera.p_BC.copy()
         self.offset_s = 0.0
-        self.camera_model, self.intrinsics = kernels.intrinsics_of(calibration.camera)
+        self.camera_model, self.intrinsics = kernels.intrinsics_of(camera.model)
         self.clones = Poses(np.empty((0, 3, 3)), np.empty((0, 3)), np.empty((0, 3, 3)), np.empty((0, 3)))
         self.landmark_ids: NDArray[np.int64] = np.empty(0, np.int64)
         self.p_WF: Float = np.empty((0, 3))
@@ -80,11 +92,11 @@ class FilterState:
 
         sigma = np.zeros(CLONES)
         if extrinsics:
-            sigma[EXTRINSICS] = np.repeat([_SIGMA_ROTATION, _SIGMA_TRANSLATION], 3)
+            sigma[EXTRINSICS] = np.concatenate([known.rotation, known.position])
         if offset:
-            sigma[OFFSET] = _SIGMA_OFFSET
+            sigma[OFFSET] = known.time_offset_s
         if intrinsics:
-            sigma[INTRINSICS] = np.repeat([_SIGMA_PIXELS, _SIGMA_DISTORTION], 4)
+            sigma[INTRINSICS] = known.intrinsics
         self.cov: Float = np.diag(sigma**2)
         self.cov[:IMU, :IMU] = initial.cov
 
@@ -103,6 +115,20 @@ class FilterState:
             self.bias_gyro_B.copy(),
             self.bias_accel_B.copy(),
             self.cov[:IMU, :IMU].copy(),
+        )
+
+    def calibration(self) -> CalibrationEstimate:
+        """What is believed of the calibration by now."""
+        camera = self._given.cameras[0]
+        fx, fy, cx, cy, d1, d2, d3, d4 = self.intrinsics.tolist()
+        model = replace(camera.model, fx=fx, fy=fy, cx=cx, cy=cy, distortion=(d1, d2, d3, d4))
+        offset_ns = camera.time_offset_ns + round(self.offset_s * NS_PER_S)
+        sigma = np.sqrt(np.diag(self.cov)[CALIBRATION])
+        return CalibrationEstimate(
+            self._given.with_camera(
+                0, model=model, R_BC=self.R_BC.copy(), p_BC=self.p_BC.copy(), time_offset_ns=offset_ns
+            ),
+            (CameraSigma(sigma[0:3], sigma[3:6], float(sigma[6]), sigma[7:15]),),
         )
 
     def propagate(self, imu: ImuSegment, noise: ImuNoise, first_estimates: bool) -> None:

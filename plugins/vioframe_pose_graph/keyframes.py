@@ -27,8 +27,8 @@ class KeyframeSelector:
     """Thins the frames of any back-end by how much the picture has moved, turning left out."""
 
     def __init__(self, calibration: Calibration, parallax_px: float) -> None:
-        self._R_BC = calibration.R_BC
-        self._parallax = parallax_px / calibration.camera.focal_px
+        self._R_BC = calibration.cameras[0].R_BC
+        self._parallax = parallax_px / calibration.cameras[0].model.focal_px
         self._pending: deque[_Pending] = deque()
         self._last: _Pending | None = None
         self._p_WF: dict[int, Float] = {}
@@ -48,10 +48,10 @@ class KeyframeSelector:
             self.segment += 1
         self._p_WF.update(zip(estimate.landmark_ids.tolist(), estimate.p_WF, strict=True))
         if self._last is None or (estimate.is_keyframe and self._moved_on(self._last, step.tracks, state)):
-            self._last = _Pending(state, self.segment, step.frame.image, step.tracks)
+            self._last = _Pending(state, self.segment, step.frames.images[0], step.tracks)
             self._pending.append(self._last)
             self._forget(step.tracks)
-        while self._pending and step.frame.t_ns - self._pending[0].state.t_ns >= _WAIT_NS:
+        while self._pending and step.frames.t_ns - self._pending[0].state.t_ns >= _WAIT_NS:
             ready.append(self._complete(self._pending.popleft()))
         return ready
 

@@ -52,19 +52,19 @@ class Place:
 
 def describe(keyframe: Keyframe, describer: Describer, calibration: Calibration, sigma_px: float) -> Place:
     """Find and describe the points of ``keyframe``; its landmarks are known to ``sigma_px`` in the image."""
-    R_WC = keyframe.R_WB @ calibration.R_BC
-    p_WC = keyframe.p_WB + keyframe.R_WB @ calibration.p_BC
+    R_WC = keyframe.R_WB @ calibration.cameras[0].R_BC
+    p_WC = keyframe.p_WB + keyframe.R_WB @ calibration.cameras[0].p_BC
     xy, descriptors, which = describer.describe(keyframe.image, keyframe.xy, R_WC)
-    xy_normalised = calibration.camera.undistort(xy)
+    xy_normalised = calibration.cameras[0].model.undistort(xy)
     seen = np.isfinite(xy_normalised).all(axis=1)
     xy_normalised, descriptors, which = xy_normalised[seen], descriptors[seen], which[seen]
 
     p_WF = np.where(which[:, None] >= 0, keyframe.p_WF[which], np.nan)
     known = np.flatnonzero(np.isfinite(p_WF[:, 0]))
-    sigma = sigma_px / calibration.camera.focal_px
+    sigma = sigma_px / calibration.cameras[0].model.focal_px
     R_WC, p_WC, fits = resect(p_WF[known], xy_normalised[known], R_WC, p_WC, sigma, _MAX_SIGMAS * sigma)
     p_WF[known[~fits]] = np.nan
-    p_WB_seen = p_WC - keyframe.R_WB @ calibration.p_BC
+    p_WB_seen = p_WC - keyframe.R_WB @ calibration.cameras[0].p_BC
     return Place(
         keyframe.t_ns,
         keyframe.segment,

@@ -52,7 +52,7 @@ class Recogniser:
             relation = relate(
                 self.places[earlier],
                 place,
-                self._calibration.camera.focal_px,
+                self._calibration.cameras[0].model.focal_px,
                 self._options.reprojection_px,
                 self._options.min_inliers,
             )

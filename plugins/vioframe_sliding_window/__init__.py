@@ -5,17 +5,14 @@ from collections.abc import Mapping
 from vioframe.interfaces import Backend, BackendFactory
 from vioframe.parts.hooks import hookimpl
 from vioframe.parts.options import plugin_factory
-from vioframe.types import Calibration
 from vioframe_sliding_window.options import SlidingWindowOptions
 
 
-def sliding_window(calibration: Calibration, options: SlidingWindowOptions) -> Backend:
+def sliding_window(options: SlidingWindowOptions) -> Backend:
     """Tightly coupled non-linear optimisation over a window of keyframes, with a marginalisation prior."""
     from vioframe_sliding_window.backend import SlidingWindow
-    from vioframe_sliding_window.warm_up import warm_up
 
-    warm_up(calibration)
-    return SlidingWindow(calibration, options)
+    return SlidingWindow(options)
 
 
 @hookimpl

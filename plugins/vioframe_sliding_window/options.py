@@ -28,8 +28,6 @@ class SlidingWindowOptions:
     """Where Cauchy's robust loss begins to discount an observation, standard deviations."""
     outlier_px: float = 3.0
     """Tracks that are off by more than this on average are dropped."""
-    imu_noise_factor: float = 4.0
-    """How many times the calibration's IMU noise is assumed: in flight, vibration adds to the sensor's own."""
     max_iterations: int = 8
     """Steps of the solver a frame, at most."""
     max_solve_ms: float = 0.0
@@ -40,14 +38,6 @@ class SlidingWindowOptions:
     """Estimate the camera's pose on the body."""
     calibrate_time_offset: bool = True
     """Estimate what is left of the time offset between camera and IMU."""
-    unknown_camera_rotation: bool = False
-    """The camera's rotation on the body is not known: find it while initialising, whatever the calibration says."""
-    zero_velocity_update: bool = True
-    """Recognise standstill and use it."""
-    standstill_disparity_px: float = 0.7
-    """Median image motion over half a second below which the camera may be standing still."""
-    max_blind_s: float = 4.0
-    """Seconds without a usable landmark after which the estimate is given up and begun anew."""
     max_jump_m: float = 1.0
     """Most that images may move the newest position from where the readings put it."""
 
@@ -60,8 +50,6 @@ class SlidingWindowOptions:
             "pixel_sigma": self.pixel_sigma,
             "cauchy_sigmas": self.cauchy_sigmas,
             "outlier_px": self.outlier_px,
-            "imu_noise_factor": self.imu_noise_factor,
-            "max_blind_s": self.max_blind_s,
             "max_jump_m": self.max_jump_m,
         }
         for name, value in positive.items():

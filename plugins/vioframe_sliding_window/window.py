@@ -14,15 +14,22 @@ from vioframe.estimation.factors.reprojection import CALIBRATION_SIZE, Calibrate
 from vioframe.estimation.factors.solver import solve, solve_positive
 from vioframe.estimation.factors.tracks import LandmarkTable, TrackTable
 from vioframe.estimation.inertial.preintegration import Preintegrated, join_segments, preintegrate
-from vioframe.estimation.initialization.hand_eye import CameraRotation
 from vioframe.estimation.recovery import noise_over
 from vioframe.estimation.standstill import Standstill
 from vioframe.geometry.kernels import intrinsics_of
-from vioframe.types import NS_PER_S, Calibration, Float, FrameTracks, ImuSegment, Int, NavState
+from vioframe.types import (
+    NS_PER_S,
+    CalibrationEstimate,
+    CameraSigma,
+    Float,
+    FrameTracks,
+    ImuSegment,
+    Int,
+    NavState,
+    Start,
+)
 from vioframe_sliding_window.options import SlidingWindowOptions
 
-# Prior standard deviations of the calibration: rad, m, s. Those of OpenVINS on EuRoC.
-_SIGMA_CALIBRATION = np.repeat([0.005, 0.015, 0.01], [3, 3, 1])
 # Biases that moved farther from those the readings were integrated with have them integrated anew, rad/s and m/s^2.
 _REPROPAGATE_GYRO, _REPROPAGATE_ACCEL = 0.01, 0.1
 
@@ -30,38 +37,30 @@ _REPROPAGATE_GYRO, _REPROPAGATE_ACCEL = 0.01, 0.1
 class Window:
     """K states, the newest last, and all factors between them.
 
-    It begins with one state, whose covariance is the first prior, the tracks of its frame and the gyroscope's reading
-    there, ``gyro_B`` (3,) rad/s. ``camera_rotation`` is what the hand-eye calibration found, where there was one.
+    It begins with one state, whose covariance is the first prior, and the tracks of its frame.
     """
 
-    def __init__(
-        self,
-        state: NavState,
-        tracks: FrameTracks,
-        gyro_B: Float,
-        calibration: Calibration,
-        options: SlidingWindowOptions,
-        camera_rotation: CameraRotation | None = None,
-    ) -> None:
+    def __init__(self, start: Start, options: SlidingWindowOptions) -> None:
+        state, calibration = start.state, start.calibration.calibration
+        (camera,), (sigma,) = calibration.cameras, start.calibration.sigma
+        self._given = calibration
         self._noise = calibration.imu
         self._options = options
-        self._focal_px = calibration.camera.focal_px
+        self._focal_px = camera.model.focal_px
         self._sigma = options.pixel_sigma / self._focal_px
         self._t_ns = [state.t_ns]
         self._states = StateArrays.stack([state])
-        self._gyro_B = gyro_B[None]
-        self._camera = Calibrated(calibration.R_BC, calibration.p_BC, 0.0)
-        camera_cov = np.diag(_SIGMA_CALIBRATION**2)
-        if camera_rotation is not None:
-            camera_cov[:3, :3] = camera_rotation.cov
-        self._prior = Prior.of(state, self._camera, camera_cov)
+        self._gyro_B = start.imu.gyro_B[-1:]
+        self._camera = Calibrated(camera.R_BC, camera.p_BC, 0.0)
+        self._camera_sigma = np.concatenate([sigma.rotation, sigma.position, [sigma.time_offset_s]])
+        self._prior = Prior.of(state, self._camera, np.diag(self._camera_sigma**2))
         self._readings: list[Preintegrated] = []
         self._still: dict[int, Standstill] = {}
         self._newest_is_keyframe = True
         self._cov = state.cov
-        self._camera_model, self._intrinsics = intrinsics_of(calibration.camera)
+        self._camera_model, self._intrinsics = intrinsics_of(camera.model)
         self.tracks = LandmarkTable()
-        self._add_tracks(tracks)
+        self._add_tracks(start.tracks)
 
     def __len__(self) -> int:
         return len(self._t_ns)
@@ -74,6 +73,15 @@ class Window:
     @property
     def camera(self) -> Calibrated:
         return self._camera
+
+    def calibration(self) -> CalibrationEstimate:
+        """What is believed of the calibration by now."""
+        given, camera, sigma = self._given.cameras[0], self._camera, self._camera_sigma
+        offset_ns = given.time_offset_ns + round(camera.offset_s * NS_PER_S)
+        return CalibrationEstimate(
+            self._given.with_camera(0, R_BC=camera.R_BC, p_BC=camera.p_BC, time_offset_ns=offset_ns),
+            (CameraSigma(sigma[:3], sigma[3:6], float(sigma[6]), np.zeros(8)),),
+        )
 
     @property
     def prior(self) -> Prior:
@@ -168,7 +176,7 @@ class Window:
         x = solution.variables
         self._states, self._camera, self.tracks.landmarks[rows] = x.states, x.camera, x.landmarks
         S, _, _ = problem.linearise(x).reduced(0.0)
-        self._cov = self._newest_covariance(S)
+        self._cov, self._camera_sigma = self._covariance(S)
         return solution.iterations
 
     def reject_outliers(self) -> tuple[int, int]:
@@ -262,13 +270,17 @@ class Window:
         active[n + 6] = options.calibrate_time_offset
         return np.flatnonzero(active)
 
-    def _newest_covariance(self, S: Float) -> Float:
+    def _covariance(self, S: Float) -> tuple[Float, Float]:
+        """Of the newest state (15, 15), and the standard deviations of the calibration (7,), zero where it is fixed."""
         active = self._active()
         at = STATE_SIZE * (len(self) - 1)
-        unit = np.zeros((len(active), STATE_SIZE))
-        unit[at : at + STATE_SIZE] = np.eye(STATE_SIZE)
-        cov = solve_positive(S[np.ix_(active, active)], unit)[at : at + STATE_SIZE]
-        return 0.5 * (cov + cov.T)
+        unit = np.zeros((len(active), len(active) - at))
+        unit[at:] = np.eye(len(active) - at)
+        end = solve_positive(S[np.ix_(active, active)], unit)[at:]
+        sigma = np.zeros(CALIBRATION_SIZE)
+        sigma[active[at + STATE_SIZE :] - at - STATE_SIZE] = np.sqrt(np.diag(end)[STATE_SIZE:])
+        cov = end[:STATE_SIZE, :STATE_SIZE]
+        return 0.5 * (cov + cov.T), sigma
 
 
 def parallax(tracks: TrackTable, before: int, now: int, R_CbCn: Float) -> tuple[int, float]:

@@ -17,8 +17,8 @@ from vioframe.geometry import so3
 from vioframe.geometry.cameras import Camera
 from vioframe.geometry.trajectory import Trajectory
 from vioframe.io.calibration import packaged_calibration
+from vioframe.simulation import TrackSequence
 from vioframe.simulation.segments import cut_segments
-from vioframe.simulation.sequence import TrackSequence
 from vioframe.types import Calibration, Float, FrameTracks, Int
 
 CORNERS_PER_TAG = 4
@@ -47,11 +47,11 @@ def april_sequence(folder: Path, calibration: Calibration | None = None) -> Trac
     views = [v for v in read_board_views(folder) if imu_ns[0] <= v.t_ns <= imu_ns[-1]]
     frames_ns = np.array([view.t_ns for view in views], np.int64)
     segments = cut_segments(imu_ns, gyro_B, accel_B, frames_ns)
-    tracks = _tracks(views, calibration.camera)
+    tracks = _tracks(views, calibration.cameras[0].model)
 
-    R_AC, p_AC = board_poses(views, calibration.camera)
-    R_AB = R_AC @ calibration.R_BC.T
-    p_AB = p_AC - R_AB @ calibration.p_BC
+    R_AC, p_AC = board_poses(views, calibration.cameras[0].model)
+    R_AB = R_AC @ calibration.cameras[0].R_BC.T
+    p_AB = p_AC - R_AB @ calibration.cameras[0].p_BC
     g_A = gravity_in_frame(Trajectory(frames_ns, R_AB, p_AB), imu_ns, accel_B)
     R_WA = rotation_to_vertical(g_A)
     truth = Trajectory(frames_ns, R_WA @ R_AB, p_AB @ R_WA.T)
@@ -110,7 +110,7 @@ def _tracks(views: list[BoardView], camera: Camera) -> list[FrameTracks]:
         appearances += seen & ~seen_before
         seen_before = seen
         ids = view.corner + count * (appearances[view.corner] - 1)
-        tracks.append(FrameTracks(view.t_ns, ids, view.xy, camera.undistort(view.xy)))
+        tracks.append(FrameTracks(view.t_ns, ids, np.zeros_like(ids), view.xy, camera.undistort(view.xy)))
     return tracks
 
 

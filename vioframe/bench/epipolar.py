@@ -21,8 +21,8 @@ def epipolar_errors_px(
     """
     covered = [s for s in steps if ground_truth.covers([s.t_ns])[0]]
     truth = ground_truth.at([s.t_ns for s in covered])
-    R_WC = truth.R_WB @ calibration.R_BC
-    p_WC = truth.p_WB + truth.R_WB @ calibration.p_BC
+    R_WC = truth.R_WB @ calibration.cameras[0].R_BC
+    p_WC = truth.p_WB + truth.R_WB @ calibration.cameras[0].p_BC
     errors = [np.empty(0)]
     for k in range(len(covered) - baseline):
         before, after = covered[k], covered[k + baseline]
@@ -31,5 +31,5 @@ def epipolar_errors_px(
         E = essential_matrix(R_C2W @ R_WC[k], R_C2W @ (p_WC[k] - p_WC[k + baseline]))
         errors.append(np.abs(sampson_distance(E, before.xy_normalised[i], after.xy_normalised[j])))
     # Sampson's distance shares an error evenly between two views; the root of two puts all of it into one.
-    error_px: Float = np.sqrt(2.0) * calibration.camera.focal_px * np.concatenate(errors)
+    error_px: Float = np.sqrt(2.0) * calibration.cameras[0].model.focal_px * np.concatenate(errors)
     return error_px

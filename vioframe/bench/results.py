@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from vioframe.bench.run import BackendRun
 from vioframe.evaluation import evaluate
 from vioframe.runs import machine
-from vioframe.simulation.sequence import TrackSequence
+from vioframe.simulation import TrackSequence
 
 if TYPE_CHECKING:
     from rich.table import Table

@@ -11,9 +11,11 @@ from time import perf_counter, thread_time
 import numpy as np
 
 from vioframe.errors import TrajectoryError
+from vioframe.estimation.lifecycle import LifeCycle
+from vioframe.estimation.options import EstimationOptions
 from vioframe.geometry.trajectory import Trajectory
 from vioframe.interfaces import Backend
-from vioframe.simulation.sequence import TrackSequence
+from vioframe.simulation import TrackSequence
 from vioframe.types import DP, Estimate, Float, NavState, Status
 
 _POSE = DP.stop  # [dtheta dp] come first in the error state
@@ -93,12 +95,18 @@ def _trajectory(states: Sequence[NavState]) -> Trajectory:
     )
 
 
-def run_backend(sequence: TrackSequence, backend: Backend) -> BackendRun:
+def run_backend(
+    sequence: TrackSequence,
+    backend: Backend,
+    estimation: EstimationOptions | None = None,
+    initial_state: NavState | None = None,
+) -> BackendRun:
     """Feed every packet of ``sequence`` to ``backend`` in order."""
+    life = LifeCycle(backend, sequence.calibration, estimation, initial_state)
     estimates, seconds, cpu_seconds = [], [], []
     for imu, tracks in sequence.packets:
         begin, cpu_begin = perf_counter(), thread_time()
-        estimates.append(backend.process(imu, tracks))
+        estimates.append(life.process(imu, tracks))
         seconds.append(perf_counter() - begin)
         cpu_seconds.append(thread_time() - cpu_begin)
     stamps = tuple(tracks.t_ns for _, tracks in sequence.packets)

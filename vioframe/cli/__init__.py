@@ -15,7 +15,7 @@ _COMMANDS = {
     "run": "Estimate the motion along a recording and write a run folder.",
     "evaluate": "Compare runs with the ground truth, as a table.",
     "plot": "Draw trajectories and errors of one or more runs.",
-    "view": "Show runs in three dimensions, in a window or as a picture.",
+    "view": "Show runs in space and over time, in rerun's viewer.",
     "plugins": "List the detectors, back-ends and readers, or the options of one.",
     "config": "Print a complete configuration, or check a file.",
     "simulate": "Render a flight and write it as a recording with exact truth.",

@@ -4,17 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import click
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from vioframe.errors import ConfigError
 from vioframe.interfaces import Dataset
 from vioframe.io.convert import FORMATS, convert, format_of
 from vioframe.parts import registry
-from vioframe.types import Frame, Measurement
+from vioframe.parts.config import parse_assignments
+from vioframe.types import FrameSet, Measurement
 
 _FILE = click.Path(path_type=Path)
 _COMPRESSIONS = sorted({name for format in FORMATS.values() for name in format.compressions})
@@ -47,30 +46,37 @@ def command(
                            NAME.mcap   MCAP file
                            NAME        ASL folder, as EuRoC's
 
-    One camera and one IMU are written, as cam0 and imu0; their calibration goes to the folder DST.calib, or into the
-    ASL folder. Ground truth is not converted: name its file with `vioframe run --ground-truth`.
+    Every camera is written (or those of `-o cameras=[cam0,cam1]`), the IMU, and the ground truth that SRC itself
+    brings; the calibration goes to the folder DST.calib, or into the ASL folder.
     """
     format = format or format_of(destination)
-    chosen = _parse(options) | ({"calibration": list(calibration)} if calibration else {})
-    dataset = registry.load().open_dataset(source, reader, chosen)
+    installed = registry.load()
+    part = installed.find_reader(source, reader)
+    chosen = {name: value for _, name, value in parse_assignments(options, {part.name: part.options})}
+    if calibration:
+        chosen["calibration"] = list(calibration)
+    dataset = installed.open_dataset(source, part.name, chosen)
     progress = _progress()
     try:
-        measurements = _watched(dataset, progress)
-        done = convert(measurements, dataset.calibration, destination, format=format, compression=compression)
+        done = convert(
+            _watched(dataset, progress),
+            dataset.calibration,
+            destination,
+            truth=dataset.ground_truth,
+            format=format,
+            compression=compression,
+        )
     finally:
         if progress.tasks:
             progress.stop()
-    click.echo(f"{destination}: {FORMATS[format].description}, {done.frames} frames, {done.imu_samples} IMU samples")
+    cameras = len(dataset.calibration.cameras)
+    of_cameras = f" of {cameras} cameras" if cameras > 1 else ""
+    click.echo(
+        f"{destination}: {FORMATS[format].description}, {done.frames} frames{of_cameras}, "
+        f"{done.imu_samples} IMU samples, {done.true_poses or 'no'} true poses"
+    )
     if done.unreadable:
         click.echo(f"left out: {done.unreadable} frames or samples of {source} that could not be read")
-
-
-def _parse(options: tuple[str, ...]) -> dict[str, Any]:
-    pairs = [option.partition("=") for option in options]
-    for option, (_, equals, _) in zip(options, pairs, strict=True):
-        if not equals:
-            raise ConfigError(f"-o takes key=value, got {option!r}")
-    return {key: value for key, _, value in pairs}
 
 
 def _progress() -> Progress:
@@ -87,5 +93,5 @@ def _watched(dataset: Dataset, progress: Progress) -> Iterator[Measurement]:
             task = progress.add_task(dataset.name, total=dataset.frame_count)
             progress.start()
         yield measurement
-        if isinstance(measurement, Frame):
+        if isinstance(measurement, FrameSet):
             progress.advance(task)

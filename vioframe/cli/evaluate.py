@@ -6,8 +6,9 @@ from pathlib import Path
 
 import click
 
+from vioframe.cli.progress import print_table
+
 _FILE = click.Path(path_type=Path)
-_WIDE = 1000
 
 
 @click.command("evaluate")
@@ -56,11 +57,10 @@ def command(
     `evaluation_loop.json`) in each run folder.
     """
     from vioframe.parts import registry
-    from vioframe.report.evaluated import evaluate_paths
     from vioframe.report.map_quality import measure_maps
-    from vioframe.report.metrics import create_metrics, measure_runs
-    from vioframe.report.rows import notes
-    from vioframe.report.tables import to_csv, to_json, to_markdown, to_rich
+    from vioframe.report.tables import figures, notes, to_csv, to_json, to_markdown, to_rich
+    from vioframe.runs.evaluated import evaluate_paths, measure_runs
+    from vioframe.runs.metrics import create_metrics
     from vioframe.runs.recorder import write_json
 
     asked = create_metrics(metrics, registry.load()) if metrics else ()
@@ -68,13 +68,11 @@ def command(
     if asked:
         evaluated = measure_runs(evaluated, asked)
     if format_ == "table":
-        from rich.console import Console
-
-        console = Console()
-        # Into a file or a pipe the table goes whole: rich would fold it at 80 columns.
-        (console if console.is_terminal else Console(width=_WIDE)).print(to_rich(evaluated))
+        print_table(to_rich(figures(evaluated)))
+    elif format_ == "markdown":
+        click.echo(to_markdown(figures(evaluated)))
     else:
-        click.echo({"json": to_json, "csv": to_csv, "markdown": to_markdown}[format_](evaluated))
+        click.echo({"json": to_json, "csv": to_csv}[format_](evaluated))
     for note in (*notes(evaluated), *on_maps):
         click.echo(f"note: {note}", err=True)
     # Last: what is read from a full or read-only disk is shown all the same.

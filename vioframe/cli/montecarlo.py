@@ -11,7 +11,7 @@ import click
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from vioframe.bench.consistency import Trial
+    from vioframe.evaluation.consistency import Trial
 
 _WIDE = 1000
 
@@ -68,6 +68,7 @@ def command(
     from vioframe.bench.contenders import parse_contenders
     from vioframe.bench.montecarlo import Setup, check_montecarlo, run_montecarlo
     from vioframe.bench.processes import usable_cores
+    from vioframe.bench.results import record
     from vioframe.parts import registry
     from vioframe.report.montecarlo import MARKER, to_rich, write_files
     from vioframe.runs.recorder import check_run_folder, free_run_folder, new_run_folder
@@ -91,7 +92,8 @@ def command(
     folder = out or free_run_folder(Path("runs"), "montecarlo")
     new_run_folder(folder, overwrite=overwrite, marker=MARKER)
     settings = {"backends": backends, "options": options, "flights": flights, "seeds": seeds, **sensors}
-    write_files(outcomes, settings, folder)
+    write_files(outcomes, folder)
+    record(folder / MARKER, [outcome.to_dict() for outcome in outcomes], settings)
     click.echo(f"written to {folder}: {', '.join(sorted(path.name for path in folder.iterdir()))}")
 
 

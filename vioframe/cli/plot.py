@@ -32,9 +32,9 @@ def command(
     Paths in 3-D, from above and from the side; translation and rotation errors over time; relative errors; time by
     stage; features over time: as far as the runs have what it takes.
     """
-    from vioframe.report.evaluated import evaluate_paths
     from vioframe.report.figures import write_figures
-    from vioframe.report.rows import notes
+    from vioframe.report.tables import notes
+    from vioframe.runs.evaluated import evaluate_paths
 
     evaluated = evaluate_paths(runs, ground_truth, alignment)
     if out is None:

@@ -12,11 +12,11 @@ import click
 from vioframe.cli.progress import RunProgress
 from vioframe.errors import DatasetError, TrajectoryError
 from vioframe.evaluation import evaluate
-from vioframe.experiment import Experiment, prepare, record
 from vioframe.geometry.trajectory import Trajectory
 from vioframe.parts import config as configuration
 from vioframe.parts import registry
 from vioframe.parts.config import Config
+from vioframe.pipeline import Experiment, prepare, record
 from vioframe.runs.folder import RunFolder
 from vioframe.runs.recorder import check_run_folder, free_run_folder
 from vioframe.types import Step

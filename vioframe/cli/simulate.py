@@ -9,20 +9,17 @@ from typing import Any
 
 import click
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-from rich.table import Table
-from rich.text import Text
+from rich.progress import Progress
 
-from vioframe.errors import ConfigError, DatasetError
+from vioframe.errors import DatasetError
 from vioframe.parts import registry
 from vioframe.parts.config import validate
-from vioframe.parts.options import did_you_mean, summary_of
+from vioframe.parts.options import summary_of
 from vioframe.simulation import config as configuration
 from vioframe.simulation.conditions import CONDITIONS, Conditions
 from vioframe.simulation.config import SimulationConfig
 from vioframe.simulation.record import check_destinations, record
 from vioframe.simulation.recording import DEFAULT_DURATION_S, SimulatedRecording
-from vioframe.types import Frame
 
 _FILE = click.Path(path_type=Path)
 
@@ -31,18 +28,28 @@ _FILE = click.Path(path_type=Path)
 @click.argument("destinations", metavar="DST...", type=_FILE, nargs=-1)
 @click.option("--list", "only_list", is_flag=True, help="List flights, worlds and conditions.")
 @click.option("--flight", metavar="NAME|FILE", help="Flight by name, or a trajectory file (TUM, EuRoC) to fly along.")
-@click.option("--imu", type=_FILE, metavar="SEQ", help="EuRoC sequence, or its imu0/data.csv: its real IMU, motion.")
+@click.option(
+    "--imu", "recorded", type=_FILE, metavar="SEQ", help="EuRoC sequence, or its imu0/data.csv: its real IMU, motion."
+)
 @click.option("--world", metavar="NAME", help="World to fly through.  [default: hall]")
 @click.option("-c", "--condition", "conditions", metavar="NAME=LEVEL", multiple=True, help="Hard condition, 0 to 1.")
 @click.option("-o", "--option", "options", metavar="KEY=VALUE", multiple=True, help="Option of flight, world or IMU.")
-@click.option("--start", type=float, metavar="S", help="Skip the first S seconds of a file or sequence.")
-@click.option("--duration", type=float, metavar="S", help=f"Length.  [default: {DEFAULT_DURATION_S:g} s; files: whole]")
+@click.option("--start", "start_s", type=float, metavar="S", help="Skip the first S seconds of a file or sequence.")
+@click.option(
+    "--duration",
+    "duration_s",
+    type=float,
+    metavar="S",
+    help=f"Length.  [default: {DEFAULT_DURATION_S:g} s; files: whole]",
+)
 @click.option("--seed", type=int, help="Seed of all that is random.  [default: 0]")
-@click.option("--rate", type=float, metavar="HZ", help="Frames per second.  [default: 20]")
-@click.option("--imu-rate", type=float, metavar="HZ", help="Rate of the IMU.  [default: the calibration's]")
-@click.option("--exact-imu", is_flag=True, help="An IMU without noise and biases.")
-@click.option("--calibration", type=_FILE, multiple=True, help="Calibration file or folder.  [default: EuRoC's]")
-@click.option("--config", "config_file", type=_FILE, help="Configuration, or manifest of a recording to make again.")
+@click.option("--rate", "frame_rate_hz", type=float, metavar="HZ", help="Frames per second.  [default: 20]")
+@click.option("--imu-rate", "imu_rate_hz", type=float, metavar="HZ", help="Of the IMU.  [default: the calibration's]")
+@click.option("--exact-imu", is_flag=True, default=None, help="An IMU without noise and biases.")
+@click.option(
+    "--calibration", type=_FILE, multiple=True, help="Of a rig: file or folder.  [default: EuRoC's left camera]"
+)
+@click.option("--config", "file", type=_FILE, help="Configuration, or manifest of a recording to make again.")
 @click.option("--compression", type=click.Choice(["bz2", "lz4", "zstd"]), help="Compress bags.  [default: no]")
 @click.option("--workers", type=click.IntRange(1), help="Processes that render.  [default: the number of cores]")
 @click.option("--overwrite", is_flag=True, help="Replace a simulated recording of the same name.")
@@ -54,7 +61,7 @@ def command(
     workers: int | None,
     overwrite: bool,
     quiet: bool,
-    **arguments: Any,
+    **choices: Any,
 ) -> None:
     """Render a flight through a world and write it as a recording, with images, IMU and exact ground truth.
 
@@ -74,109 +81,62 @@ def command(
     if not destinations:
         raise DatasetError("no destination given: `vioframe simulate flight.bag`; --list shows what there is")
     check_destinations(destinations, compression, overwrite=overwrite)
-    config = configuration.complete(_configure(installed, **arguments), installed)
+    config = configuration.complete(_configure(installed, **choices), installed)
     begin_s = perf_counter()
     recording = SimulatedRecording(config, installed, workers or os.cpu_count() or 1)
-    with _Watch(recording, quiet) as watch:
-        record(recording, destinations, compression=compression, overwrite=overwrite, on_frame=watch)
-    if not quiet:
-        _report(recording, destinations, perf_counter() - begin_s)
+    with Progress(console=Console(stderr=True), disable=quiet) as progress:
+        task = progress.add_task(recording.name, total=recording.frame_count)
+        record(
+            recording,
+            destinations,
+            compression=compression,
+            overwrite=overwrite,
+            on_frame=lambda _: progress.advance(task),
+        )
+    if quiet:
+        return
+    truth, levels = recording.ground_truth, recording.conditions.levels
+    click.echo(
+        f"{recording.name}: {recording.frame_count} frames and {recording.imu_count} IMU samples of "
+        f"{truth.duration_s:.1f} s along {truth.path_length_m:.1f} m, in {perf_counter() - begin_s:.0f} s"
+    )
+    if levels:
+        click.echo("conditions: " + ", ".join(f"{name} {level:g}" for name, level in levels.items()))
+    click.echo(f"written to {', '.join(map(str, destinations))}; next:\n  vioframe run {destinations[0]}")
 
 
 def _configure(
     installed: registry.Registry,
     *,
-    config_file: Path | None,
+    file: Path | None,
     flight: str | None,
-    imu: Path | None,
     world: str | None,
     conditions: tuple[str, ...],
     options: tuple[str, ...],
-    calibration: tuple[Path, ...],
-    exact_imu: bool,
-    **numbers: Any,
+    **values: Any,
 ) -> SimulationConfig:
     """The configuration file, if any, with the command line's choices over it."""
-    config = SimulationConfig() if config_file is None else configuration.read(config_file)
+    config = SimulationConfig() if file is None else configuration.read(file)
     tree = config.model_dump() | {"made": {}}
     if flight is not None:
-        motion = _flight_or_file(installed, flight)
-        tree |= {"flight": SimulationConfig().flight.model_dump(), "trajectory": None, "recorded": None} | motion
-    if imu is not None:
-        tree |= {"recorded": imu}
+        tree |= {"flight": SimulationConfig().flight.model_dump(), "trajectory": None, "recorded": None}
+        path = Path(flight)
+        # What is installed is a flight; anything else that exists, or looks like a path, a file.
+        named = flight in installed.names(registry.FLIGHT) or not (path.exists() or path.suffix or os.sep in flight)
+        tree |= {"flight": {"name": flight}} if named else {"trajectory": path}
     if world is not None and world != tree["world"]["name"]:
         tree["world"] = {"name": world}
     tree["conditions"] |= Conditions.parse(conditions).levels
-    if calibration:
-        tree["calibration"] = calibration
-    tree["exact_imu"] |= exact_imu
-    keys = {"start": "start_s", "duration": "duration_s", "rate": "frame_rate_hz", "imu_rate": "imu_rate_hz"}
-    tree |= {keys.get(name, name): value for name, value in numbers.items() if value is not None}
+    tree |= {name: value for name, value in values.items() if value not in (None, ())}
     return configuration.override(validate(SimulationConfig, tree, "command line"), installed, options)
 
 
-def _flight_or_file(installed: registry.Registry, flight: str) -> dict[str, Any]:
-    """A name that is installed is a flight; anything else that exists, or looks like a path, is a file."""
-    names = installed.names(registry.FLIGHT)
-    if flight in names:
-        return {"flight": {"name": flight}}
-    if Path(flight).exists() or Path(flight).suffix or os.sep in flight:
-        return {"trajectory": Path(flight)}
-    raise ConfigError(
-        f"no flight is called {flight!r}{did_you_mean(flight, names)}; "
-        f"installed: {', '.join(names)}; or name a trajectory file"
-    )
-
-
-class _Watch:
-    """A progress bar that moves with each frame written, unless ``quiet``."""
-
-    def __init__(self, recording: SimulatedRecording, quiet: bool) -> None:
-        columns = (
-            TextColumn("{task.description}"),
-            BarColumn(),
-            MofNCompleteColumn(),
-            TextColumn("{task.fields[rate]}"),
-        )
-        console = Console(stderr=True)
-        self._progress = Progress(*columns, TimeRemainingColumn(compact=True), console=console, disable=quiet)
-        self._task = self._progress.add_task(recording.name, total=recording.frame_count, rate="")
-
-    def __enter__(self) -> _Watch:
-        self._progress.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._progress.stop()
-
-    def __call__(self, frame: Frame) -> None:
-        task = self._progress.tasks[self._task]
-        rate = (task.completed + 1) / max(task.elapsed or 0.0, 1e-3)
-        self._progress.update(self._task, advance=1, rate=f"{rate:.1f} frames/s")
-
-
-def _report(recording: SimulatedRecording, destinations: tuple[Path, ...], wall_s: float) -> None:
-    truth = recording.ground_truth
-    click.echo(
-        f"{recording.name}: {recording.frame_count} frames and {recording.imu_count} IMU samples of "
-        f"{truth.duration_s:.1f} s along {truth.path_length_m:.1f} m, in {wall_s:.0f} s"
-    )
-    if levels := recording.conditions.levels:
-        click.echo("conditions: " + ", ".join(f"{name} {level:g}" for name, level in levels.items()))
-    click.echo(f"written to {', '.join(map(str, destinations))}; next:\n  vioframe run {destinations[0]}")
-
-
 def _list(installed: registry.Registry) -> None:
-    console = Console()
+    formatter = click.HelpFormatter()
     for kind in (registry.FLIGHT, registry.WORLD):
-        rows = {name: summary_of(installed.find(kind, name).factory) for name in installed.names(kind)}
-        console.print(_table(f"{kind.name}s", rows))
-    console.print(_table("conditions (level 0 to 1)", CONDITIONS))
-    console.print("Options of a flight or world: `vioframe plugins NAME`.")
-
-
-def _table(title: str, rows: dict[str, str]) -> Table:
-    table = Table(title=title, title_style="bold", title_justify="left", box=None, pad_edge=False, show_header=False)
-    for name, text in rows.items():
-        table.add_row(Text(name, style="cyan"), Text(text))
-    return table
+        with formatter.section(f"{kind.name}s"):
+            names = installed.names(kind)
+            formatter.write_dl([(name, summary_of(installed.find(kind, name).factory)) for name in names])
+    with formatter.section("conditions (level 0 to 1)"):
+        formatter.write_dl(list(CONDITIONS.items()))
+    click.echo(f"{formatter.getvalue()}\nOptions of a flight or world: `vioframe plugins NAME`.")

@@ -8,7 +8,7 @@ from typing import Self
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from vioframe.bench.consistency import Trial
+from vioframe.evaluation.consistency import Trial
 
 
 class TrialProgress:

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from vioframe.errors import DivergedError
 from vioframe.geometry.so3 import rotation_z, yaw_of
 from vioframe.types import ImuNoise, ImuSegment, NavState
 
@@ -13,10 +14,6 @@ from vioframe.types import ImuNoise, ImuSegment, NavState
 _UNSEEN_TURN, _UNSEEN_ACCELERATION, _MAX_IMU_GAP_S = 0.5, 2.0, 0.5
 # Beyond these an estimate is not merely inaccurate but wrong, whatever the covariance says.
 _MAX_SPEED_M_S, _MAX_BIAS_GYRO, _MAX_BIAS_ACCEL = 30.0, 1.0, 2.5
-
-
-class DivergedError(ArithmeticError):
-    """The estimate can no longer be believed; the message says why. A back-end starts again, and never lets it out."""
 
 
 def check_plausible(state: NavState) -> None:

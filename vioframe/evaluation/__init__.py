@@ -1,6 +1,6 @@
 """Trajectories: files, association, alignment and error metrics. Everything is pure; nothing mutates its input."""
 
-from vioframe.evaluation.alignment import ALIGNMENTS, Alignment
+from vioframe.evaluation.alignment import ALIGNED_BY, ALIGNMENTS, Alignment
 from vioframe.evaluation.association import associate
 from vioframe.evaluation.comparison import Comparison
 from vioframe.evaluation.evaluation import TrajectoryErrors, evaluate
@@ -8,6 +8,7 @@ from vioframe.evaluation.metrics import RelativeErrors, Stats
 from vioframe.evaluation.nees import Nees
 
 __all__ = [
+    "ALIGNED_BY",
     "ALIGNMENTS",
     "Alignment",
     "Comparison",

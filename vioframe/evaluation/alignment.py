@@ -75,6 +75,11 @@ ALIGNMENTS: Mapping[str, Callable[[Trajectory, Trajectory], Alignment]] = Mappin
 )
 """By the names that the command line and :func:`vioframe.evaluation.evaluate` use."""
 
+ALIGNED_BY: Mapping[str, str] = MappingProxyType(
+    {"posyaw": "position + yaw", "se3": "SE(3)", "sim3": "Sim(3)", "first": "first pose"}
+)
+"""What each of them fits, in words."""
+
 
 def _centred_correlation(estimate: Trajectory, truth: Trajectory) -> tuple[Float, Float, Float]:
     """Both mean positions (3,) and C (3, 3) = mean of (p_G - mean)(p_W - mean)^T, Umeyama (34), (35), (38)."""

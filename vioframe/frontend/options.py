@@ -8,7 +8,7 @@ from typing import Literal, get_args
 from vioframe.errors import ConfigError
 
 Equalisation = Literal["none", "clahe", "histogram"]
-Rejection = Literal["none", "essential", "fundamental", "magsac", "two_point"]
+Rejection = Literal["none", "fundamental", "magsac", "two_point"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -20,48 +20,31 @@ class FrontendOptions:
     min_distance_px: float = 15.0
     """New points keep this far from every track and from each other; of two tracks that come within half of it, the
     younger is dropped."""
-    grid: tuple[int, int] = (6, 8)
-    """Rows and columns of the grid whose emptiest cells are refilled first."""
-    border_px: float = 5.0
-    """Points closer than this to the edge of the image are dropped."""
     equalisation: Equalisation = "clahe"
     """Contrast equalisation before tracking and detection: none, clahe (local) or histogram (global)."""
     klt_window_px: int = 15
     """Side of the square patch that is followed; odd."""
     klt_levels: int = 4
     """Pyramid levels above the full image."""
-    predict_with_gyro: bool = True
-    """Start each search where the gyroscope says that the point went; needs the camera's rotation on the body."""
-    forward_backward_px: float = 1.0
-    """A point tracked forth and back must return to within this of where it was."""
     rejection: Rejection = "magsac"
-    """Epipolar outlier rejection: essential or fundamental matrix by RANSAC, magsac (essential matrix by MAGSAC++),
-    two_point (rotation from the gyroscope, hence needs the camera's rotation on the body) or none."""
+    """Epipolar outlier rejection: magsac (essential matrix by MAGSAC++), fundamental (fundamental matrix by RANSAC, asks
+    less of the calibration), two_point (rotation from the gyroscope; magsac where nobody knows how the camera is
+    turned) or none."""
     rejection_px: float = 0.7
     """Largest distance of an inlier from the epipolar geometry, scaled by the focal length."""
     refill_below: float = 0.9
     """The detector is asked for new points once fewer than this share of ``max_points`` is alive."""
-    candidates_per_point: int = 3
-    """Candidates asked of the detector, as a multiple of ``max_points``; most fall near live tracks."""
-    subpixel_window_px: int = 0
-    """Half window for moving whole-pixel corners to their sub-pixel place; 0 leaves all as detected, which tracks a
-    little better: what is followed is the patch, wherever its corner lies."""
 
     def __post_init__(self) -> None:
         for name, valid, remedy in (
             ("max_points", self.max_points >= 1, "at least 1"),
             ("min_distance_px", self.min_distance_px >= 0.0, "zero or more"),
-            ("grid", len(self.grid) == 2 and min(self.grid) >= 1, "[rows, columns], each at least 1"),
-            ("border_px", self.border_px >= 0.0, "zero or more"),
             ("equalisation", self.equalisation in get_args(Equalisation), " or ".join(get_args(Equalisation))),
             ("klt_window_px", self.klt_window_px >= 5 and self.klt_window_px % 2 == 1, "odd and at least 5"),
             ("klt_levels", 0 <= self.klt_levels <= 8, "0 to 8"),
-            ("forward_backward_px", self.forward_backward_px > 0.0, "more than zero"),
             ("rejection", self.rejection in get_args(Rejection), " or ".join(get_args(Rejection))),
             ("rejection_px", self.rejection_px > 0.0, "more than zero"),
             ("refill_below", 0.0 < self.refill_below <= 1.0, "in (0, 1]"),
-            ("candidates_per_point", self.candidates_per_point >= 1, "at least 1"),
-            ("subpixel_window_px", 0 <= self.subpixel_window_px <= 15, "0 to 15"),
         ):
             if not valid:
                 raise ConfigError(f"front-end option {name} must be {remedy}, got {getattr(self, name)!r}")

@@ -29,11 +29,11 @@ class Camera:
     cy: float
     distortion: tuple[float, float, float, float]
     resolution: tuple[int, int]
-    model: DistortionModel = "radtan"
+    distortion_model: DistortionModel = "radtan"
 
     def __post_init__(self) -> None:
-        if self.model not in ("radtan", "equidistant"):
-            raise CalibrationError(f"unknown distortion model {self.model!r}; use radtan or equidistant")
+        if self.distortion_model not in ("radtan", "equidistant"):
+            raise CalibrationError(f"unknown distortion model {self.distortion_model!r}; use radtan or equidistant")
         numbers = [self.fx, self.fy, self.cx, self.cy, *self.distortion]
         if len(self.distortion) != 4 or not np.all(np.isfinite(numbers)) or self.fx <= 0.0 or self.fy <= 0.0:
             raise CalibrationError(f"camera needs fx, fy > 0 and four finite distortion coefficients, got {numbers}")
@@ -72,7 +72,7 @@ class Camera:
         """
         target = (np.asarray(xy, dtype=np.float64).reshape(-1, 2) - self._centre) / self._focal
         guess = target.copy()
-        if self.model == "equidistant":
+        if self.distortion_model == "equidistant":
             # The distorted radius is nearly the angle from the axis; start from the undistorted tangent.
             theta = np.linalg.norm(target, axis=1, keepdims=True)
             guess *= np.tan(np.minimum(theta, 1.5)) / np.where(theta < 1e-9, 1.0, theta)
@@ -105,7 +105,7 @@ class Camera:
     def _distort(self, xy: Float) -> Float:
         x, y = xy[:, 0], xy[:, 1]
         r2 = x * x + y * y
-        if self.model == "radtan":
+        if self.distortion_model == "radtan":
             k1, k2, p1, p2 = self.distortion
             radial = 1.0 + r2 * (k1 + k2 * r2)
             return np.stack(
@@ -121,7 +121,7 @@ class Camera:
         x, y = xy[:, 0], xy[:, 1]
         r2 = x * x + y * y
         J = np.empty((len(xy), 2, 2))
-        if self.model == "radtan":
+        if self.distortion_model == "radtan":
             k1, k2, p1, p2 = self.distortion
             radial = 1.0 + r2 * (k1 + k2 * r2)
             slope = 2.0 * (k1 + 2.0 * k2 * r2)  # d radial / d r2, times 2

@@ -16,7 +16,7 @@ RADTAN, EQUIDISTANT = 0, 1
 
 def intrinsics_of(camera: Camera) -> tuple[int, Float]:
     """The camera as the kernels take it: model number and (8,) [fx fy cx cy d1 d2 d3 d4]."""
-    number = RADTAN if camera.model == "radtan" else EQUIDISTANT
+    number = RADTAN if camera.distortion_model == "radtan" else EQUIDISTANT
     return number, np.array([camera.fx, camera.fy, camera.cx, camera.cy, *camera.distortion])
 
 

@@ -50,20 +50,10 @@ def sampson_distance(E: Float, xy_1: Float, xy_2: Float) -> Float:
     return distance
 
 
-def essential_inliers(xy_1: Float, xy_2: Float, threshold: float, confidence: float = 0.999) -> Mask:
-    """(N,) inliers to the essential matrix by RANSAC over Nistér's 5-point solver (PAMI 2004); needs N >= 5."""
-    import cv2
-
-    _, mask = cv2.findEssentialMat(
-        xy_1, xy_2, np.eye(3), method=cv2.RANSAC, prob=confidence, threshold=threshold, maxIters=_MAX_ITERATIONS
-    )
-    return _as_mask(mask, len(xy_1))
-
-
 def fundamental_inliers(xy_1: Float, xy_2: Float, threshold: float, confidence: float = 0.999) -> Mask:
     """(N,) inliers to a fundamental matrix by RANSAC over the 7-point solver (11.1.2); needs N >= 8.
 
-    It asks less of the calibration than :func:`essential_inliers`, and rejects less.
+    It asks less of the calibration than :func:`magsac_inliers`, and rejects less.
     """
     import cv2
 

@@ -1,34 +1,39 @@
 """One recording format into another: ASL folder, ROS 1 bag, ROS 2 bag, MCAP; stamps, pixels and readings stay exact.
 
-A converted recording holds one camera and one IMU under EuRoC's names (``cam0``, ``imu0``; ``/cam0/image_raw``,
-``/imu0``) and its calibration: as ``sensor.yaml`` in an ASL folder, beside any other in the folder ``<name>.calib``.
+A converted recording holds every camera under its name (a folder ``cam0``, a topic ``/cam0/image_raw``), the IMU
+(``imu0``, ``/imu0``), the ground truth where its source brings one, and the calibration: as ``sensor.yaml`` in an ASL
+folder, beside any other in the folder ``<name>.calib``. For the truth's topics see :mod:`vioframe.io.writers`.
 """
 
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable, Iterable, Iterator
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from heapq import merge
 from pathlib import Path
 
 from vioframe.errors import DatasetError
+from vioframe.geometry.trajectory import Trajectory
 from vioframe.io.calibration import sidecar_folder, write_calibration
+from vioframe.io.trajectories import true_values
 from vioframe.io.writers import AslWriter, McapWriter, RecordingWriter, Ros1Writer, Ros2Writer
-from vioframe.types import Calibration, Frame, ImuSample, Measurement
+from vioframe.types import Calibration, FrameSet, ImuSample, Measurement, Unreadable
 
 
 @dataclass(frozen=True, slots=True)
 class Format:
-    """A recording format that can be written: ``open(path, compression)`` begins one."""
+    """A recording format that can be written: ``open(path, compression, camera_names)`` begins one."""
 
     description: str
-    open: Callable[[Path, str | None], RecordingWriter]
+    open: Callable[[Path, str | None, Sequence[str]], RecordingWriter]
     compressions: tuple[str, ...] = ()
 
 
 FORMATS = {
-    "asl": Format("ASL folder, as EuRoC's", lambda path, _: AslWriter(path)),
+    "asl": Format("ASL folder, as EuRoC's", lambda path, _, camera_names: AslWriter(path, camera_names)),
     "ros1": Format("ROS 1 bag", Ros1Writer, ("bz2", "lz4")),
     "ros2": Format("ROS 2 bag, a folder with sqlite3 storage", Ros2Writer, ("zstd",)),
     "mcap": Format("MCAP file with ROS 2 messages", McapWriter, ("zstd",)),
@@ -37,10 +42,11 @@ FORMATS = {
 
 @dataclass(frozen=True, slots=True)
 class Conversion:
-    """What was written, and how much of the source could not be read."""
+    """How much was written, frame sets and true poses among it, and how much of the source could not be read."""
 
     frames: int
     imu_samples: int
+    true_poses: int
     unreadable: int
 
 
@@ -63,10 +69,14 @@ def convert(
     calibration: Calibration,
     destination: Path,
     *,
+    truth: Trajectory | None = None,
     format: str | None = None,
     compression: str | None = None,
 ) -> Conversion:
-    """Write a data set's measurements and calibration to ``destination``, which appears only once it is complete.
+    """Write a data set's measurements, calibration and ground truth to ``destination``.
+
+    It appears only once it is complete. Where the ``truth`` is a :class:`~vioframe.io.trajectories.TrueTrajectory`, as
+    the built-in readers give it, its numbers are written as they are, velocity and biases included.
 
     ``format`` is a key of :data:`FORMATS`, by default told by the name (:func:`format_of`); ``compression`` is one that
     the format offers. Raises :class:`~vioframe.errors.DatasetError`, also where the destination exists.
@@ -78,7 +88,8 @@ def convert(
     if compression is not None and compression not in offered:
         raise DatasetError(f"{format} offers no compression {compression!r}; it has: {', '.join(offered) or 'none'}")
     with appearing(destination) as unfinished:
-        counts = _write(measurements, FORMATS[format].open(unfinished, compression))
+        camera_names = [camera.name for camera in calibration.cameras]
+        counts = _write(measurements, truth, FORMATS[format].open(unfinished, compression, camera_names))
         if not counts.frames or not counts.imu_samples:
             raise DatasetError(f"nothing to write to {destination}: the source has no readable frame or no IMU sample")
         if format == "asl":
@@ -88,19 +99,26 @@ def convert(
     return counts
 
 
-def _write(measurements: Iterable[Measurement], writer: RecordingWriter) -> Conversion:
-    frames = imu_samples = unreadable = 0
+@dataclass(frozen=True, slots=True)
+class _TrueRow:
+    t_ns: int
+    values: list[float]
+
+
+def _write(measurements: Iterable[Measurement], truth: Trajectory | None, writer: RecordingWriter) -> Conversion:
+    rows = () if truth is None else map(_TrueRow, truth.t_ns.tolist(), true_values(truth).tolist())
+    counts: Counter[type] = Counter()
+    items: Iterator[Measurement | _TrueRow] = merge(measurements, rows, key=lambda item: item.t_ns)
     with writer:
-        for measurement in measurements:
-            if isinstance(measurement, Frame):
-                writer.write_frame(measurement)
-                frames += 1
-            elif isinstance(measurement, ImuSample):
-                writer.write_imu(measurement)
-                imu_samples += 1
-            else:
-                unreadable += 1
-    return Conversion(frames, imu_samples, unreadable)
+        for item in items:
+            if isinstance(item, FrameSet):
+                writer.write_frame(item)
+            elif isinstance(item, ImuSample):
+                writer.write_imu(item)
+            elif isinstance(item, _TrueRow):
+                writer.write_true_values(item.t_ns, item.values)
+            counts[type(item)] += 1
+    return Conversion(*(counts[kind] for kind in (FrameSet, ImuSample, _TrueRow, Unreadable)))
 
 
 @contextmanager

@@ -1,7 +1,11 @@
-"""Images of any kind a recording may hold -> the (H, W) uint8 that a :class:`~vioframe.types.Frame` carries."""
+"""Images of any kind a recording may hold -> the (H, W) uint8 that a :class:`~vioframe.types.FrameSet` carries.
+
+A reader makes a set of each image as it comes (:func:`single`); :func:`gathered` joins those of one stamp.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from typing import Any, cast
 
 import numpy as np
@@ -9,7 +13,11 @@ from numpy.typing import NDArray
 
 from vioframe.errors import DatasetError
 from vioframe.geometry.cameras import Camera
-from vioframe.types import Image
+from vioframe.types import FrameSet, Image, Measurement
+
+# How many measurements may follow an image before those of the other cameras at its instant are no longer waited for:
+# half a second of two cameras at 20 Hz and an IMU at 200 Hz.
+_LOOK_AHEAD = 120
 
 
 def decode_image(data: bytes | NDArray[np.uint8]) -> NDArray[Any] | None:
@@ -48,6 +56,43 @@ def check_bit_depth(bit_depth: int | None) -> None:
     """Raise :class:`~vioframe.errors.DatasetError` unless the option is None or 8 to 16."""
     if bit_depth is not None and not 8 <= bit_depth <= 16:
         raise DatasetError(f"bit_depth must lie between 8 and 16, not {bit_depth}")
+
+
+def single(t_ns: int, image: Image, place: int, cameras: int) -> FrameSet:
+    """What the camera at ``place`` in a rig of so many ``cameras`` took, as a set without the others."""
+    return FrameSet(t_ns, tuple(image if i == place else None for i in range(cameras)))
+
+
+def gathered(measurements: Iterable[Measurement]) -> Iterator[Measurement]:
+    """The same measurements in the same order, but images of one stamp joined, in the place of the first of them.
+
+    An incomplete set is held back, and with it what follows, until its other images have come or too much has.
+    """
+    held: list[Measurement] = []
+    for measurement in measurements:
+        if not isinstance(measurement, FrameSet) or not _joined(measurement, held):
+            held.append(measurement)
+        ready = next((i for i, other in enumerate(held) if _incomplete(other)), len(held))
+        if len(held) > _LOOK_AHEAD:
+            ready = max(ready, 1)
+        yield from held[:ready]
+        del held[:ready]
+    yield from held
+
+
+def _incomplete(measurement: Measurement) -> bool:
+    return isinstance(measurement, FrameSet) and any(image is None for image in measurement.images)
+
+
+def _joined(frames: FrameSet, held: list[Measurement]) -> bool:
+    """Whether a set of the same stamp among ``held`` lacked these images; it now has them."""
+    for i, other in enumerate(held):
+        if isinstance(other, FrameSet) and other.t_ns == frames.t_ns:
+            pairs = list(zip(other.images, frames.images, strict=True))
+            if all(one is None or another is None for one, another in pairs):
+                held[i] = FrameSet(frames.t_ns, tuple(another if one is None else one for one, another in pairs))
+                return True
+    return False
 
 
 def check_size(image: Image, camera: Camera, where: str) -> None:

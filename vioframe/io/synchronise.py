@@ -16,12 +16,13 @@ from statistics import median
 
 import numpy as np
 
+from vioframe.errors import ConfigError
 from vioframe.incidents import Incidents
-from vioframe.types import NS_PER_S, Frame, ImuSample, ImuSegment, Measurement
+from vioframe.types import NS_PER_S, FrameSet, ImuSample, ImuSegment, Measurement
 
-# A frame waits until this many later IMU samples are there, so that samples may arrive out of order by as many places
-# (50 ms at 200 Hz). Counting samples rather than time keeps a single stamp from the far future harmless.
-_REORDER_SAMPLES = 10
+Packet = tuple[ImuSegment, FrameSet]
+
+NS_PER_MS = 1_000_000
 # Frames waiting for an IMU that has fallen silent; bounds the memory that they take.
 _MAX_WAITING_FRAMES = 200
 # Beyond the range of any IMU that flies or is worn (4000 deg/s, 200 g): a fault of the sensor or of its bus.
@@ -29,70 +30,122 @@ _MAX_RATE_RAD_S, _MAX_FORCE_M_S2 = 100.0, 2000.0
 _IMU_GAP_PERIODS = 5.0
 _CAMERA_GAP_PERIODS = 2.5
 _PERIOD_SAMPLES = 51
+_READINGS_BEHIND_THE_END = 20
+# Readings kept while no frame waits for them: the next may be late by as much.
+_MOST_IDLE_READINGS = 4000
 
 
-def synchronise(
-    measurements: Iterable[Measurement],
-    *,
-    time_offset_ns: int = 0,
-    start_s: float = 0.0,
-    duration_s: float | None = None,
-    incidents: Incidents,
-) -> Iterator[tuple[ImuSegment, Frame]]:
-    """Pair each frame with the inertial readings since the previous one, in order of time.
+class Synchroniser:
+    """Takes measurements one by one; gives each frame with the inertial readings since the previous one.
 
     IMU stamps move to the camera's clock (``t_cam = t_imu - time_offset_ns``). Both ends of a segment are interpolated
-    linearly onto the frame stamps; the first packet's segment is a single reading. ``start_s`` seconds of frames are
-    skipped at the beginning, counted from the first frame, and ``duration_s`` is how much is played after that.
+    linearly onto the frame stamps; the first packet's segment is a single reading.
+
+    A frame waits until readings from ``wait_ms`` behind it are there: so much later may a reading arrive than one with
+    a later stamp, and still find its place. Of those two must have come, so that a single stamp from the far future
+    does no harm. With 0 the first reading at or behind the frame lets it go: the least latency, for a stream in order.
 
     ``incidents`` counts ``imu_nan``, ``imu_out_of_range``, ``imu_duplicate``, ``imu_out_of_order``, ``imu_gap``,
     ``frame_duplicate``, ``frame_out_of_order``, ``frame_before_imu``, ``frame_after_imu``, ``frame_without_imu`` and
     ``camera_gap``.
     """
-    imu = _ImuBuffer(time_offset_ns, incidents)
-    frames = _FrameBuffer(incidents)
-    begin_ns: int | None = None
-    for frame in _released(measurements, imu, frames, incidents):
-        if begin_ns is None:
-            begin_ns = frame.t_ns + round(start_s * NS_PER_S)
-        if frame.t_ns < begin_ns:
-            continue
-        if duration_s is not None and frame.t_ns > begin_ns + round(duration_s * NS_PER_S):
-            return
-        if imu.covers(frame.t_ns):
-            frames.watch_gap(frame.t_ns)
-            yield imu.segment_until(frame.t_ns), frame
-        else:
-            incidents.add("frame_before_imu", frame.t_ns, "dropped: no IMU sample at or before it")
 
+    def __init__(self, incidents: Incidents, *, time_offset_ns: int = 0, wait_ms: float = 50.0) -> None:
+        if not wait_ms >= 0.0:
+            raise ConfigError(f"wait_ms must be zero or more, got {wait_ms!r}")
+        self._imu = _ImuBuffer(time_offset_ns, incidents)
+        self._frames = _FrameBuffer(incidents)
+        self._incidents = incidents
+        self._wait_ns = round(wait_ms * NS_PER_MS)
 
-def _released(
-    measurements: Iterable[Measurement], imu: _ImuBuffer, frames: _FrameBuffer, incidents: Incidents
-) -> Iterator[Frame]:
-    """Frames in order of time, each once enough IMU samples after it have arrived."""
-    for measurement in measurements:
+    def add(self, measurement: Measurement) -> Iterator[Packet]:
+        """Take one measurement; the packets that are complete by it."""
+        imu, frames = self._imu, self._frames
         if isinstance(measurement, ImuSample):
             imu.add(measurement)
-        elif isinstance(measurement, Frame):
+            if not frames.waiting:
+                imu.forget()
+        elif isinstance(measurement, FrameSet):
             frames.add(measurement)
         else:
-            incidents.add(measurement.kind, measurement.t_ns, measurement.detail)
-        while frames.waiting and imu.count_from(frames.waiting[0].t_ns) >= (1 if frames.full else _REORDER_SAMPLES):
-            yield frames.pop()
+            self._incidents.add(measurement.kind, measurement.t_ns, measurement.detail)
+        while frames.waiting and self._is_covered(frames.waiting[0]):
+            yield from self._release()
         if frames.full:
             dropped = frames.pop()
-            incidents.add("frame_without_imu", dropped.t_ns, "dropped: the IMU has fallen silent")
-    while frames.waiting and imu.count_from(frames.waiting[0].t_ns):
-        yield frames.pop()
-    for frame in frames.waiting:
-        incidents.add("frame_after_imu", frame.t_ns, "dropped: no IMU sample at or after it")
+            self._incidents.add("frame_without_imu", dropped.t_ns, "dropped: the IMU has fallen silent")
+
+    def finish(self) -> Iterator[Packet]:
+        """The packets of the frames that still wait, as far as readings reach: nothing more will come."""
+        while self._frames.waiting and self._imu.count_from(self._frames.waiting[0].t_ns):
+            yield from self._release()
+        for frame in self._frames.waiting:
+            self._incidents.add("frame_after_imu", frame.t_ns, "dropped: no IMU sample at or after it")
+        self._frames.waiting.clear()
+
+    def _is_covered(self, frame: FrameSet) -> bool:
+        """Whether the readings reach far enough behind ``frame``."""
+        if self._wait_ns == 0 or self._frames.full:
+            return self._imu.count_from(frame.t_ns) >= 1
+        return self._imu.count_from(frame.t_ns + self._wait_ns) >= 2
+
+    def _release(self) -> Iterator[Packet]:
+        frame = self._frames.pop()
+        if self._imu.covers(frame.t_ns):
+            self._frames.watch_gap(frame.t_ns)
+            yield self._imu.segment_until(frame.t_ns), frame
+        else:
+            self._incidents.add("frame_before_imu", frame.t_ns, "dropped: no IMU sample at or before it")
+
+
+def synchronise(
+    measurements: Iterable[Measurement],
+    incidents: Incidents,
+    *,
+    time_offset_ns: int = 0,
+    start_s: float = 0.0,
+    duration_s: float | None = None,
+) -> Iterator[Packet]:
+    """The packets of a recording, or of the part of it that :func:`played` lets through."""
+    synchroniser = Synchroniser(incidents, time_offset_ns=time_offset_ns)
+    for measurement in played(measurements, start_s, duration_s):
+        yield from synchroniser.add(measurement)
+    yield from synchroniser.finish()
+
+
+def played(
+    measurements: Iterable[Measurement], start_s: float = 0.0, duration_s: float | None = None
+) -> Iterator[Measurement]:
+    """A recording without the frames of its first ``start_s`` seconds, nor those ``duration_s`` and more after that.
+
+    Time counts from the first frame. The readings stay, up to some behind the last frame.
+    """
+    if start_s == 0.0 and duration_s is None:
+        yield from measurements
+        return
+    begin_ns: int | None = None
+    end_ns = inf
+    behind = 0
+    for measurement in measurements:
+        if isinstance(measurement, FrameSet):
+            if begin_ns is None:
+                begin_ns = measurement.t_ns + round(start_s * NS_PER_S)
+                end_ns = inf if duration_s is None else begin_ns + round(duration_s * NS_PER_S)
+            if begin_ns <= measurement.t_ns <= end_ns:
+                yield measurement
+            continue
+        yield measurement
+        # One wild stamp is no reason to stop.
+        behind = behind + 1 if measurement.t_ns > end_ns + NS_PER_S else 0
+        if behind > _READINGS_BEHIND_THE_END:
+            return
 
 
 class _FrameBuffer:
     """Frames that wait for their IMU samples, ordered by time."""
 
     def __init__(self, incidents: Incidents) -> None:
-        self.waiting: list[Frame] = []
+        self.waiting: list[FrameSet] = []
         self._incidents = incidents
         self._last_released_ns: int | None = None
         self._previous_arrival_ns: int | None = None
@@ -103,7 +156,7 @@ class _FrameBuffer:
     def full(self) -> bool:
         return len(self.waiting) > _MAX_WAITING_FRAMES
 
-    def add(self, frame: Frame) -> None:
+    def add(self, frame: FrameSet) -> None:
         last_ns = self._last_released_ns
         previous_ns, self._previous_arrival_ns = self._previous_arrival_ns, frame.t_ns
         place = bisect_left(self.waiting, frame.t_ns, key=lambda other: other.t_ns)
@@ -117,7 +170,7 @@ class _FrameBuffer:
             self._incidents.add("frame_out_of_order", frame.t_ns, "sorted into place")
         self.waiting.insert(place, frame)
 
-    def pop(self) -> Frame:
+    def pop(self) -> FrameSet:
         frame = self.waiting.pop(0)
         self._last_released_ns = frame.t_ns
         return frame
@@ -168,6 +221,11 @@ class _ImuBuffer:
             self._incidents.add("imu_out_of_order", t_ns, "sorted into place")
         self._times.insert(place, t_ns)
         self._samples.insert(place, sample)
+
+    def forget(self) -> None:
+        """Let go of the oldest readings where there are more than any frame may still ask for."""
+        if len(self._times) > 2 * _MOST_IDLE_READINGS:
+            del self._times[:_MOST_IDLE_READINGS], self._samples[:_MOST_IDLE_READINGS]
 
     def count_from(self, t_ns: int) -> int:
         """Number of samples at or after ``t_ns``."""

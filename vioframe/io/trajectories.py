@@ -11,10 +11,11 @@ from __future__ import annotations
 import gzip
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from decimal import Decimal, InvalidOperation
 from itertools import compress
 from pathlib import Path
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,6 +30,30 @@ _MOTION_CAPTURE = re.compile(r"vicon|leica", re.IGNORECASE)
 _EUROC_COLUMNS = (8, 11, 17)
 _QUAT_NORM_TOLERANCE = 0.01
 _INT64_MAX = 2**63 - 1
+
+
+@dataclass(frozen=True, eq=False)
+class TrueTrajectory(Trajectory):
+    """A trajectory that keeps what EuRoC's ground truth knows beside poses, and its numbers as they were given.
+
+    ``values`` (N, 7, 10 or 16) are ``p_WB`` and the quaternion wxyz (of any norm), then ``v_WB`` m/s, then
+    ``bias_gyro_B`` rad/s and ``bias_accel_B`` m/s^2: the columns of EuRoC's file behind the stamp.
+    """
+
+    values: Float = field(kw_only=True)
+
+    @classmethod
+    def of(cls, t_ns: Int, values: Float) -> Self:
+        """From stamps (N,) and ``values``."""
+        poses = Trajectory.from_quat_xyzw(t_ns, values[:, :3], values[:, [4, 5, 6, 3]])
+        return cls(poses.t_ns, poses.R_WB, poses.p_WB, values=values)
+
+
+def true_values(trajectory: Trajectory) -> Float:
+    """The ``values`` of a :class:`TrueTrajectory`, (N, 7) of the poses where it is none."""
+    if isinstance(trajectory, TrueTrajectory):
+        return trajectory.values
+    return np.hstack([trajectory.p_WB, trajectory.quat_xyzw[:, [3, 0, 1, 2]]])
 
 
 @dataclass(frozen=True)
@@ -52,7 +77,7 @@ class _Table:
 def load_trajectory(
     path: str | Path, *, complete_lines_only: bool = False, keep_first_of_repeats: bool = False
 ) -> Trajectory:
-    """Read a TUM or EuRoC file; which one is told from its contents.
+    """Read a TUM or EuRoC file; which one is told from its contents. EuRoC's is a :class:`TrueTrajectory`.
 
     ``complete_lines_only`` ignores a last line without its line end, as an interrupted run leaves behind;
     ``keep_first_of_repeats`` drops lines that repeat the stamp of the line before, else an error. Raises
@@ -82,6 +107,8 @@ def load_trajectory(
     off = np.abs(np.linalg.norm(quat, axis=1) - 1.0) > _QUAT_NORM_TOLERANCE
     if off.any():
         raise table.error(int(np.argmax(off)), "the quaternion is not of unit norm; are the columns in order?")
+    if unit == 1:
+        return TrueTrajectory.of(t_ns, values[:, 1:])
     return Trajectory.from_quat_xyzw(t_ns, values[:, 1:4], quat)
 
 
@@ -187,16 +214,16 @@ def _check_order(table: _Table, t_ns: Int) -> None:
 
 
 def _values(table: _Table) -> Float:
-    """(N, 8) the leading columns as floats, all finite but the stamp's."""
-    leading: Sequence[Sequence[str]] = [fields[:8] for fields in table.rows]
+    """(N, columns) as floats; the poses, which are the first eight but the stamp, all finite."""
+    rows: Sequence[Sequence[str]] = table.rows
     try:
-        values = np.array(leading, dtype=np.float64)
+        values = np.array(rows, dtype=np.float64)
     except ValueError:
-        values = np.array([[_float_or_nan(field) for field in fields] for fields in leading])
-    finite = np.isfinite(values).all(axis=1)
+        values = np.array([[_float_or_nan(field) for field in fields] for fields in rows])
+    finite = np.isfinite(values[:, :8]).all(axis=1)
     if not finite.all():
         row = int(np.argmin(finite))
-        raise table.error(row, f"the pose is not finite: {' '.join(leading[row][1:])}")
+        raise table.error(row, f"the pose is not finite: {' '.join(rows[row][1:8])}")
     return values
 
 

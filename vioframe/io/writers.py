@@ -3,20 +3,23 @@
 from __future__ import annotations
 
 import shutil
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Protocol, Self
+from typing import Any, Protocol, Self, TextIO
 
 import numpy as np
 
 from vioframe.errors import DatasetError
 from vioframe.geometry import so3
-from vioframe.types import NS_PER_S, Float, Frame, ImuSample, NavState
+from vioframe.types import NS_PER_S, Float, FrameSet, Image, ImuSample, NavState
 
-CAMERA_TOPIC = "/cam0/image_raw"
 IMU_TOPIC = "/imu0"
 GROUND_TRUTH_TOPIC = "/vioframe/ground_truth"
-"""Poses of the body in W, exact and on the camera's clock: of simulated recordings only."""
+"""Poses of the body in W, on the camera's clock: of recordings whose source knows the truth in the body frame."""
+TRUE_VECTOR_TOPICS = tuple(f"{GROUND_TRUTH_TOPIC}/{name}" for name in ("velocity", "bias_gyro", "bias_accel"))
+"""``v_WB`` m/s, ``bias_gyro_B`` rad/s, ``bias_accel_B`` m/s^2 at the stamps of the poses, where they are known."""
 
 # ROS 2 keeps seconds in 32 bits with a sign.
 _ROS_STAMP_LIMIT_NS = 2**31 * NS_PER_S
@@ -24,6 +27,7 @@ _ROS_STAMP_LIMIT_NS = 2**31 * NS_PER_S
 _IMAGE = "sensor_msgs/msg/Image"
 _IMU = "sensor_msgs/msg/Imu"
 _POSE = "geometry_msgs/msg/PoseStamped"
+_VECTOR = "geometry_msgs/msg/Vector3Stamped"
 _FRAME_HEADING = "#timestamp [ns],filename\n"
 _IMU_HEADING = (
     "#timestamp [ns],w_RS_S_x [rad s^-1],w_RS_S_y [rad s^-1],w_RS_S_z [rad s^-1],"
@@ -48,47 +52,70 @@ class RecordingWriter(Protocol):
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None: ...
 
-    def write_frame(self, frame: Frame) -> None: ...
+    def write_frame(self, frames: FrameSet) -> None:
+        """The images there are, of the cameras in the order that the writer was told."""
+        ...
 
     def write_imu(self, sample: ImuSample) -> None: ...
 
-    def write_truth(self, state: NavState) -> None: ...
+    def write_truth(self, state: NavState) -> None:
+        """A true state: velocity and biases as far as it knows them (they are not NaN)."""
+        ...
+
+    def write_true_values(self, t_ns: int, values: Sequence[float]) -> None:
+        """The same as a row of :attr:`vioframe.io.trajectories.TrueTrajectory.values`."""
+        ...
 
 
-class TruthFile:
-    """A ground-truth file of EuRoC's: pose, and velocity and biases as far as the states know them (are not NaN)."""
+class _TruthWriter(ABC):
+    """True states to rows."""
+
+    def write_truth(self, state: NavState) -> None:
+        x, y, z, w = so3.to_quat_xyzw(state.R_WB).tolist()
+        known = np.concatenate([state.v_WB, state.bias_gyro_B, state.bias_accel_B])
+        self.write_true_values(state.t_ns, [*state.p_WB.tolist(), w, x, y, z, *known[np.isfinite(known)].tolist()])
+
+    @abstractmethod
+    def write_true_values(self, t_ns: int, values: Sequence[float]) -> None: ...
+
+
+class TruthFile(_TruthWriter):
+    """A ground-truth file of EuRoC's, with as many columns as its first row has."""
 
     def __init__(self, path: Path) -> None:
         self._file = path.open("w", encoding="utf-8")
         self._columns = 0
 
-    def write(self, state: NavState) -> None:
-        x, y, z, w = so3.to_quat_xyzw(state.R_WB).tolist()
-        known = np.concatenate([state.v_WB, state.bias_gyro_B, state.bias_accel_B])
+    def write_true_values(self, t_ns: int, values: Sequence[float]) -> None:
         if not self._columns:
-            self._columns = 8 + int(np.isfinite(known).sum())
-            self._file.write(",".join(_TRUTH_HEADING[: self._columns]) + "\n")
-        values = [*state.p_WB.tolist(), w, x, y, z, *known.tolist()][: self._columns - 1]
-        self._file.write(",".join([str(state.t_ns), *map(repr, values)]) + "\n")
+            self._columns = 1 + len(values)
+            heading = ",".join(_TRUTH_HEADING[: self._columns])
+            # Poses alone under EuRoC's names are its raw motion capture, which no reader takes for the truth.
+            self._file.write((heading.replace("RS_R", "WB") if self._columns == 8 else heading) + "\n")
+        self._file.write(_row(t_ns, values[: self._columns - 1]))
 
     def close(self) -> None:
         self._file.close()
 
 
-class AslWriter:
-    """An ASL folder: ``mav0/cam0`` with lossless images, ``mav0/imu0``, and ``mav0/state_groundtruth_estimate0`` where
-    the truth is known; numbers are written so as to read back equal."""
+class AslWriter(_TruthWriter):
+    """An ASL folder: in ``mav0`` a folder of lossless images for each camera, ``imu0``, and
+    ``state_groundtruth_estimate0`` where the truth is known; numbers are written so as to read back equal."""
 
-    def __init__(self, folder: Path) -> None:
-        self._truth_folder = folder / "mav0" / "state_groundtruth_estimate0"
+    def __init__(self, folder: Path, camera_names: Sequence[str]) -> None:
+        self._mav0 = folder / "mav0"
+        self._cameras: list[tuple[Path, TextIO]] = []
+        for name in camera_names:
+            (self._mav0 / name / "data").mkdir(parents=True)
+            self._cameras.append((self._mav0 / name / "data", self._begin(name, _FRAME_HEADING)))
+        (self._mav0 / "imu0").mkdir()
+        self._imu = self._begin("imu0", _IMU_HEADING)
         self._truth: TruthFile | None = None
-        self._images = folder / "mav0" / "cam0" / "data"
-        self._images.mkdir(parents=True)
-        (folder / "mav0" / "imu0").mkdir()
-        self._frames = (folder / "mav0" / "cam0" / "data.csv").open("w", encoding="utf-8")
-        self._imu = (folder / "mav0" / "imu0" / "data.csv").open("w", encoding="utf-8")
-        self._frames.write(_FRAME_HEADING)
-        self._imu.write(_IMU_HEADING)
+
+    def _begin(self, sensor: str, heading: str) -> TextIO:
+        file = (self._mav0 / sensor / "data.csv").open("w", encoding="utf-8")
+        file.write(heading)
+        return file
 
     def __enter__(self) -> Self:
         return self
@@ -96,45 +123,52 @@ class AslWriter:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._frames.close()
+        for _, file in self._cameras:
+            file.close()
         self._imu.close()
         if self._truth is not None:
             self._truth.close()
 
-    def write_frame(self, frame: Frame) -> None:
+    def write_frame(self, frames: FrameSet) -> None:
         import cv2
 
-        # The fastest level: these files are a few per cent larger than at the default one.
-        _, png = cv2.imencode(".png", frame.image, [cv2.IMWRITE_PNG_COMPRESSION, 1])
-        (self._images / f"{frame.t_ns}.png").write_bytes(png.tobytes())
-        self._frames.write(f"{frame.t_ns},{frame.t_ns}.png\n")
+        for (folder, file), image in zip(self._cameras, frames.images, strict=True):
+            if image is not None:
+                # The fastest level: these files are a few per cent larger than at the default one.
+                _, png = cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, 1])
+                (folder / f"{frames.t_ns}.png").write_bytes(png.tobytes())
+                file.write(f"{frames.t_ns},{frames.t_ns}.png\n")
 
     def write_imu(self, sample: ImuSample) -> None:
-        readings = [*sample.gyro_B.tolist(), *sample.accel_B.tolist()]
-        self._imu.write(",".join([str(sample.t_ns), *map(repr, readings)]) + "\n")
+        self._imu.write(_row(sample.t_ns, [*sample.gyro_B.tolist(), *sample.accel_B.tolist()]))
 
-    def write_truth(self, state: NavState) -> None:
+    def write_true_values(self, t_ns: int, values: Sequence[float]) -> None:
         if self._truth is None:
-            self._truth_folder.mkdir()
-            self._truth = TruthFile(self._truth_folder / "data.csv")
-        self._truth.write(state)
+            folder = self._mav0 / "state_groundtruth_estimate0"
+            folder.mkdir()
+            self._truth = TruthFile(folder / "data.csv")
+        self._truth.write_true_values(t_ns, values)
 
 
-class _RosWriter:
+class _RosWriter(_TruthWriter):
     """What ROS 1 and ROS 2 have in common: messages, and a time of recording that keeps them in the order they came."""
 
-    def __init__(self, bag: Any, store: Any, serialize: Any, header_extra: dict[str, int]) -> None:
+    def __init__(
+        self, bag: Any, camera_names: Sequence[str], store: Any, serialize: Any, header_extra: dict[str, int]
+    ) -> None:
         self._bag = bag
+        self._camera_names = camera_names
         self._store = store
         self._types = store.types
         self._serialize = serialize
         self._header_extra = header_extra
         self._recorded_ns = 0
+        self._connections: dict[str, Any] = {}
         bag.open()
         # rosbags reads messages of the same time in the order of their topics: the IMU first, as from an ASL folder.
-        self._imu = bag.add_connection(IMU_TOPIC, _IMU, typestore=store)
-        self._camera = bag.add_connection(CAMERA_TOPIC, _IMAGE, typestore=store)
-        self._truth: Any = None
+        self._connect(IMU_TOPIC, _IMU)
+        for name in camera_names:
+            self._connect(_image_topic(name), _IMAGE)
 
     def __enter__(self) -> Self:
         return self
@@ -144,18 +178,23 @@ class _RosWriter:
     ) -> None:
         self._bag.__exit__(kind, error, trace)
 
-    def write_frame(self, frame: Frame) -> None:
-        height, width = frame.image.shape
+    def write_frame(self, frames: FrameSet) -> None:
+        for name, image in zip(self._camera_names, frames.images, strict=True):
+            if image is not None:
+                self._write_image(frames.t_ns, name, image)
+
+    def _write_image(self, t_ns: int, camera_name: str, image: Image) -> None:
+        height, width = image.shape
         message = self._types[_IMAGE](
-            header=self._header(frame.t_ns, "cam0"),
+            header=self._header(t_ns, camera_name),
             height=height,
             width=width,
             encoding="mono8",
             is_bigendian=0,
             step=width,
-            data=np.ascontiguousarray(frame.image).ravel(),
+            data=np.ascontiguousarray(image).ravel(),
         )
-        self._write(self._camera, _IMAGE, frame.t_ns, message)
+        self._write(_image_topic(camera_name), t_ns, message)
 
     def write_imu(self, sample: ImuSample) -> None:
         # A first covariance of -1 says that there is no orientation; zeros say that a covariance is not known.
@@ -170,22 +209,29 @@ class _RosWriter:
             linear_acceleration=self._vector(sample.accel_B),
             linear_acceleration_covariance=np.zeros(9),
         )
-        self._write(self._imu, _IMU, sample.t_ns, message)
+        self._write(IMU_TOPIC, sample.t_ns, message)
 
-    def write_truth(self, state: NavState) -> None:
-        if self._truth is None:
-            self._truth = self._bag.add_connection(GROUND_TRUTH_TOPIC, _POSE, typestore=self._store)
-        position, quat = state.p_WB.tolist(), so3.to_quat_xyzw(state.R_WB).tolist()
+    def write_true_values(self, t_ns: int, values: Sequence[float]) -> None:
+        x, y, z, qw, qx, qy, qz = map(float, values[:7])
         pose = self._types["geometry_msgs/msg/Pose"](
-            position=self._types["geometry_msgs/msg/Point"](**dict(zip("xyz", position, strict=True))),
-            orientation=self._types["geometry_msgs/msg/Quaternion"](**dict(zip("xyzw", quat, strict=True))),
+            position=self._types["geometry_msgs/msg/Point"](x=x, y=y, z=z),
+            orientation=self._types["geometry_msgs/msg/Quaternion"](x=qx, y=qy, z=qz, w=qw),
         )
-        message = self._types[_POSE](header=self._header(state.t_ns, "world"), pose=pose)
-        self._write(self._truth, _POSE, state.t_ns, message)
+        message = self._types[_POSE](header=self._header(t_ns, "world"), pose=pose)
+        self._write(GROUND_TRUTH_TOPIC, t_ns, message)
+        vectors = np.reshape(values[7:], ((len(values) - 7) // 3, 3))
+        for topic, frame_id, vector in zip(TRUE_VECTOR_TOPICS, ("world", "imu0", "imu0"), vectors, strict=False):
+            message = self._types[_VECTOR](header=self._header(t_ns, frame_id), vector=self._vector(vector))
+            self._write(topic, t_ns, message)
 
-    def _write(self, connection: Any, message_type: str, t_ns: int, message: Any) -> None:
+    def _write(self, topic: str, t_ns: int, message: Any) -> None:
         self._recorded_ns = max(self._recorded_ns, t_ns)
-        self._bag.write(connection, self._recorded_ns, self._serialize(message, message_type))
+        self._connect(topic, message.__msgtype__)
+        self._bag.write(self._connections[topic], self._recorded_ns, self._serialize(message, message.__msgtype__))
+
+    def _connect(self, topic: str, message_type: str) -> None:
+        if topic not in self._connections:
+            self._connections[topic] = self._bag.add_connection(topic, message_type, typestore=self._store)
 
     def _header(self, t_ns: int, frame_id: str) -> Any:
         if not 0 <= t_ns < _ROS_STAMP_LIMIT_NS:
@@ -201,7 +247,7 @@ class _RosWriter:
 class Ros1Writer(_RosWriter):
     """A ROS 1 bag, chunks compressed with ``bz2``, ``lz4`` or not at all."""
 
-    def __init__(self, path: Path, compression: str | None) -> None:
+    def __init__(self, path: Path, compression: str | None, camera_names: Sequence[str]) -> None:
         from rosbags.rosbag1 import Writer
         from rosbags.typesys import Stores, get_typestore
 
@@ -209,25 +255,25 @@ class Ros1Writer(_RosWriter):
         if compression is not None:
             bag.set_compression(Writer.CompressionFormat[compression.upper()])
         store = get_typestore(Stores.ROS1_NOETIC)
-        super().__init__(bag, store, store.serialize_ros1, {"seq": 0})
+        super().__init__(bag, camera_names, store, store.serialize_ros1, {"seq": 0})
 
 
 class Ros2Writer(_RosWriter):
     """A ROS 2 bag: a folder with ``metadata.yaml`` and sqlite3 storage, messages compressed with ``zstd`` or not."""
 
-    def __init__(self, path: Path, compression: str | None) -> None:
+    def __init__(self, path: Path, compression: str | None, camera_names: Sequence[str]) -> None:
         from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 
         bag = Writer(path, version=9, storage_plugin=StoragePlugin.SQLITE3)
         if compression is not None:
             bag.set_compression(CompressionMode.MESSAGE, CompressionFormat[compression.upper()])
-        super().__init__(bag, *_ros2_types())
+        super().__init__(bag, camera_names, *_ros2_types())
 
 
 class McapWriter(_RosWriter):
     """A single MCAP file of ROS 2 messages, chunks compressed with ``zstd`` or not."""
 
-    def __init__(self, path: Path, compression: str | None) -> None:
+    def __init__(self, path: Path, compression: str | None, camera_names: Sequence[str]) -> None:
         from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 
         self._path = path
@@ -236,7 +282,7 @@ class McapWriter(_RosWriter):
         bag = Writer(self._folder, version=9, storage_plugin=StoragePlugin.MCAP)
         if compression is not None:
             bag.set_compression(CompressionMode.STORAGE, CompressionFormat[compression.upper()])
-        super().__init__(bag, *_ros2_types())
+        super().__init__(bag, camera_names, *_ros2_types())
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
@@ -252,3 +298,12 @@ def _ros2_types() -> tuple[Any, Any, dict[str, int]]:
 
     store = get_typestore(Stores.ROS2_HUMBLE)
     return store, store.serialize_cdr, {}
+
+
+def _image_topic(camera_name: str) -> str:
+    return f"/{camera_name}/image_raw"
+
+
+def _row(t_ns: int, values: Sequence[float]) -> str:
+    """A line of comma-separated values; ``repr`` is the shortest text that reads back equal."""
+    return ",".join([str(t_ns), *(repr(float(value)) for value in values)]) + "\n"

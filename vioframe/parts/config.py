@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 import textwrap
 from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import asdict
 from io import StringIO
 from pathlib import Path
 from typing import Any, TypeVar
@@ -19,11 +20,15 @@ from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
 
 from vioframe.errors import ConfigError
+from vioframe.estimation.options import EstimationOptions
 from vioframe.frontend import FrontendOptions
 from vioframe.parts.options import Option, did_you_mean, options_of, validate_options
 from vioframe.parts.registry import BACKEND, DETECTOR, LOOP_CLOSER, Kind, Registry
 
 SectionT = TypeVar("SectionT", bound="Section")
+
+# What is not of one part, but of all that are put in its place.
+OPTION_SECTIONS = {"frontend": FrontendOptions, "estimation": EstimationOptions}
 
 
 class Section(BaseModel):
@@ -55,6 +60,10 @@ class Config(Section):
     backend: PartConfig = PartConfig(name="msckf")
     loop_closure: PartConfig | None = Field(default=None, description="loop closer (name, options); null: none")
     frontend: dict[str, Any] = {}
+    estimation: dict[str, Any] = {}
+    wait_ms: float = Field(
+        default=50.0, ge=0.0, allow_inf_nan=False, description="how long a frame waits for readings that come late"
+    )
     ground_truth: Path | None = Field(default=None, description="trajectory file (TUM, or EuRoC csv) to compare with")
     start_s: float = Field(default=0.0, ge=0.0, allow_inf_nan=False, description="seconds skipped at the start")
     duration_s: float | None = Field(default=None, gt=0.0, allow_inf_nan=False, description="null: run to the end")
@@ -62,6 +71,10 @@ class Config(Section):
     @property
     def frontend_options(self) -> FrontendOptions:
         return FrontendOptions(**validate_options("the front-end", FrontendOptions, self.frontend))
+
+    @property
+    def estimation_options(self) -> EstimationOptions:
+        return EstimationOptions(**validate_options("the estimation", EstimationOptions, self.estimation))
 
 
 def read(path: str | Path) -> Config:
@@ -121,7 +134,7 @@ def override(config: Config, registry: Registry, assignments: Iterable[str]) -> 
     options = _options_by_section(config, registry)
     tree = config.model_dump()
     for section, name, value in parse_assignments(assignments, options):
-        values = tree[section] if section == "frontend" else tree[section]["options"]
+        values = tree[section] if section in OPTION_SECTIONS else tree[section]["options"]
         values[name] = value
     return parse(tree)
 
@@ -166,14 +179,14 @@ def complete(config: Config, registry: Registry) -> Config:
             name=config.backend.name,
             options=registry.find(BACKEND, config.backend.name).validate(config.backend.options),
         ),
-        "frontend": validate_options("the front-end", FrontendOptions, config.frontend),
+        "frontend": asdict(config.frontend_options),
+        "estimation": asdict(config.estimation_options),
     }
     if config.loop_closure is not None:
         parts["loop_closure"] = PartConfig(
             name=config.loop_closure.name,
             options=registry.find(LOOP_CLOSER, config.loop_closure.name).validate(config.loop_closure.options),
         )
-    FrontendOptions(**parts["frontend"])  # raises on a value out of range
     if config.dataset.path is not None:
         reader = registry.find_reader(config.dataset.path, config.dataset.reader)
         parts["dataset"] = DatasetConfig(
@@ -200,8 +213,9 @@ def render(config: Config, registry: Registry) -> str:
             continue
         lines += [f"{section}:", *_entry("name", part.name, "", 1)]
         lines += _options("options", part.options, options[section], 1)
-    lines += _options("frontend", config.frontend, options["frontend"], 0)
-    for name in ("ground_truth", "start_s", "duration_s"):
+    for section in OPTION_SECTIONS:
+        lines += _options(section, getattr(config, section), options[section], 0)
+    for name in ("wait_ms", "ground_truth", "start_s", "duration_s"):
         lines += _entry(name, getattr(config, name), Config.model_fields[name].description or "", 0)
     return "\n".join(lines) + "\n"
 
@@ -210,7 +224,7 @@ def _options_by_section(config: Config, registry: Registry) -> dict[str, list[Op
     sections = {
         "detector": registry.find(DETECTOR, config.detector.name).options,
         "backend": registry.find(BACKEND, config.backend.name).options,
-        "frontend": options_of(FrontendOptions),
+        **{section: options_of(factory) for section, factory in OPTION_SECTIONS.items()},
     }
     if config.loop_closure is not None:
         sections["loop_closure"] = registry.find(LOOP_CLOSER, config.loop_closure.name).options

@@ -31,7 +31,7 @@ def vioframe_detectors() -> Mapping[str, DetectorFactory]:  # type: ignore[empty
 
 @hookspec
 def vioframe_backends() -> Mapping[str, BackendFactory]:  # type: ignore[empty-body]
-    """Map names to factories: ``factory(calibration, **options) -> Backend``."""
+    """Map names to factories: ``factory(**options) -> Backend``."""
 
 
 @hookspec

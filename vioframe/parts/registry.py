@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import inspect
 import logging
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import astuple, dataclass, field
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
@@ -43,7 +44,7 @@ class Kind:
 
 
 DETECTOR = Kind("detector", "vioframe_detectors", Detector, 0)
-BACKEND = Kind("backend", "vioframe_backends", Backend, 1)
+BACKEND = Kind("backend", "vioframe_backends", Backend, 0)
 LOOP_CLOSER = Kind("loop closer", "vioframe_loop_closers", LoopCloser, 1)
 DATASET = Kind("dataset", "vioframe_datasets", Dataset, 1)
 FLIGHT = Kind("flight", "vioframe_flights", Flight, 2)
@@ -137,8 +138,8 @@ class Registry:
     def create_detector(self, name: str, options: Mapping[str, Any] | None = None) -> Detector:
         return cast(Detector, self.find(DETECTOR, name).create(options=options or {}))
 
-    def create_backend(self, name: str, calibration: Calibration, options: Mapping[str, Any] | None = None) -> Backend:
-        return cast(Backend, self.find(BACKEND, name).create(calibration, options=options or {}))
+    def create_backend(self, name: str, options: Mapping[str, Any] | None = None) -> Backend:
+        return cast(Backend, self.find(BACKEND, name).create(options=options or {}))
 
     def create_loop_closer(
         self, name: str, calibration: Calibration, options: Mapping[str, Any] | None = None
@@ -190,6 +191,21 @@ class Registry:
             culprit = next((s for m, s in modules.items() if name == m or name.startswith(f"{m}.")), culprit)
             trace = trace.tb_next
         return culprit
+
+    @contextmanager
+    def blaming(self) -> Iterator[None]:
+        """What a plug-in raises within comes out as a :class:`PluginError` that names it."""
+        try:
+            yield
+        except VioframeError:
+            raise
+        except (Exception, SystemExit) as error:
+            if _is_interrupt(error):
+                raise KeyboardInterrupt from error
+            source = self.blame(error.__traceback__)
+            if source is None:
+                raise
+            raise PluginError(f"plug-in {source.entry_point!r} ({source}) failed: {describe(error)}") from error
 
     def _failure_hint(self) -> str:
         if not self.failures:
@@ -263,6 +279,15 @@ def _checked(kind: Kind, name: object, factory: Any) -> Any:
         raise PluginError(f"the reader {name!r} has no accepts(path)")
     inspect.signature(factory)  # raises ValueError for the few callables that have none, hence no options to read
     return factory
+
+
+def _is_interrupt(error: BaseException | None) -> bool:
+    """Whether Ctrl-C is what began it: within compiled code it comes out as a SystemError, or as one behind another."""
+    while error is not None:
+        if isinstance(error, KeyboardInterrupt):
+            return True
+        error = error.__cause__ or error.__context__
+    return False
 
 
 def _source(entry: EntryPoint) -> Source:

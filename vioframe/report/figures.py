@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 
 from vioframe.errors import RunError
 from vioframe.report import plot_cost, plot_errors, plot_paths
-from vioframe.report.evaluated import Evaluated
 from vioframe.report.style import RC
+from vioframe.runs.evaluated import Evaluated
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -58,6 +58,6 @@ def _available(runs: Sequence[Evaluated], band_m: float | None) -> dict[str, _Dr
         drawings["relative_error"] = plot_errors.relative_error
     if any(run.stage_ms() for run in runs):
         drawings["timing"] = plot_cost.timing
-    if any(run.folder and run.folder.track_counts() for run in runs):
+    if any(run.folder and run.folder.tracks() for run in runs):
         drawings["tracks"] = plot_cost.tracks
     return drawings

@@ -10,10 +10,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from vioframe.bench.consistency import PARTS, AverageNees, Outcome
-from vioframe.bench.results import record
+from vioframe.evaluation.consistency import PARTS, AverageNees, Outcome
 from vioframe.types import NS_PER_S
 
 if TYPE_CHECKING:
@@ -70,13 +69,12 @@ def to_rich(outcomes: Sequence[Outcome]) -> Table:
     return table
 
 
-def write_files(outcomes: Sequence[Outcome], settings: Mapping[str, Any], folder: Path) -> None:
-    """Write everything into ``folder``, which exists; :data:`MARKER` comes last, when all the rest is there."""
+def write_files(outcomes: Sequence[Outcome], folder: Path) -> None:
+    """Write all but :data:`MARKER` into ``folder``, which exists."""
     from vioframe.report.plot_montecarlo import write_figures
 
     (folder / "nees.csv").write_text(to_csv(outcomes), encoding="utf-8")
     write_figures(outcomes, folder)
-    record(folder / MARKER, [outcome.to_dict() for outcome in outcomes], settings)
 
 
 def to_csv(outcomes: Sequence[Outcome]) -> str:

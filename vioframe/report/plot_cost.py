@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vioframe.report.evaluated import Evaluated
 from vioframe.report.style import PALETTE_SIZE, caption, colour, legend_above, line
+from vioframe.runs.evaluated import Evaluated
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -59,10 +59,10 @@ def tracks(runs: Sequence[Evaluated]) -> Figure:
     panels: Any = figure.subplots(2, 1, sharex=True)
     handles = []
     for i, run in enumerate(runs):
-        counts = run.folder.track_counts() if run.folder else None
+        counts = run.folder.tracks() if run.folder else None
         if counts is None:
             continue
-        time_s = (counts.t_ns - counts.t_ns[0]) * 1e-9
+        time_s = (counts.frames_ns - counts.frames_ns[0]) * 1e-9
         handles += panels[0].plot(time_s, counts.tracked, **line(i), label=run.name)
         # In the first frame every feature is new, which would hide all that follows.
         panels[1].plot(time_s[1:], counts.new[1:], **{**line(i), "lw": 1.0})

@@ -7,10 +7,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vioframe.evaluation import TrajectoryErrors
-from vioframe.report.evaluated import Evaluated
-from vioframe.report.rows import ALIGNED_BY
+from vioframe.evaluation import ALIGNED_BY, TrajectoryErrors
 from vioframe.report.style import caption, colour, legend_above, line
+from vioframe.runs.evaluated import Evaluated
 from vioframe.types import Float
 
 if TYPE_CHECKING:

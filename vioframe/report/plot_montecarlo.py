@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vioframe.bench.consistency import PARTS, Outcome, Trial
+from vioframe.evaluation.consistency import PARTS, Outcome, Trial
 from vioframe.report.style import RC, caption, colour, legend_above, line
 from vioframe.types import NS_PER_S
 

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vioframe.report.evaluated import Evaluated
-from vioframe.report.rows import ALIGNED_BY
+from vioframe.evaluation import ALIGNED_BY
 from vioframe.report.style import TRUTH, caption, legend_above, line
+from vioframe.runs.evaluated import Evaluated
 from vioframe.types import Float
 
 if TYPE_CHECKING:

@@ -11,11 +11,13 @@ from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import ValidationError
 
 from vioframe.errors import ConfigError, RunError
 from vioframe.evaluation.landmarks import Landmarks, read_landmarks
 from vioframe.geometry.trajectory import Trajectory
 from vioframe.io.trajectories import load_trajectory
+from vioframe.parts.config import DatasetConfig, read_tree
 from vioframe.types import Calibration, Float, Int
 
 _UPPER = np.triu_indices(6)
@@ -45,12 +47,44 @@ class Timings:
 
 
 @dataclass(frozen=True)
-class TrackCounts:
-    """How many features were tracked in each frame, (N,), and how many of them were seen for the first time."""
+class States:
+    """What belongs to the N tracked poses: velocity m/s and biases (N, 3), rad/s and m/s^2.
+
+    ``sigma`` (N, 15) are the standard deviations of the error state [dtheta dp dv dbg dba], NaN where not known.
+    """
 
     t_ns: Int
-    tracked: Int
-    new: Int
+    v_WB: Float
+    bias_gyro_B: Float
+    bias_accel_B: Float
+    sigma: Float
+
+
+@dataclass(frozen=True)
+class Tracks:
+    """Every feature observation of the frames ``frames_ns`` (N,): ``ids`` (M,) and ``xy`` (M, 2) px at ``t_ns`` (M,)."""
+
+    frames_ns: Int
+    t_ns: Int
+    ids: Int
+    xy: Float
+
+    @property
+    def tracked(self) -> Int:
+        """(N,) how many features each frame holds; a frame without any has no row, but it has its timings."""
+        return _count(self.t_ns, self.frames_ns)
+
+    @property
+    def is_new(self) -> NDArray[np.bool_]:
+        """(M,) whether it is the first observation of its feature."""
+        out = np.zeros(len(self.ids), dtype=bool)
+        out[np.unique(self.ids, return_index=True)[1]] = True
+        return out
+
+    @property
+    def new(self) -> Int:
+        """(N,) how many features were seen for the first time in each frame."""
+        return _count(self.t_ns[self.is_new], self.frames_ns)
 
 
 @dataclass(frozen=True)
@@ -100,15 +134,12 @@ class RunFolder:
         path = self.path / "ground_truth.tum"
         return load_trajectory(path) if path.is_file() else None
 
-    def recording(self) -> Path | None:
-        """What the run was made on, which may be gone by now; None where its configuration does not say."""
-        from vioframe.parts.config import read_tree
-
+    def dataset_config(self) -> DatasetConfig:
+        """What the run was made on; its path is None where the run's configuration does not say, and may be gone."""
         try:
-            path = read_tree(self.path / "config.yaml")["dataset"]["path"]
-        except (ConfigError, KeyError, TypeError):
-            return None
-        return Path(path) if isinstance(path, str) else None
+            return DatasetConfig.model_validate(read_tree(self.path / "config.yaml").get("dataset", {}))
+        except (ConfigError, ValidationError):
+            return DatasetConfig()
 
     def calibration(self) -> Calibration | None:
         """The calibration that the run was given; None in run folders that were written without it."""
@@ -129,16 +160,22 @@ class RunFolder:
             return None
         return Timings(table["t_ns"], {stage: table[stage] for stage in table.dtype.names or () if stage != "t_ns"})
 
-    def track_counts(self) -> TrackCounts | None:
+    def tracks(self) -> Tracks | None:
         """None where no frame was recorded."""
         table, timings = self._table("tracks.csv"), self.timings()
         if table is None or timings is None:
             return None
-        # A frame without any feature has no row among the tracks, but it has its timings.
-        first = np.unique(table["id"], return_index=True)[1]
-        return TrackCounts(
-            timings.t_ns, _count(table["t_ns"], timings.t_ns), _count(table["t_ns"][first], timings.t_ns)
-        )
+        table = table[np.isin(table["t_ns"], timings.t_ns)]  # the last frame of an interrupted run may lack its times
+        return Tracks(timings.t_ns, table["t_ns"], table["id"], np.column_stack([table["x_px"], table["y_px"]]))
+
+    def states(self) -> States | None:
+        """None where no pose was recorded."""
+        table = self._table("states.csv")
+        if table is None:
+            return None
+        v_WB, gyro, accel = (np.column_stack([table[f"{n}_{a}"] for a in "xyz"]) for n in ("v", "bg", "ba"))
+        sigma = np.sqrt(np.column_stack([table[f"cov_{i}"] for i in range(15)]))
+        return States(table["t_ns"], v_WB, gyro, accel, sigma)
 
     def _pose_covariance(self, t_ns: Int) -> Float | None:
         """(N, 6, 6), NaN where a pose has none; None where no pose has one."""
@@ -159,7 +196,9 @@ class RunFolder:
         if len(lines) < 2:
             return None
         columns = lines[0].strip().split(",")
-        dtype = np.dtype([(column, np.int64 if column in ("t_ns", "id") else np.float64) for column in columns])
+        dtype = np.dtype(
+            [(column, np.int64 if column in ("t_ns", "id", "camera") else np.float64) for column in columns]
+        )
         try:
             return np.loadtxt(StringIO("".join(lines[1:])), dtype=dtype, delimiter=",", ndmin=1)
         except ValueError as error:

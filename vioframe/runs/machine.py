@@ -10,14 +10,12 @@ from importlib.metadata import distribution, requires, version
 from pathlib import Path
 from typing import Any
 
-import vioframe
-
 
 def describe() -> dict[str, Any]:
     """Facts about this machine and installation, as plain values for ``machine.json``."""
     return {
-        "vioframe": vioframe.__version__,
-        "commit": commit(Path(vioframe.__file__).parent),
+        "vioframe": version("vioframe"),
+        "commit": commit(Path(__file__).parent),
         "python": platform.python_version(),
         "versions": versions(),
         "platform": platform.platform(),

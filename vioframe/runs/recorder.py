@@ -5,10 +5,12 @@
     pose_cov.csv     pose covariance, upper triangle               summary.json     how the run went
     tracks.csv       every feature observation                     ground_truth.tum where there is one
     timings.csv      seconds, a column a stage                     map.ply          landmarks, written at the end
-    calibration/     as it was given, in EuRoC's format
+    calibration.csv  what the back-end has learned of the rig, a row a camera and frame
+    calibration/     as it was given, and calibration_learned/ as it was in the end, in EuRoC's format: --calibration
     trajectory_loop.tum, loops.csv  poses corrected by loop closure, and the loops, where a run has it
 
 Each frame is flushed as it comes, so an interrupted run leaves what it had, with ``finished: false`` in its summary.
+Nothing but the map is kept until the end, so that an hour takes no more memory than a minute.
 All but the timings, the machine and the summary's clock-dependent figures are the same byte for byte in every run.
 """
 
@@ -18,7 +20,7 @@ import json
 import shutil
 from collections import Counter
 from collections.abc import Mapping
-from itertools import count, pairwise
+from itertools import count
 from pathlib import Path
 from time import perf_counter
 from types import TracebackType
@@ -26,10 +28,12 @@ from typing import Any, Self, TextIO
 
 import numpy as np
 
-from vioframe.errors import PluginError, RunError
+from vioframe.errors import RunError
+from vioframe.geometry import so3
 from vioframe.incidents import Incidents
+from vioframe.io.calibration import write_calibration
 from vioframe.io.trajectories import tum_line, write_tum
-from vioframe.types import NS_PER_S, Float, LoopClosure, NavState, Status, Step
+from vioframe.types import NS_PER_S, Calibration, CalibrationEstimate, Float, LoopClosure, NavState, Status, Step
 
 STATE_COLUMNS = (
     "t_ns",
@@ -37,8 +41,17 @@ STATE_COLUMNS = (
     *(f"cov_{i}" for i in range(15)),
 )
 POSE_COV_COLUMNS = ("t_ns", *(f"c{i}{j}" for i in range(6) for j in range(i, 6)))
+CALIBRATION_COLUMNS = (
+    *("t_ns", "camera", "qx", "qy", "qz", "qw", "px", "py", "pz", "time_offset_s"),
+    *("fx", "fy", "cx", "cy", "d1", "d2", "d3", "d4"),
+    *(f"sigma_{name}" for name in ("rx", "ry", "rz", "px", "py", "pz", "time_offset_s")),
+    *(f"sigma_{name}" for name in ("fx", "fy", "cx", "cy", "d1", "d2", "d3", "d4")),
+)
+"""Of ``calibration.csv``: the camera by its place in the rig, its pose on the body (R_BC as a quaternion, p_BC m), time offset, intrinsics, and
+their standard deviations (rad, m, s, px); zero is what is not estimated."""
 LOOP_COLUMNS = ("earlier_t_ns", "later_t_ns", "x_m", "y_m", "z_m", "yaw_rad", "inliers", "accepted")
 _UPPER = np.triu_indices(6)
+_EVENTS_KEPT_PER_KIND = 20
 
 
 def check_run_folder(path: Path, *, overwrite: bool = False, marker: str = "summary.json") -> None:
@@ -87,16 +100,19 @@ class Recorder:
         self._append("trajectory.tum", "# timestamp tx ty tz qx qy qz qw\n")
         self._append("states.csv", ",".join(STATE_COLUMNS) + "\n")
         self._append("pose_cov.csv", ",".join(POSE_COV_COLUMNS) + "\n")
-        self._append("tracks.csv", "t_ns,id,x_px,y_px\n")
+        self._append("tracks.csv", "t_ns,id,camera,x_px,y_px\n")
         self._stages: list[str] = []
-        self._timings: list[tuple[int, Mapping[str, float]]] = []
         self._landmarks: dict[int, Float] = {}
-        self._statuses: list[Status] = []
         self._segments: list[dict[str, int]] = []
         self._events: list[dict[str, Any]] = []
+        self._event_counts: Counter[str] = Counter()
         self._stage_totals: Counter[str] = Counter()
         self._frame_seconds = 0.0
-        self._points = 0
+        self._points = self._frames = self._tracked = self._resets = 0
+        self._first_t_ns = self._last_t_ns = 0
+        self._begun: tuple[int, int] | None = None
+        self._tracking = False
+        self._calibration: Calibration | None = None
 
     def __enter__(self) -> Self:
         return self
@@ -107,9 +123,12 @@ class Recorder:
         for file in self._files.values():
             file.close()
         write_ply(self.folder / "map.ply", self._landmarks)
+        if self._calibration is not None:
+            write_calibration(self._calibration, self.folder / "calibration_learned")
         self.summary |= {
             **self._figures(),
             "events": self._events,
+            "event_counts": dict(self._event_counts),
             "incidents": dict(sorted(self._incidents.counts.items())),
             "incident_notes": self._incidents.notes,
         }
@@ -119,25 +138,36 @@ class Recorder:
         self._write_summary()
 
     def add(self, step: Step) -> None:
-        """Write one frame; raises :class:`PluginError` where the back-end's state is not finite."""
-        t_ns, estimate = step.frame.t_ns, step.estimate
-        observations = zip(step.tracks.ids, step.tracks.xy.tolist(), strict=True)
-        self._append("tracks.csv", "".join(f"{t_ns},{i},{x:.3f},{y:.3f}\n" for i, (x, y) in observations))
-        self._points += len(step.tracks.ids)
+        """Write one frame."""
+        t_ns, tracks, estimate = step.frames.t_ns, step.tracks, step.estimate
+        observations = zip(tracks.ids.tolist(), tracks.camera.tolist(), tracks.xy.tolist(), strict=True)
+        self._append("tracks.csv", "".join(f"{t_ns},{i},{c},{x:.3f},{y:.3f}\n" for i, c, (x, y) in observations))
+        self._points += len(tracks.ids)
         self._add_timings(t_ns, step.stage_seconds)
-        self._frame_seconds += sum(seconds for stage, seconds in step.stage_seconds.items() if "." not in stage)
-        self._events += [{"t_ns": t_ns, "event": event} for event in estimate.events]
-        tracked_before = bool(self._statuses) and self._statuses[-1] is Status.TRACKING
-        if tracked_before and estimate.status is not Status.TRACKING:
+        for event in estimate.events:
+            self._add_event(t_ns, event)
+        if self._frames == 0:
+            self._first_t_ns = t_ns
+        self._last_t_ns = t_ns
+        tracking = estimate.status is Status.TRACKING and estimate.state is not None
+        if self._tracking and not tracking:
+            self._resets += 1
             self._landmarks.clear()  # a new start is a new world: old landmarks do not belong to it
-        self._statuses.append(estimate.status)
-        if estimate.status is Status.TRACKING and estimate.state is not None:
-            if not (tracked_before and self._segments):
+        if tracking:
+            assert estimate.state is not None
+            if self._begun is None:
+                self._begun = self._frames, t_ns
+            if not self._tracking:
                 self._segments.append({"first_t_ns": t_ns, "last_t_ns": t_ns, "poses": 0})
+            self._tracked += 1
             self._segments[-1]["last_t_ns"] = t_ns
             self._segments[-1]["poses"] += 1
             self._add_state(t_ns, estimate.state)
             self._landmarks.update(zip(estimate.landmark_ids.tolist(), estimate.p_WF, strict=True))
+            if estimate.calibration is not None:
+                self._add_calibration(t_ns, estimate.calibration)
+        self._tracking = tracking
+        self._frames += 1
 
     def add_loop_closure(self, result: LoopClosure) -> None:
         """Write what a loop closer made of the run."""
@@ -156,32 +186,60 @@ class Recorder:
             "seconds_beside": dict(result.stage_seconds),
         }
 
+    def _add_event(self, t_ns: int, event: str) -> None:
+        """Count an event by its kind, what stands before its colon; the first of a kind are kept, and its last."""
+        kind = event.partition(":")[0]
+        self._event_counts[kind] += 1
+        if self._event_counts[kind] > _EVENTS_KEPT_PER_KIND:
+            self._events = [e for e in self._events if e.get("last_of") != kind]
+            self._events.append({"t_ns": t_ns, "event": event, "last_of": kind})
+        else:
+            self._events.append({"t_ns": t_ns, "event": event})
+
     def _add_state(self, t_ns: int, state: NavState) -> None:
         cov = np.full((15, 15), np.nan) if state.cov is None else state.cov
         values = np.concatenate([state.v_WB, state.bias_gyro_B, state.bias_accel_B])
-        if not all(np.isfinite(array).all() for array in (state.R_WB, state.p_WB, values)):
-            raise PluginError(f"the back-end's state at {t_ns} ns is not finite")
         self._append("trajectory.tum", tum_line(t_ns, state.R_WB, state.p_WB))
         self._append("states.csv", _csv_line(t_ns, np.concatenate([values, np.diag(cov)])))
         self._append("pose_cov.csv", _csv_line(t_ns, cov[:6, :6][_UPPER]))
 
+    def _add_calibration(self, t_ns: int, learned: CalibrationEstimate) -> None:
+        if self._calibration is None:
+            self._append("calibration.csv", ",".join(CALIBRATION_COLUMNS) + "\n")
+        self._calibration = learned.calibration
+        for place, (camera, sigma) in enumerate(zip(learned.calibration.cameras, learned.sigma, strict=True)):
+            model = camera.model
+            values = np.concatenate(
+                [
+                    so3.to_quat_xyzw(camera.R_BC),
+                    camera.p_BC,
+                    [camera.time_offset_ns / NS_PER_S, model.fx, model.fy, model.cx, model.cy, *model.distortion],
+                    sigma.rotation,
+                    sigma.position,
+                    [sigma.time_offset_s],
+                    sigma.intrinsics,
+                ]
+            )
+            self._append("calibration.csv", f"{t_ns},{place}," + _csv_values(values))
+
     def _add_timings(self, t_ns: int, stage_seconds: Mapping[str, float]) -> None:
-        self._timings.append((t_ns, stage_seconds))
         self._stage_totals.update(stage_seconds)
+        self._frame_seconds += sum(seconds for stage, seconds in stage_seconds.items() if "." not in stage)
         new = [stage for stage in stage_seconds if stage not in self._stages]
         if new:
-            # A stage seen for the first time is a new column for every row: the file starts anew.
-            self._stages += new
-            if file := self._files.pop("timings.csv", None):
-                file.close()
-            self._append("timings.csv", ",".join(["t_ns", *self._stages]) + "\n")
-            rows = self._timings
-        else:
-            rows = self._timings[-1:]
-        self._append("timings.csv", "".join(self._timing_line(*row) for row in rows))
+            self._widen_timings(new)
+        row = [str(t_ns), *(f"{stage_seconds.get(stage, 0.0):.6f}" for stage in self._stages)]
+        self._append("timings.csv", ",".join(row) + "\n")
 
-    def _timing_line(self, t_ns: int, stage_seconds: Mapping[str, float]) -> str:
-        return ",".join([str(t_ns), *(f"{stage_seconds.get(stage, 0.0):.6f}" for stage in self._stages)]) + "\n"
+    def _widen_timings(self, new: list[str]) -> None:
+        """A stage seen for the first time is a new column for every row: the file starts anew."""
+        self._stages += new
+        rows: list[str] = []
+        if file := self._files.pop("timings.csv", None):
+            file.close()
+            rows = (self.folder / "timings.csv").read_text(encoding="utf-8").splitlines()[1:]
+        self._append("timings.csv", ",".join(["t_ns", *self._stages]) + "\n")
+        self._append("timings.csv", "".join(row + ",0.000000" * len(new) + "\n" for row in rows))
 
     def _append(self, name: str, text: str) -> None:
         file = self._files.get(name)
@@ -191,27 +249,25 @@ class Recorder:
         file.flush()
 
     def _figures(self) -> dict[str, Any]:
-        frames = len(self._statuses)
+        frames = self._frames
         if frames == 0:
             return {"frames": 0}
-        stamps = [t_ns for t_ns, _ in self._timings]
-        tracking = [status is Status.TRACKING for status in self._statuses]
         wall_s = perf_counter() - self._begin_s
-        begin = tracking.index(True) if any(tracking) else None
+        skipped, begun_ns = self._begun or (frames, None)
         return {
             "frames": frames,
-            "first_frame_t_ns": stamps[0],
-            "last_frame_t_ns": stamps[-1],
-            "initialised_t_ns": None if begin is None else stamps[begin],
-            "initialised_after_s": None if begin is None else (stamps[begin] - stamps[0]) / NS_PER_S,
-            "completion": 0.0 if begin is None else sum(tracking[begin:]) / (frames - begin),
-            "resets": sum(before and not now for before, now in pairwise(tracking)),
+            "first_frame_t_ns": self._first_t_ns,
+            "last_frame_t_ns": self._last_t_ns,
+            "initialised_t_ns": begun_ns,
+            "initialised_after_s": None if begun_ns is None else (begun_ns - self._first_t_ns) / NS_PER_S,
+            "completion": 0.0 if begun_ns is None else self._tracked / (frames - skipped),
+            "resets": self._resets,
             "segments": self._segments,
             "tracked_points_mean": self._points / frames,
             "mean_ms": {stage: 1e3 * self._stage_totals[stage] / frames for stage in self._stages},
             "mean_frame_ms": 1e3 * self._frame_seconds / frames,
             "wall_s": wall_s,
-            "real_time_factor": (stamps[-1] - stamps[0]) / NS_PER_S / wall_s,
+            "real_time_factor": (self._last_t_ns - self._first_t_ns) / NS_PER_S / wall_s,
         }
 
     def _write_summary(self) -> None:
@@ -241,4 +297,8 @@ def write_ply(path: Path, landmarks: Mapping[int, Float]) -> None:
 
 
 def _csv_line(t_ns: int, values: Float) -> str:
-    return f"{t_ns}," + ",".join(f"{value:.9g}" for value in values) + "\n"
+    return f"{t_ns}," + _csv_values(values)
+
+
+def _csv_values(values: Float) -> str:
+    return ",".join(f"{value:.9g}" for value in values) + "\n"

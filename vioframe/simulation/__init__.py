@@ -1,13 +1,25 @@
-"""Track sequences whose truth is known: simulated landmarks along real or exactly known motion."""
+"""Flights, worlds and sensors whose truth is known: rendered recordings of a rig, and feature tracks without images."""
 
-from vioframe.simulation.real_motion import REAL_MOTION_SEQUENCES, real_motion_sequence
-from vioframe.simulation.sequence import Packet, TrackSequence
-from vioframe.simulation.synthetic import simulated_sequence
+from vioframe.simulation.tracks import (
+    REAL_MOTION_SEQUENCES,
+    Packet,
+    TrackOptions,
+    TrackSequence,
+    TrackSimulator,
+    cut_segments,
+    real_motion_sequence,
+    simulated_sequence,
+    simulated_stream,
+)
 
 __all__ = [
     "REAL_MOTION_SEQUENCES",
     "Packet",
+    "TrackOptions",
     "TrackSequence",
+    "TrackSimulator",
+    "cut_segments",
     "real_motion_sequence",
     "simulated_sequence",
+    "simulated_stream",
 ]

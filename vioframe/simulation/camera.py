@@ -1,4 +1,4 @@
-"""A simulated camera at work: light gathered through an exposure, then amplified, read out with noise and digitised."""
+"""Simulated cameras at work: light gathered through an exposure, then amplified, read out with noise and digitised."""
 
 from __future__ import annotations
 
@@ -14,26 +14,29 @@ from threading import Thread
 
 import numpy as np
 
+from vioframe.arrays import Float, Image
 from vioframe.errors import DatasetError
 from vioframe.geometry.cameras import Camera
 from vioframe.interfaces import World
-from vioframe.simulation.movers import Movers
-from vioframe.simulation.renderer import Renderer
-from vioframe.simulation.sensor import digitise
-from vioframe.simulation.shading import Float32
-from vioframe.types import Float, Image
+from vioframe.simulation.renderer import Float32, Renderer
+from vioframe.simulation.world import Movers
 
 _MIDDLE_GREY = 0.4
+# Electrons of a white pixel at a gain of one: their shot noise is what low light is noisy by.
+_FULL_WELL = 10_000.0
+_READ_NOISE = 0.002
+_WHITE = 255.0
 
 
 @dataclass(frozen=True)
 class Shot:
-    """One picture to take: the camera's poses at S instants of the exposure, and how it is exposed.
+    """One picture to take, with a camera of the studio: its poses at S instants of the exposure, and how it is exposed.
 
     ``R_WC`` (S, 3, 3) and ``p_WC`` (S, 3) m; with a rolling shutter (S, height, 3, 3) and (S, height, 3). ``p_WM``
     (S, M, 3) m is where the movers are, or None. ``gain`` is that of the whole exposure; ``seed`` that of its noise.
     """
 
+    camera: int
     R_WC: Float
     p_WC: Float
     p_WM: Float | None
@@ -43,13 +46,13 @@ class Shot:
 
 @dataclass(frozen=True)
 class Studio:
-    """All that is the same for every picture: world, optics and sensor. Small enough to be sent to other processes.
+    """All that is the same for every picture: world, optics and sensors. Small enough to be sent to other processes.
 
     ``light`` is the part of full light there is, which the gain makes up for; ``noise_deviation`` is added to that of
     the sensor itself, 1 is white; ``dynamic_range`` is the exponent of light around middle grey.
     """
 
-    camera: Camera
+    cameras: tuple[Camera, ...]
     world: World
     movers: Movers | None = None
     contrast: float = 1.0
@@ -59,32 +62,49 @@ class Studio:
     dynamic_range: float = 1.0
 
 
-class SimulatedCamera:
+class Photographer:
     """Takes the pictures of a studio, the same ones for the same shots."""
 
     def __init__(self, studio: Studio) -> None:
         self._studio = studio
-        self._renderer = Renderer(
-            studio.camera, studio.world, studio.movers, contrast=studio.contrast, fog_per_m=studio.fog_per_m
-        )
+        self._renderers = [
+            Renderer(camera, studio.world, studio.movers, contrast=studio.contrast, fog_per_m=studio.fog_per_m)
+            for camera in studio.cameras
+        ]
 
     def take(self, shot: Shot) -> Image:
         """(height, width) uint8."""
+        studio, renderer = self._studio, self._renderers[shot.camera]
         movers = [None] * len(shot.p_WC) if shot.p_WM is None else shot.p_WM
-        instants = zip(shot.R_WC, shot.p_WC, movers, strict=True)
-        return self._digitise(np.mean([self._renderer.render(*instant) for instant in instants], axis=0), shot)
-
-    def _digitise(self, light: Float32, shot: Shot) -> Image:
-        studio = self._studio
+        light = np.mean([renderer.render(*at) for at in zip(shot.R_WC, shot.p_WC, movers, strict=True)], axis=0)
         if studio.dynamic_range != 1.0:
             light = _MIDDLE_GREY * (light / _MIDDLE_GREY) ** studio.dynamic_range
-        return digitise(
-            light,
-            np.random.default_rng(shot.seed),
-            gain=shot.gain,
-            exposed=studio.light,
-            noise_deviation=studio.noise_deviation,
-        )
+        rng = np.random.default_rng(shot.seed)
+        return digitise(light, rng, gain=shot.gain, exposed=studio.light, noise_deviation=studio.noise_deviation)
+
+
+def digitise(
+    light: Float32,
+    rng: np.random.Generator,
+    *,
+    gain: float = 1.0,
+    exposed: float = 1.0,
+    noise_deviation: float = 0.0,
+) -> Image:
+    """What a sensor makes of ``light`` (H, W), 1 for white, times ``gain``: (H, W) uint8.
+
+    ``exposed`` is the part of full light there is, which an amplifier makes up for; ``noise_deviation`` is added to
+    that of the sensor itself, 1 is white. In full light and without it there is no noise, and ``rng`` is left alone.
+    """
+    value = light * gain
+    if exposed < 1.0 or noise_deviation > 0.0:
+        # Shot noise is that of the electrons gathered; the gain amplifies it and the read-out noise alike.
+        amplification = gain / exposed
+        shot_variance = np.maximum(light, 0.0) * exposed / _FULL_WELL
+        deviation = np.sqrt(amplification**2 * (shot_variance + _READ_NOISE**2) + noise_deviation**2)
+        value = value + deviation * rng.standard_normal(light.shape, dtype=np.float32)
+    image: Image = np.clip(np.round(_WHITE * value), 0.0, _WHITE).astype(np.uint8)
+    return image
 
 
 def take_pictures(studio: Studio, shots: Iterable[Shot], workers: int) -> Iterator[Image]:
@@ -93,7 +113,7 @@ def take_pictures(studio: Studio, shots: Iterable[Shot], workers: int) -> Iterat
     Raises :class:`DatasetError` where a process ends before its time.
     """
     if workers == 1:
-        yield from map(SimulatedCamera(studio).take, shots)
+        yield from map(Photographer(studio).take, shots)
         return
     # Spawned, not forked: threads of BLAS and Open3D do not survive a fork.
     pool = ProcessPoolExecutor(workers, get_context("spawn"), _open_studio, (studio,))
@@ -112,16 +132,16 @@ def take_pictures(studio: Studio, shots: Iterable[Shot], workers: int) -> Iterat
         pool.shutdown(wait=True, cancel_futures=True)
 
 
-_camera: SimulatedCamera | None = None
+_photographer: Photographer | None = None
 """That of a worker process: what it renders with is built once, not for every shot."""
 
 
 def _open_studio(studio: Studio) -> None:
-    global _camera
+    global _photographer
     # Ctrl-C goes to the whole group of processes; the one that waits for these ends them.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     Thread(target=_end_with_parent, daemon=True).start()
-    _camera = SimulatedCamera(studio)
+    _photographer = Photographer(studio)
 
 
 def _end_with_parent() -> None:
@@ -133,5 +153,5 @@ def _end_with_parent() -> None:
 
 
 def _take(shot: Shot) -> Image:
-    assert _camera is not None
-    return _camera.take(shot)
+    assert _photographer is not None
+    return _photographer.take(shot)

@@ -1,4 +1,8 @@
-"""What is to be simulated: YAML in, a frozen and validated :class:`SimulationConfig` out."""
+"""What is to be simulated: YAML in, a frozen and validated :class:`SimulationConfig` out.
+
+A recording comes with the folder of what it was made of: ``flight.bag.simulation`` beside ``flight.bag``, or
+``simulation`` in an ASL folder.
+"""
 
 from __future__ import annotations
 
@@ -8,11 +12,14 @@ from typing import Annotated, Any, Self
 
 from pydantic import Field, model_validator
 
-from vioframe.parts.config import PartConfig, Section, parse_assignments, read_tree, to_yaml, validate
-from vioframe.parts.options import Option, options_of, validate_options
-from vioframe.parts.registry import FLIGHT, WORLD, Registry
+from vioframe.parts.config import PartConfig, Section, parse_assignments, read_tree, validate
+from vioframe.parts.options import options_of, validate_options
+from vioframe.parts.registry import FLIGHT, WORLD, Kind, Registry
 from vioframe.simulation.conditions import Conditions
 from vioframe.simulation.imu import ImuErrors
+
+MANIFEST, TRUTH, MESH = "manifest.yaml", "ground_truth.csv", "world.ply"
+"""Files of a simulation's folder: all settings, the exact states in EuRoC's format, and the mesh of the world in W."""
 
 
 class SimulationConfig(Section):
@@ -55,8 +62,11 @@ def read(path: Path) -> SimulationConfig:
 
 def override(config: SimulationConfig, registry: Registry, assignments: Iterable[str]) -> SimulationConfig:
     """``config`` with options of the flight, the world or the IMU set from ``key=value`` texts."""
+    options = {"world": registry.find(WORLD, config.world.name).options, "imu": options_of(ImuErrors)}
+    if config.trajectory is None and config.recorded is None:
+        options["flight"] = registry.find(FLIGHT, config.flight.name).options
     tree = config.model_dump()
-    for section, name, value in parse_assignments(assignments, _options_by_section(config, registry)):
+    for section, name, value in parse_assignments(assignments, options):
         values = tree["imu"] if section == "imu" else tree[section]["options"]
         values[name] = value
     return validate(SimulationConfig, tree, "command line")
@@ -64,31 +74,27 @@ def override(config: SimulationConfig, registry: Registry, assignments: Iterable
 
 def complete(config: SimulationConfig, registry: Registry) -> SimulationConfig:
     """``config`` with every option checked, coerced and its default filled in, and paths made absolute."""
+
+    def completed(part: PartConfig, kind: Kind) -> PartConfig:
+        return PartConfig(name=part.name, options=registry.find(kind, part.name).validate(part.options))
+
     Conditions.of(config.conditions)
-    parts: dict[str, Any] = {}
+    parts: dict[str, Any] = {
+        "world": completed(config.world, WORLD),
+        "trajectory": config.trajectory and config.trajectory.absolute(),
+        "recorded": config.recorded and config.recorded.absolute(),
+        "calibration": tuple(path.absolute() for path in config.calibration),
+    }
     if config.recorded is None:
         parts["imu"] = validate_options("the IMU", ImuErrors, config.imu)
-    if config.recorded is None and config.trajectory is None:
-        parts["flight"] = _completed(config.flight, registry, FLIGHT)
-    parts["world"] = _completed(config.world, registry, WORLD)
-    for name in ("trajectory", "recorded"):
-        path: Path | None = getattr(config, name)
-        parts[name] = path if path is None else path.absolute()
-    parts["calibration"] = tuple(path.absolute() for path in config.calibration)
+        if config.trajectory is None:
+            parts["flight"] = completed(config.flight, FLIGHT)
     return config.model_copy(update=parts)
 
 
-def render(config: SimulationConfig) -> str:
-    """``config`` as YAML; :func:`read` returns the same configuration."""
-    return to_yaml(config)
-
-
-def _completed(part: PartConfig, registry: Registry, kind: Any) -> PartConfig:
-    return PartConfig(name=part.name, options=registry.find(kind, part.name).validate(part.options))
-
-
-def _options_by_section(config: SimulationConfig, registry: Registry) -> dict[str, list[Option]]:
-    sections = {"world": registry.find(WORLD, config.world.name).options, "imu": options_of(ImuErrors)}
-    if config.trajectory is None and config.recorded is None:
-        sections["flight"] = registry.find(FLIGHT, config.flight.name).options
-    return sections
+def simulation_folder(recording: Path) -> Path:
+    """Where a simulated recording keeps what it was made of, whether there is one or not."""
+    recording = recording.absolute()
+    if (recording / "mav0").is_dir():
+        return recording / "simulation"
+    return recording.with_name(f"{recording.name}.simulation")

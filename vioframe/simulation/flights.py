@@ -1,27 +1,41 @@
 """Flights known exactly: pose, velocity, acceleration and angular rate as functions of time.
 
-A :class:`ShapedFlight` is two B-splines of degree five through time, for position and for yaw, pitch and roll, so that
-accelerations and angular accelerations are smooth. The built-in flights are made of it, and anybody's may be.
+Both kinds are B-splines of degree five, so that accelerations and angular accelerations are smooth: a
+:class:`ShapedFlight` through a position and yaw, pitch and roll that anybody may give as functions of time, of which
+the built-in flights are made; a :class:`RecordedFlight` through the poses of a trajectory.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vioframe.errors import ConfigError
+from vioframe.arrays import Float
+from vioframe.errors import ConfigError, TrajectoryError
+from vioframe.geometry import so3
+from vioframe.geometry.trajectory import Trajectory
 from vioframe.interfaces import Flight
+from vioframe.io.trajectories import load_trajectory
 from vioframe.parts import registry
-from vioframe.types import Float, Motion
+from vioframe.types import NS_PER_S, Motion
 
 if TYPE_CHECKING:
     from scipy.interpolate import BSpline
 
 _DEGREE = 5
+# Of a recorded flight: between knots; poses beyond the piece asked for that still shape it; what is flown and no more.
+_KNOT_INTERVAL_S = 0.1
+_MARGIN_S = 1.0
+_FEWEST_POSES = 12
+_LONGEST_GAP_S = 1.0
+_FASTEST_M_S = 30.0
+_FASTEST_RAD_S = 20.0
+_HARDEST_M_S2 = 150.0
 
 Shape = Callable[[Float], Float]
 """Times (N,) s, also a little before zero, to (N, 3)."""
@@ -103,3 +117,112 @@ def _euler_rates_to_omega(angles: Float, rates: Float) -> Float:
             -np.sin(roll) * d_pitch + np.cos(pitch) * np.cos(roll) * d_yaw,
         ]
     )
+
+
+@dataclass(frozen=True, slots=True)
+class RecordedFlight:
+    """A flight along recorded poses: splines of position (3) m and quaternion xyzw (4) from their time ``begin_s`` on.
+
+    Both are B-splines of degree five, fitted by least squares; a rotation is the quaternion spline, normalised. With
+    ``q`` a curve in R^4 and ``*`` the conjugate, the body turns at ``omega_B = 2 Im(q* dq/dt) / |q|^2``: the part of
+    ``dq/dt`` along ``q`` changes nothing but the norm and drops out, for its product with ``q*`` is real. Where the
+    norm is one, this is the rate of a quaternion as in Solà, "Quaternion kinematics for the error-state Kalman filter"
+    (2017).
+    """
+
+    duration_s: float
+    begin_s: float
+    position: BSpline
+    quat_xyzw: BSpline
+
+    def at(self, t_s: Float) -> Motion:
+        """The motion at times ``t_s`` (N,), 0 to ``duration_s``."""
+        t_s = np.asarray(t_s, dtype=np.float64) + self.begin_s
+        quat, d_quat = self.quat_xyzw(t_s), self.quat_xyzw(t_s, 1)
+        (vector, w), (d_vector, d_w) = (np.split(q, [3], axis=1) for q in (quat, d_quat))
+        imaginary = w * d_vector - d_w * vector - np.cross(vector, d_vector)
+        omega_B = 2.0 * imaginary / (quat**2).sum(axis=1, keepdims=True)
+        p_WB, v_WB, a_WB = (self.position(t_s, order) for order in range(3))
+        return Motion(so3.from_quat_xyzw(quat), p_WB, v_WB, a_WB, omega_B)
+
+
+def flight_from_file(path: str | Path, start_s: float = 0.0, duration_s: float | None = None) -> RecordedFlight:
+    """The flight along the TUM or EuRoC file ``path``, whose poses are the body's in a world with z up.
+
+    ``start_s`` counts from the file's first pose; ``duration_s`` None, or more than there is, is to its last. Motion
+    faster than the knots, 0.1 s apart or two poses where that is more, is smoothed, and so are steps of the recording,
+    which no body could fly. Raises :class:`TrajectoryError`, with the time, for gaps and jumps, and for a motion that
+    comes out beyond what a vehicle can do.
+    """
+    path = Path(path)
+    return fit_flight(load_trajectory(path), start_s, duration_s, name=path.name)
+
+
+def fit_flight(
+    trajectory: Trajectory, start_s: float = 0.0, duration_s: float | None = None, *, name: str = "the trajectory"
+) -> RecordedFlight:
+    """As :func:`flight_from_file`, from poses at hand; errors call them ``name``."""
+    from scipy.interpolate import make_lsq_spline
+
+    if not (0.0 <= start_s < np.inf and (duration_s is None or 0.0 < duration_s < np.inf)):
+        raise ConfigError("a flight begins at start_s >= 0 and lasts for duration_s > 0 seconds")
+    t_s = (trajectory.t_ns - trajectory.t_ns[0]) / NS_PER_S
+    end_s = t_s[-1] if duration_s is None else min(start_s + duration_s, t_s[-1])
+    shaping = (t_s >= start_s - _MARGIN_S) & (t_s <= end_s + _MARGIN_S)
+    if end_s <= start_s or shaping.sum() < _FEWEST_POSES:
+        raise TrajectoryError(
+            f"{name} lasts {t_s[-1]:g} s and has {shaping.sum()} poses for a flight from {start_s:g} s on, which needs "
+            f"{_FEWEST_POSES}; start earlier or give a longer recording"
+        )
+    t_s, poses = t_s[shaping], trajectory.select(shaping)
+    _check_poses(name, t_s, poses)
+    quat = poses.quat_xyzw
+    # q and -q are the same rotation: the signs that make neighbours alike.
+    turned_over = np.einsum("ni,ni->n", quat[1:], quat[:-1]) < 0.0
+    quat = quat * np.where(np.cumsum(np.r_[False, turned_over]) % 2, -1.0, 1.0)[:, None]
+    knots = _knots(t_s)
+    position, quat_xyzw = (make_lsq_spline(t_s, values, knots, _DEGREE) for values in (poses.p_WB, quat))
+    flight = RecordedFlight(float(end_s - start_s), float(start_s), position, quat_xyzw)
+    at_s = np.linspace(0.0, flight.duration_s, int(flight.duration_s / 0.01) + 2)
+    motion = flight.at(at_s)
+    hardest = ((motion.a_WB, _HARDEST_M_S2, "m/s^2"), (motion.omega_B, _FASTEST_RAD_S, "rad/s"))
+    _check_limits(f"{name} asks for", at_s + start_s, hardest, "more than a vehicle can do; smooth the recording")
+    return flight
+
+
+def _knots(t_s: Float) -> Float:
+    """Knots at every second pose or rarer, which keeps the least squares well posed (Schoenberg and Whitney 1953)."""
+    inner: list[float] = []
+    last = t_s[0]
+    for candidate, beyond in zip(t_s[2:-2:2], t_s[3:-1:2], strict=True):
+        # Halfway between two poses, so that none lies on a knot; the tolerance is for stamps that jitter.
+        if candidate - last >= 0.999 * _KNOT_INTERVAL_S:
+            inner.append(0.5 * (candidate + beyond))
+            last = candidate
+    # No last span shorter than the others: so few poses would leave its derivatives to their noise.
+    while inner and t_s[-1] - inner[-1] < _KNOT_INTERVAL_S:
+        inner.pop()
+    return np.concatenate([np.repeat(t_s[0], _DEGREE + 1), inner, np.repeat(t_s[-1], _DEGREE + 1)])
+
+
+def _check_poses(name: str, t_s: Float, poses: Trajectory) -> None:
+    dt = np.diff(t_s)
+    widest = int(np.argmax(dt))
+    if dt[widest] > _LONGEST_GAP_S:
+        raise TrajectoryError(
+            f"{name} has no pose from {t_s[widest]:.3f} s to {t_s[widest + 1]:.3f} s after its first; "
+            "take a piece without that gap (start_s, duration_s)"
+        )
+    velocity = np.diff(poses.p_WB, axis=0) / dt[:, None]
+    rate = so3.log(np.swapaxes(poses.R_WB[:-1], 1, 2) @ poses.R_WB[1:]) / dt[:, None]
+    fastest = ((velocity, _FASTEST_M_S, "m/s"), (rate, _FASTEST_RAD_S, "rad/s"))
+    _check_limits(f"{name} jumps at", t_s, fastest, "a wrong pose; take a piece without the jump (start_s, duration_s)")
+
+
+def _check_limits(what: str, t_s: Float, rates: Sequence[tuple[Float, float, str]], why: str) -> None:
+    """Raise :class:`TrajectoryError` for the largest of the ``rates`` (N, 3) that is beyond its limit."""
+    for rate, limit, unit in rates:
+        size = np.linalg.norm(rate, axis=1)
+        worst = int(np.argmax(size))
+        if not size[worst] <= limit:
+            raise TrajectoryError(f"{what} {size[worst]:.0f} {unit} {t_s[worst]:.3f} s after its first pose, {why}")

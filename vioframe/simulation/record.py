@@ -2,24 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
-from dataclasses import asdict
 from heapq import merge
+from importlib.metadata import version
 from pathlib import Path
-from typing import Any
 
-import vioframe
+from pydantic_core import to_jsonable_python
+
 from vioframe.errors import DatasetError
 from vioframe.io.calibration import write_calibration
 from vioframe.io.convert import FORMATS, appearing, format_of, write_sidecar
 from vioframe.io.writers import RecordingWriter, TruthFile
+from vioframe.parts.config import to_yaml
 from vioframe.runs import machine
-from vioframe.simulation import config as configuration
-from vioframe.simulation.files import MANIFEST, TRUTH, WORLD, simulation_folder
+from vioframe.simulation.config import MANIFEST, MESH, TRUTH, simulation_folder
 from vioframe.simulation.recording import SimulatedRecording
 from vioframe.simulation.world import write_mesh
-from vioframe.types import Calibration, Frame, ImuSample, Measurement, NavState
+from vioframe.types import FrameSet, ImuSample, Measurement
 
 
 def record(
@@ -28,7 +28,7 @@ def record(
     *,
     compression: str | None = None,
     overwrite: bool = False,
-    on_frame: Callable[[Frame], None] = lambda frame: None,
+    on_frame: Callable[[FrameSet], None] = lambda frames: None,
 ) -> None:
     """Write ``recording`` to every destination, whose name tells its format; see :func:`vioframe.io.convert.format_of`.
 
@@ -37,9 +37,15 @@ def record(
     :class:`DatasetError`, also where a destination exists and ``overwrite`` is not set.
     """
     check_destinations(destinations, compression, overwrite=overwrite)
+    names = [camera.name for camera in recording.calibration.cameras]
     with ExitStack() as stack:
         begun = [(path, stack.enter_context(appearing(path, replace=overwrite))) for path in destinations]
-        _write(recording, [_open(path, unfinished, compression) for path, unfinished in begun], on_frame)
+        with ExitStack() as opened:
+            writers = [
+                opened.enter_context(FORMATS[format_of(path)].open(unfinished, compression, names))
+                for path, unfinished in begun
+            ]
+            _write(recording, writers, on_frame)
         for path, unfinished in begun:
             if format_of(path) == "asl":
                 write_calibration(recording.calibration, unfinished / "mav0")
@@ -66,58 +72,44 @@ def check_destinations(destinations: Sequence[Path], compression: str | None, *,
         raise DatasetError("a destination is named twice")
 
 
-def _open(path: Path, unfinished: Path, compression: str | None) -> RecordingWriter:
-    format = FORMATS[format_of(path)]
-    return format.open(unfinished, compression if format.compressions else None)
-
-
 def _write(
-    recording: SimulatedRecording, writers: Sequence[RecordingWriter], on_frame: Callable[[Frame], None]
+    recording: SimulatedRecording, writers: Sequence[RecordingWriter], on_frame: Callable[[FrameSet], None]
 ) -> None:
-    with ExitStack() as stack:
+    truth = zip(recording.ground_truth.t_ns.tolist(), recording.ground_truth.values.tolist(), strict=True)
+    items: Iterator[Measurement | tuple[int, list[float]]] = merge(
+        recording.measurements(), truth, key=lambda item: item[0] if isinstance(item, tuple) else item.t_ns
+    )
+    for item in items:
         for writer in writers:
-            stack.enter_context(writer)
-        measurements: Iterable[Measurement | NavState] = recording.measurements()
-        for item in merge(measurements, recording.truth, key=lambda item: item.t_ns):
-            for writer in writers:
-                if isinstance(item, Frame):
-                    writer.write_frame(item)
-                elif isinstance(item, ImuSample):
-                    writer.write_imu(item)
-                elif isinstance(item, NavState):
-                    writer.write_truth(item)
-            if isinstance(item, Frame):
-                on_frame(item)
+            if isinstance(item, tuple):
+                writer.write_true_values(*item)
+            elif isinstance(item, FrameSet):
+                writer.write_frame(item)
+            elif isinstance(item, ImuSample):
+                writer.write_imu(item)
+        if isinstance(item, FrameSet):
+            on_frame(item)
 
 
 def _describe(recording: SimulatedRecording, folder: Path) -> None:
-    """The manifest, the truth and the world's mesh in a new ``folder``."""
+    """The manifest, which makes the recording again, the truth and the world's mesh in a new ``folder``."""
     folder.mkdir()
-    (folder / MANIFEST).write_text(_manifest(recording), encoding="utf-8")
-    write_mesh(recording.world.mesh, folder / WORLD)
-    truth = TruthFile(folder / TRUTH)
-    for state in recording.truth:
-        truth.write(state)
-    truth.close()
-
-
-def _manifest(recording: SimulatedRecording) -> str:
-    """The configuration that makes the recording again, and what came of it."""
     made = {
         "name": recording.name,
         "frames": recording.frame_count,
         "imu_samples": recording.imu_count,
         "path_m": round(recording.ground_truth.path_length_m, 6),
-        "true_calibration": _plain(recording.true_calibration),
-        "calibration_told": _plain(recording.calibration),
-        "vioframe": vioframe.__version__,
-        "revision": machine.commit(Path(vioframe.__file__).parent),
+        "true_calibration": recording.true_calibration,
+        "calibration_told": recording.calibration,
+        "vioframe": version("vioframe"),
+        "revision": machine.commit(Path(__file__).parent),
     }
+    plain = to_jsonable_python(made, fallback=lambda array: array.tolist())
     heading = "# A simulated recording: `vioframe simulate --config FILE NAME` makes it again.\n"
-    return heading + configuration.render(recording.config.model_copy(update={"made": made}))
-
-
-def _plain(calibration: Calibration) -> dict[str, Any]:
-    tree = asdict(calibration)
-    tree["R_BC"], tree["p_BC"] = calibration.R_BC.tolist(), calibration.p_BC.tolist()
-    return tree
+    manifest = heading + to_yaml(recording.config.model_copy(update={"made": plain}))
+    (folder / MANIFEST).write_text(manifest, encoding="utf-8")
+    write_mesh(recording.world.mesh, folder / MESH)
+    truth = TruthFile(folder / TRUTH)
+    for t_ns, values in zip(recording.ground_truth.t_ns.tolist(), recording.ground_truth.values.tolist(), strict=True):
+        truth.write_true_values(t_ns, values)
+    truth.close()

@@ -1,17 +1,70 @@
-"""Ideal feature tracks: static landmarks seen by a moving camera, with noise in the pixels and nowhere else."""
+"""Feature tracks without images: static landmarks seen from a known motion, with noise in the pixels and nowhere else.
+
+A :class:`TrackSequence` is a recording reduced to what a back-end takes in, with the truth that it is judged by.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from heapq import merge
+from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from vioframe.arrays import Bool, Float, Int
+from vioframe.errors import DatasetError
 from vioframe.geometry.cameras import Camera
-from vioframe.types import Calibration, Float, FrameTracks, Int
+from vioframe.geometry.trajectory import Trajectory
+from vioframe.incidents import Incidents
+from vioframe.interfaces import Flight
+from vioframe.io.calibration import packaged_calibration
+from vioframe.io.synchronise import synchronise
+from vioframe.simulation.flights import flight as named_flight
+from vioframe.simulation.imu import ImuErrors
+from vioframe.simulation.scenario import Scenario, fly, load_euroc
+from vioframe.types import (
+    Calibration,
+    FrameSet,
+    FrameTracks,
+    ImuNoise,
+    ImuSample,
+    ImuSegment,
+    Measurement,
+    NavState,
+)
 
+Packet = tuple[ImuSegment, FrameTracks]
+
+REAL_MOTION_SEQUENCES = ("MH_02_easy", "MH_03_medium", "MH_05_difficult", "V1_01_easy", "V1_02_medium")
+"""The flights of ``euroc_imu_gt`` in the shared data."""
+
+EUROC_NOISE = ImuNoise(
+    gyro_density=1.6968e-4, accel_density=2.0e-3, gyro_walk=1.9393e-5, accel_walk=3.0e-3, rate_hz=200.0
+)
+"""That of the ADIS16448 in EuRoC's sensor, as published."""
+
+_DURATION_S = 30.0
 # Landmarks nearer than this cannot be tracked: they cross the image too fast.
 _NEAREST_M = 0.3
+# Landmarks are seen this far inside the image, as a tracking window needs.
+_BORDER_PX = 5.0
+_OUTLIER_PX = (5.0, 30.0)
+
+
+@dataclass(frozen=True)
+class TrackSequence:
+    """Packets for :meth:`vioframe.interfaces.Backend.process`, one a frame, and the motion behind them.
+
+    ``ground_truth`` holds a pose for each frame. ``true_states``, where they are known, hold velocity and biases too
+    (one a frame, or none at all); those of a simulated flight are exact, a recording's are its publisher's estimate.
+    """
+
+    name: str
+    calibration: Calibration
+    packets: tuple[Packet, ...]
+    ground_truth: Trajectory
+    true_states: tuple[NavState, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -19,76 +72,257 @@ class TrackOptions:
     """What the simulated front-end sees. Landmarks are born at a depth drawn uniformly from ``depth_m``."""
 
     max_points: int = 150
+    """Landmarks are born in a camera until it sees so many."""
     pixel_sigma: float = 1.0
     """Standard deviation of an observation, px on either axis of the raw (distorted) image."""
     outlier_ratio: float = 0.0
-    """Chance that an observation is off by ``outlier_px``."""
-    outlier_px: tuple[float, float] = (5.0, 30.0)
+    """Chance that an observation is off by 5 to 30 px."""
     depth_m: tuple[float, float] = (2.0, 10.0)
-    border_px: float = 5.0
-    """Landmarks are seen this far inside the image, as a tracking window needs."""
+
+
+def simulated_sequence(
+    flight: str | Flight,
+    noise: ImuNoise | None = EUROC_NOISE,
+    pixel_sigma: float = 1.0,
+    seed: int = 0,
+    duration_s: float | None = None,
+    *,
+    outlier_ratio: float = 0.0,
+    max_points: int = 150,
+    calibration: Calibration | None = None,
+    frame_rate_hz: float = 20.0,
+    bias_gyro_B: Float | None = None,
+    bias_accel_B: Float | None = None,
+) -> TrackSequence:
+    """Fly ``flight``, an installed one of that name or one's own, for ``duration_s`` seconds.
+
+    Left out, that is 30 s, or as long as one's own flight lasts. ``noise`` None gives exact readings at the
+    calibration's rate, and ``calibration`` None is EuRoC's. The first biases (3,) are zero unless given. The same
+    arguments give the same sequence to the last bit. Readings at the frames' stamps are interpolated as those of a
+    recording would be, unless the frame rate divides the IMU's.
+    """
+    calibration = calibration or packaged_calibration("euroc", cameras=["cam0"])
+    imu_rng, track_rng = _generators(seed)
+    rate_hz = (noise or calibration.imu).rate_hz
+    path, duration_s = _path(flight, duration_s, calibration)
+    frames_s = np.arange(int(duration_s * frame_rate_hz) + 1) / frame_rate_hz
+    scenario = fly(
+        path,
+        flight if isinstance(flight, str) else type(flight).__name__,
+        imu_rng,
+        frames_s=frames_s,
+        imu_s=np.arange(int(np.ceil(frames_s[-1] * rate_hz)) + 1) / rate_hz,
+        imu_rate_hz=rate_hz,
+        noise=noise,
+        errors=_starting_at(bias_gyro_B, bias_accel_B),
+    )
+    options = TrackOptions(max_points, pixel_sigma, outlier_ratio)
+    return _sequence(scenario, calibration, TrackSimulator(calibration, options, track_rng))
+
+
+def real_motion_sequence(
+    folder: Path,
+    calibration: Calibration | None = None,
+    *,
+    pixel_sigma: float = 1.0,
+    max_points: int = 150,
+    seed: int = 0,
+    start_s: float = 0.0,
+    duration_s: float | None = None,
+    remove_jumps: bool = False,
+) -> TrackSequence:
+    """Landmarks seen from the true poses of ``folder`` at its camera's stamps, and its recorded IMU.
+
+    ``folder``, ``start_s``, ``duration_s`` and ``remove_jumps``, which closes the jumps in the truth that is returned
+    too, are those of :func:`~vioframe.simulation.scenario.load_euroc`. ``calibration`` is EuRoC's as published unless
+    given.
+    """
+    calibration = calibration or packaged_calibration("euroc", cameras=["cam0"])
+    scenario = load_euroc(folder, start_s=start_s, duration_s=duration_s, remove_jumps=remove_jumps)
+    options = TrackOptions(max_points, pixel_sigma)
+    return _sequence(scenario, calibration, TrackSimulator(calibration, options, np.random.default_rng(seed)))
+
+
+def simulated_stream(
+    flight: str | Flight,
+    noise: ImuNoise | None = EUROC_NOISE,
+    options: TrackOptions | None = None,
+    seed: int = 0,
+    duration_s: float | None = None,
+    *,
+    calibration: Calibration | None = None,
+    frame_rate_hz: float = 20.0,
+    piece_s: float = 10.0,
+) -> Iterator[ImuSample | FrameTracks]:
+    """As :func:`simulated_sequence`, but made as it is taken, in pieces of ``piece_s`` seconds: for flights of hours.
+
+    Readings, with stamps of the IMU's clock, and frames come in the order of their stamps. The noise is not that of the
+    sequence with the same seed.
+    """
+    calibration = calibration or packaged_calibration("euroc", cameras=["cam0"])
+    imu_rng, track_rng = _generators(seed)
+    simulator = TrackSimulator(calibration, options or TrackOptions(), track_rng)
+    rate_hz = (noise or calibration.imu).rate_hz
+    path, duration_s = _path(flight, duration_s, calibration)
+    readings, frames = (np.arange(int(duration_s * hz + 1e-9) + 1) / hz for hz in (rate_hz, frame_rate_hz))
+    errors = ImuErrors()
+    for begin_s in np.arange(0.0, duration_s, piece_s).tolist():
+        end_s = begin_s + piece_s if begin_s + piece_s < duration_s else np.inf
+        # A piece begins with the last reading of the one before, whose biases it goes on from.
+        first, last = np.searchsorted(readings, [begin_s, end_s])
+        imu_s = readings[max(first - 1, 0) : last]
+        frames_s = frames[(frames >= begin_s) & (frames < end_s)]
+        piece = fly(
+            path,
+            "",
+            imu_rng,
+            frames_s=frames_s,
+            imu_s=imu_s,
+            imu_rate_hz=rate_hz,
+            noise=noise,
+            errors=errors,
+            time_offset_ns=calibration.cameras[0].time_offset_ns,
+        )
+        errors = _starting_at(*np.split(piece.truth.values[-1, 10:], 2))
+        new = slice(1 if first else 0, None)
+        samples = map(ImuSample, piece.imu_ns[new].tolist(), piece.gyro_B[new], piece.accel_B[new])
+        measured: Iterable[ImuSample | FrameTracks] = samples
+        yield from merge(measured, _tracks(piece, calibration, simulator), key=lambda item: item.t_ns)
 
 
 class TrackSimulator:
-    """Tracks landmarks frame by frame: one lives while it is in view and is never seen again after leaving it.
+    """Tracks landmarks frame by frame: one lives while a camera sees it and is never seen again after that.
 
     As in the simulator of OpenVINS (Geneva et al., ICRA 2020), a new landmark is put at a random pixel and a random
-    depth whenever there are fewer than wanted. ``p_WF`` maps each id that ever lived to its true position.
+    depth whenever there are fewer than wanted. One that lies in the view of several cameras has the same id in all.
+    ``p_WF`` maps the ids that live to their true positions, (3,) m.
     """
 
     def __init__(self, calibration: Calibration, options: TrackOptions, rng: np.random.Generator) -> None:
-        self._camera = calibration.camera
-        self._R_BC, self._p_BC = calibration.R_BC, calibration.p_BC
+        self._cameras = calibration.cameras
         self._options = options
         self._rng = rng
-        self._widest = _widest_radius(calibration.camera)
+        self._widest = [_widest_radius(camera.model) for camera in calibration.cameras]
         self._ids: Int = np.empty(0, np.int64)
         self._p_WF: Float = np.empty((0, 3))
         self._next_id = 0
-        self.p_WF: dict[int, Float] = {}
+
+    @property
+    def p_WF(self) -> dict[int, Float]:
+        return dict(zip(self._ids.tolist(), self._p_WF, strict=True))
 
     def observe(self, t_ns: int, R_WB: Float, p_WB: Float) -> FrameTracks:
-        """The tracks of a frame taken at ``R_WB`` (3, 3), ``p_WB`` (3,) m."""
-        R_WC = R_WB @ self._R_BC
-        p_WC = R_WB @ self._p_BC + p_WB
-        xy, visible = self._project(R_WC, p_WC, self._p_WF)
-        self._ids, self._p_WF, xy = self._ids[visible], self._p_WF[visible], xy[visible]
-        missing = self._options.max_points - len(self._ids)
-        if missing > 0:
-            xy = np.concatenate([xy, self._add_landmarks(missing, R_WC, p_WC)])
-        xy = self._disturb(xy)
-        return FrameTracks(t_ns, self._ids.copy(), xy, self._camera.undistort(xy))
+        """The tracks of frames taken at ``R_WB`` (3, 3), ``p_WB`` (3,) m.
 
-    def _project(self, R_WC: Float, p_WC: Float, p_WF: Float) -> tuple[Float, NDArray[np.bool_]]:
+        Where cameras have clocks of their own, the poses are one a camera: (C, 3, 3) and (C, 3).
+        """
+        count = len(self._cameras)
+        R_WB, p_WB = np.broadcast_to(R_WB, (count, 3, 3)), np.broadcast_to(p_WB, (count, 3))
+        poses = [(R @ c.R_BC, R @ c.p_BC + p) for c, R, p in zip(self._cameras, R_WB, p_WB, strict=True)]
+        views = [self._project(c, *pose, self._p_WF) for c, pose in enumerate(poses)]
+        living = np.any([seen for _, seen in views], axis=0)
+        self._ids, self._p_WF = self._ids[living], self._p_WF[living]
+        views = [(xy[living], seen[living]) for xy, seen in views]
+        for c in range(count):
+            missing = self._options.max_points - int(views[c][1].sum())
+            if missing > 0:
+                born_xy, p_WF = self._add_landmarks(c, missing, *poses[c])
+                for other, (xy, seen) in enumerate(views):
+                    new_xy, new_seen = self._project(other, *poses[other], p_WF)
+                    if other == c:  # the very pixels that were drawn
+                        new_xy, new_seen = born_xy, np.ones(missing, bool)
+                    views[other] = np.concatenate([xy, new_xy]), np.concatenate([seen, new_seen])
+        parts = []
+        for c, (ideal_xy, seen) in enumerate(views):
+            xy = self._disturb(ideal_xy[seen])
+            parts.append((self._ids[seen], np.full(len(xy), c), xy, self._cameras[c].model.undistort(xy)))
+        ids, camera, xy, xy_normalised = map(np.concatenate, zip(*parts, strict=True))
+        return FrameTracks(t_ns, ids, camera, xy, xy_normalised)
+
+    def _project(self, camera: int, R_WC: Float, p_WC: Float, p_WF: Float) -> tuple[Float, Bool]:
+        """Pixels (N, 2) of landmarks (N, 3) m in a camera, and which of them it sees."""
+        model = self._cameras[camera].model
         p_CF = (p_WF - p_WC) @ R_WC
         in_front = p_CF[:, 2] > _NEAREST_M
         uv = p_CF[:, :2] / np.where(in_front, p_CF[:, 2], 1.0)[:, None]
         # Far outside the image the distortion model folds back into it.
-        in_front &= (uv * uv).sum(axis=1) < self._widest**2
+        in_front &= (uv * uv).sum(axis=1) < self._widest[camera] ** 2
         xy = np.full_like(uv, np.nan)
-        xy[in_front] = self._camera.distort(uv[in_front])
-        return xy, in_front & self._camera.contains(xy, self._options.border_px)
+        xy[in_front] = model.distort(uv[in_front])
+        return xy, in_front & model.contains(xy, _BORDER_PX)
 
-    def _add_landmarks(self, count: int, R_WC: Float, p_WC: Float) -> Float:
-        border = self._options.border_px
-        limit = np.array(self._camera.resolution) - 1.0 - border
-        xy = self._rng.uniform(border, limit, (count, 2))
+    def _add_landmarks(self, camera: int, count: int, R_WC: Float, p_WC: Float) -> tuple[Float, Float]:
+        """Pixels (N, 2) and positions (N, 3) m of ``count`` new ones, anywhere in the view of a camera."""
+        model = self._cameras[camera].model
+        xy = self._rng.uniform(_BORDER_PX, np.array(model.resolution) - 1.0 - _BORDER_PX, (count, 2))
         depth = self._rng.uniform(*self._options.depth_m, count)
-        rays_C = np.column_stack([self._camera.undistort(xy), np.ones(count)])
+        rays_C = np.column_stack([model.undistort(xy), np.ones(count)])
         p_WF = (rays_C * depth[:, None]) @ R_WC.T + p_WC
-        ids = np.arange(self._next_id, self._next_id + count)
+        self._ids = np.concatenate([self._ids, np.arange(self._next_id, self._next_id + count)])
         self._next_id += count
-        self._ids, self._p_WF = np.concatenate([self._ids, ids]), np.concatenate([self._p_WF, p_WF])
-        self.p_WF.update(zip(ids.tolist(), p_WF, strict=True))
-        return xy
+        self._p_WF = np.concatenate([self._p_WF, p_WF])
+        return xy, p_WF
 
     def _disturb(self, xy: Float) -> Float:
         xy = xy + self._rng.normal(0.0, self._options.pixel_sigma, xy.shape)
         wrong = self._rng.random(len(xy)) < self._options.outlier_ratio
         angle = self._rng.uniform(0.0, 2.0 * np.pi, wrong.sum())
-        length = self._rng.uniform(*self._options.outlier_px, wrong.sum())
+        length = self._rng.uniform(*_OUTLIER_PX, wrong.sum())
         xy[wrong] += length[:, None] * np.column_stack([np.cos(angle), np.sin(angle)])
         return xy
+
+
+def cut_segments(t_ns: Int, gyro_B: Float, accel_B: Float, frames_ns: Int) -> list[ImuSegment]:
+    """One segment a frame, as :func:`vioframe.io.synchronise.synchronise` cuts them.
+
+    ``t_ns`` (N,) ascending, ``gyro_B`` (N, 3) rad/s, ``accel_B`` (N, 3) m/s^2, ``frames_ns`` (M,) ascending and within
+    the readings; raises :class:`DatasetError` where that is not so and a frame would be left without its segment.
+    """
+    samples: Iterable[Measurement] = map(ImuSample, t_ns.tolist(), gyro_B, accel_B)
+    frames: Iterable[Measurement] = (FrameSet(t, ()) for t in frames_ns.tolist())
+    incidents = Incidents()
+    stream = merge(samples, frames, key=lambda measurement: measurement.t_ns)
+    segments = [segment for segment, _ in synchronise(stream, incidents=incidents)]
+    if len(segments) != len(frames_ns):
+        raise DatasetError(f"frames lie outside the inertial readings or repeat: {dict(incidents.counts)}")
+    return segments
+
+
+def _sequence(scenario: Scenario, calibration: Calibration, simulator: TrackSimulator) -> TrackSequence:
+    frames_ns = scenario.frames_ns
+    segments = cut_segments(scenario.imu_ns, scenario.gyro_B, scenario.accel_B, frames_ns)
+    R_WB, p_WB, _ = scenario.motion(frames_ns)
+    packets = zip(segments, _tracks(scenario, calibration, simulator), strict=True)
+    truth = Trajectory(frames_ns, R_WB, p_WB)
+    return TrackSequence(scenario.name, calibration, tuple(packets), truth, scenario.states_at(frames_ns))
+
+
+def _tracks(scenario: Scenario, calibration: Calibration, simulator: TrackSimulator) -> Iterator[FrameTracks]:
+    """What the rig's cameras see in every frame."""
+    frames_ns = scenario.frames_ns
+    poses = [scenario.body_poses(calibration, c, frames_ns) for c in range(len(calibration.cameras))]
+    R_WB, p_WB = (np.stack(part, axis=1) for part in zip(*poses, strict=True))
+    return map(simulator.observe, frames_ns.tolist(), R_WB, p_WB)
+
+
+def _generators(seed: int) -> tuple[np.random.Generator, np.random.Generator]:
+    """Of the IMU's noise and of landmarks and pixels."""
+    imu, tracks = np.random.SeedSequence(seed).spawn(2)
+    return np.random.default_rng(imu), np.random.default_rng(tracks)
+
+
+def _path(flight: str | Flight, duration_s: float | None, calibration: Calibration) -> tuple[Flight, float]:
+    """The flight, and how long it is flown; an installed one is mounted as the first camera looks ahead."""
+    if isinstance(flight, str):
+        duration_s = _DURATION_S if duration_s is None else duration_s
+        return named_flight(flight, duration_s, calibration.cameras[0].R_BC), duration_s
+    return flight, flight.duration_s if duration_s is None else min(duration_s, flight.duration_s)
+
+
+def _starting_at(bias_gyro_B: Float | None, bias_accel_B: Float | None) -> ImuErrors:
+    """An IMU whose first biases are these (3,), zero where None."""
+    gyro, accel = (np.zeros(3) if bias is None else np.asarray(bias) for bias in (bias_gyro_B, bias_accel_B))
+    return ImuErrors(bias_gyro_B=(gyro[0], gyro[1], gyro[2]), bias_accel_B=(accel[0], accel[1], accel[2]))
 
 
 def _widest_radius(camera: Camera) -> float:

@@ -1,4 +1,4 @@
-"""A world to look at: triangles with texture coordinates, and the images on them."""
+"""A world to look at: triangles with texture coordinates, the images on them, and boxes that fly around in it."""
 
 from __future__ import annotations
 
@@ -7,10 +7,19 @@ from pathlib import Path
 
 import numpy as np
 
+from vioframe.arrays import Float, Image, Int
 from vioframe.errors import ConfigError
 from vioframe.geometry.meshes import import_open3d, ray_scene
 from vioframe.interfaces import World
-from vioframe.types import Float, Image, Int, Mesh
+from vioframe.types import Mesh
+
+# Of movers: their size, how far they swing and how often, and how clear of the cameras they stay.
+_SIZE_M = (0.3, 1.1)
+_SWING_M = (0.4, 1.6)
+_AROUND_M = np.array([2.2, 2.2, 1.2])  # with the swing still within the walls of a hall
+_PERIOD_S = (3.0, 9.0)
+_CLEARANCE_M = 1.2
+_TRIES = 400
 
 
 @dataclass(frozen=True)
@@ -82,6 +91,56 @@ class MeshBuilder:
         return Mesh(np.array(corners), np.array(uv), np.array(texture, np.int32), np.array(surface, np.int32))
 
 
+@dataclass(frozen=True)
+class Movers:
+    """M boxes swinging about ``centre_W`` (M, 3) m by ``swing_m`` (M, 3), in ``period_s`` (M, 3) from ``phase`` rad.
+
+    ``mesh`` holds each about its own origin and ``owner`` (T,) the box that a triangle belongs to.
+    """
+
+    mesh: Mesh
+    owner: Int
+    centre_W: Float
+    swing_m: Float
+    period_s: Float
+    phase: Float
+
+    def at(self, t_s: Float) -> Float:
+        """Where they are at times (N,) s: (N, M, 3) m."""
+        angle = 2.0 * np.pi * np.asarray(t_s)[:, None, None] / self.period_s + self.phase
+        return np.asarray(self.centre_W + self.swing_m * np.sin(angle))
+
+    def corners(self, p_W: Float) -> Float:
+        """(T, 3, 3) m with the boxes at ``p_W`` (M, 3)."""
+        return np.asarray(self.mesh.corners + p_W[self.owner][:, None, :])
+
+
+def draw_movers(count: int, t_s: Float, p_WC: Float, textures: int, rng: np.random.Generator) -> Movers | None:
+    """``count`` boxes around the paths ``p_WC`` (C, N, 3) m, flown at ``t_s`` (N,), that never come near them.
+
+    Fewer, or None, where the paths leave no room for them.
+    """
+    low, high = p_WC.min(axis=(0, 1)) - _AROUND_M, p_WC.max(axis=(0, 1)) + _AROUND_M
+    builder = MeshBuilder()
+    swings: list[tuple[Float, Float, Float, Float]] = []
+    for _ in range(_TRIES):
+        if len(swings) == count:
+            break
+        size = rng.uniform(*_SIZE_M, 3)
+        centre = rng.uniform(low, high)
+        amplitude = rng.uniform(*_SWING_M, 3) * [1.0, 1.0, 0.3]
+        period = rng.uniform(*_PERIOD_S, 3)
+        phase = rng.uniform(0.0, 2.0 * np.pi, 3)
+        path = centre + amplitude * np.sin(2.0 * np.pi * t_s[:, None] / period + phase)
+        if np.linalg.norm(path - p_WC, axis=2).min() >= _CLEARANCE_M + 0.5 * float(np.linalg.norm(size)):
+            builder.box(-0.5 * size, 0.5 * size, rng.integers(textures, size=6), float(size.max()), rng.random(2))
+            swings.append((centre, amplitude, period, phase))
+    if not swings:
+        return None
+    owner = np.repeat(np.arange(len(swings)), 12)  # two triangles a face
+    return Movers(builder.build(), owner, *(np.array(part) for part in zip(*swings, strict=True)))
+
+
 def check_clear(world: World, t_s: Float, p_W: Float) -> None:
     """Raise :class:`ConfigError` where the path ``p_W`` (N, 3) m at times ``t_s`` (N,) goes through a surface."""
     o3d = import_open3d("checking a flight against its world")
@@ -98,13 +157,9 @@ def check_clear(world: World, t_s: Float, p_W: Float) -> None:
 
 
 def write_mesh(mesh: Mesh, path: Path) -> None:
-    """The triangles as a binary PLY file, m in W."""
-    vertices, which = np.unique(mesh.corners.reshape(-1, 3).astype("<f4"), axis=0, return_inverse=True)
-    faces = np.empty(len(mesh.corners), dtype=[("count", "u1"), ("corners", "<i4", 3)])
-    faces["count"], faces["corners"] = 3, which.reshape(-1, 3)
-    header = (
-        f"ply\nformat binary_little_endian 1.0\nelement vertex {len(vertices)}\n"
-        "property float x\nproperty float y\nproperty float z\n"
-        f"element face {len(faces)}\nproperty list uchar int vertex_indices\nend_header\n"
-    )
-    path.write_bytes(header.encode() + vertices.tobytes() + faces.tobytes())
+    """The triangles as a PLY file, m in W."""
+    o3d = import_open3d("writing a world")
+    corners = o3d.utility.Vector3dVector(mesh.corners.reshape(-1, 3))
+    triangles = o3d.utility.Vector3iVector(np.arange(3 * len(mesh.corners), dtype=np.int32).reshape(-1, 3))
+    written = o3d.geometry.TriangleMesh(corners, triangles).remove_duplicated_vertices()
+    o3d.io.write_triangle_mesh(str(path), written)

@@ -13,7 +13,7 @@ from vioframe.errors import DatasetError
 from vioframe.geometry.trajectory import Trajectory
 from vioframe.interfaces import Dataset, DatasetFactory
 from vioframe.testing.require import fail, require
-from vioframe.types import NS_PER_S, Calibration, Frame, ImuSample
+from vioframe.types import NS_PER_S, Calibration, FrameSet, ImuSample
 
 _MAX_DISORDER_NS = NS_PER_S
 
@@ -21,8 +21,9 @@ _MAX_DISORDER_NS = NS_PER_S
 def check_dataset(factory: DatasetFactory, path: Path, *, max_frames: int = 50, **options: Any) -> None:
     """Check ``factory(path, **options)`` against :class:`vioframe.interfaces.Dataset`, on the first ``max_frames``.
 
-    ``path`` is accepted and a file of something else is not; what is missing raises DatasetError; images are (H, W)
-    uint8, read-only and of the calibrated size; stamps are integer nanoseconds and no more than a second out of order.
+    ``path`` is accepted and a file of something else is not; what is missing raises DatasetError. A frame set has a
+    place for each calibrated camera and at least one image; images are (H, W) uint8, read-only and of the size that
+    their camera is calibrated for. Stamps are integer nanoseconds and no more than a second out of order.
     """
     path = Path(path)
     require(factory.accepts(path) is True, f"accepts({path.name}) is not True")
@@ -51,29 +52,45 @@ def _check_refuses(factory: DatasetFactory, missing: Path, options: dict[str, An
 def _check_measurements(dataset: Dataset, max_frames: int) -> None:
     latest: dict[type, int] = {}
     counts: Counter[type] = Counter()
-    resolution = dataset.calibration.camera.resolution
     for measurement in dataset.measurements():
         kind = type(measurement)
-        if not isinstance(measurement, Frame | ImuSample):
+        if not isinstance(measurement, FrameSet | ImuSample):
             continue  # a note of something irregular
         require(isinstance(measurement.t_ns, int), f"t_ns of a {kind.__name__} is a {type(measurement.t_ns).__name__}")
-        if isinstance(measurement, Frame):
-            image = measurement.image
-            require(image.ndim == 2 and image.dtype == np.uint8, f"an image is {image.shape} {image.dtype}")
-            require(
-                image.shape[::-1] == resolution, f"an image is {image.shape[::-1]}, the calibration for {resolution}"
-            )
-            require(not image.flags.writeable, "an image is writeable")
+        if isinstance(measurement, FrameSet):
+            _check_frames(measurement, dataset.calibration)
         else:
             require(measurement.gyro_B.shape == measurement.accel_B.shape == (3,), "gyro_B and accel_B must be (3,)")
         behind_ns = max(latest.values(), default=measurement.t_ns) - measurement.t_ns
         require(behind_ns <= _MAX_DISORDER_NS, f"a {kind.__name__} comes {behind_ns / NS_PER_S:.1f} s too late")
         latest[kind] = measurement.t_ns
         counts[kind] += 1
-        if counts[Frame] >= max_frames:
+        if counts[FrameSet] >= max_frames:
             break
-    require(counts[Frame] and counts[ImuSample], f"{counts[Frame]} images and {counts[ImuSample]} IMU samples came")
     require(
-        dataset.frame_count is None or dataset.frame_count >= counts[Frame],
-        f"frame_count is {dataset.frame_count}, but {counts[Frame]} images came",
+        counts[FrameSet] and counts[ImuSample], f"{counts[FrameSet]} frames and {counts[ImuSample]} IMU samples came"
     )
+    require(
+        dataset.frame_count is None or dataset.frame_count >= counts[FrameSet],
+        f"frame_count is {dataset.frame_count}, but {counts[FrameSet]} frames came",
+    )
+
+
+def _check_frames(frames: FrameSet, calibration: Calibration) -> None:
+    cameras, images = calibration.cameras, frames.images
+    require(
+        isinstance(images, tuple) and len(images) == len(cameras),
+        f"a frame set has {len(images)} places, the calibration {len(cameras)} cameras",
+    )
+    require(any(image is not None for image in images), "a frame set holds no image")
+    for image, camera in zip(images, cameras, strict=True):
+        if image is None:
+            continue
+        require(
+            image.ndim == 2 and image.dtype == np.uint8, f"an image of {camera.name} is {image.shape} {image.dtype}"
+        )
+        require(
+            image.shape[::-1] == camera.model.resolution,
+            f"an image of {camera.name} is {image.shape[::-1]}, the calibration for {camera.model.resolution}",
+        )
+        require(not image.flags.writeable, f"an image of {camera.name} is writeable")

@@ -9,7 +9,7 @@ import numpy as np
 from vioframe.interfaces import LoopCloser, LoopCloserFactory
 from vioframe.simulation import TrackSequence, simulated_sequence
 from vioframe.testing.require import fail, require
-from vioframe.types import Estimate, Frame, LoopClosure, NavState, Status, Step
+from vioframe.types import Estimate, FrameSet, LoopClosure, NavState, Status, Step
 
 _DURATION_S = 26.0
 _EVERY, _LOST = 4, range(50, 60)
@@ -29,7 +29,7 @@ def check_loop_closer(factory: LoopCloserFactory, **options: Any) -> None:
     _check_closure(closure, steps)
     again = _run(factory(sequence.calibration, **options), steps)
     require(_same(closure, again), "the same steps gave another result the second time")
-    blank = [Step(s.frame, s.tracks, Estimate(Status.INITIALISING), {}) for s in steps[:20]]
+    blank = [Step(s.frames, s.tracks, Estimate(Status.INITIALISING), {}) for s in steps[:20]]
     nothing = _run(factory(sequence.calibration, **options), blank)
     require(
         nothing.trajectory is None and not nothing.loops, "there is a trajectory or a loop where nothing was tracked"
@@ -39,7 +39,7 @@ def check_loop_closer(factory: LoopCloserFactory, **options: Any) -> None:
 def _steps(sequence: TrackSequence) -> list[Step]:
     """The true poses as an estimate, lost for a while; every picture is noise of its own, so that none is alike."""
     rng = np.random.default_rng(0)
-    width, height = sequence.calibration.camera.resolution
+    width, height = sequence.calibration.cameras[0].model.resolution
     truth = sequence.ground_truth
     steps = []
     for k, (_, tracks) in enumerate(sequence.packets[::_EVERY]):
@@ -52,10 +52,10 @@ def _steps(sequence: TrackSequence) -> list[Step]:
         if k not in _LOST:
             state = NavState(tracks.t_ns, pose.R_WB[0], pose.p_WB[0], zero, zero, zero)
             ahead_C = np.column_stack([tracks.xy_normalised, np.ones(len(tracks.ids))]) * 4.0
-            R_WC = state.R_WB @ sequence.calibration.R_BC
-            p_WC = state.p_WB + state.R_WB @ sequence.calibration.p_BC
+            R_WC = state.R_WB @ sequence.calibration.cameras[0].R_BC
+            p_WC = state.p_WB + state.R_WB @ sequence.calibration.cameras[0].p_BC
             estimate = Estimate(Status.TRACKING, state, tracks.ids, ahead_C @ R_WC.T + p_WC, is_keyframe=True)
-        steps.append(Step(Frame(tracks.t_ns, image), tracks, estimate, {}))
+        steps.append(Step(FrameSet(tracks.t_ns, (image,)), tracks, estimate, {}))
     return steps
 
 

@@ -18,6 +18,7 @@ from vioframe.bench.processes import map_in_processes, single_threaded
 from vioframe.bench.results import Row
 from vioframe.errors import ConfigError, DatasetError
 from vioframe.frontend import Frontend, FrontendOptions
+from vioframe.frontend.refill import GRID
 from vioframe.geometry.trajectory import Trajectory
 from vioframe.incidents import Incidents
 from vioframe.interfaces import Dataset
@@ -25,7 +26,7 @@ from vioframe.io.synchronise import synchronise
 from vioframe.io.trajectories import load_trajectory
 from vioframe.parts import registry
 from vioframe.parts.registry import Registry
-from vioframe.types import NS_PER_S, Float, Frame, FrameTracks, ImuSegment
+from vioframe.types import NS_PER_S, Float, FrameSet, FrameTracks, ImuSegment
 
 SURVIVAL_FRAMES = (5, 10, 20)
 BASELINE_FRAMES = 5
@@ -91,7 +92,7 @@ def _fly(job: _Job) -> list[Row]:
     frontends = {
         entrant.label: Frontend(
             installed.create_detector(entrant.name, entrant.options),
-            dataset.calibration.camera,
+            dataset.calibration,
             options,
             incidents[entrant.label],
         )
@@ -99,15 +100,15 @@ def _fly(job: _Job) -> list[Row]:
     }
     steps: dict[str, list[FrameTracks]] = {label: [] for label in frontends}
     with single_threaded():
-        for imu, frame in degraded(dataset, job.stretch, job.degradation, job.seed):
+        for imu, frames in degraded(dataset, job.stretch, job.degradation, job.seed):
             for label, frontend in frontends.items():
-                steps[label].append(frontend.track(imu, frame, dataset.calibration.R_BC))
+                steps[label].append(frontend.track(imu, frames, dataset.calibration))
     rows: list[Row] = [
         {
             "detector": label,
             "degradation": job.degradation.name,
             "level": job.degradation.level,
-            **track_figures(tracks, dataset, truth_of(dataset, job.stretch), options.grid),
+            **track_figures(tracks, dataset, truth_of(dataset, job.stretch)),
             "incidents": dict(incidents[label].counts),
         }
         for label, tracks in steps.items()
@@ -130,7 +131,7 @@ def _with_leads(row: Row, baseline: Row) -> Row:
 
 def degraded(
     dataset: Dataset, stretch: Stretch, degradation: Degradation, seed: int
-) -> Iterator[tuple[ImuSegment, Frame]]:
+) -> Iterator[tuple[ImuSegment, FrameSet]]:
     """The packets of ``stretch``, each image degraded on its own.
 
     The direction of motion blur turns once every eight seconds, brightness swings once every two. Raises
@@ -138,30 +139,30 @@ def degraded(
     """
     packets = synchronise(
         dataset.measurements(),
-        time_offset_ns=dataset.calibration.time_offset_ns,
+        time_offset_ns=dataset.calibration.cameras[0].time_offset_ns,
         start_s=stretch.start_s,
         duration_s=stretch.duration_s,
         incidents=Incidents(),
     )
     begin_ns = None
-    for number, (imu, frame) in enumerate(packets):
-        begin_ns = frame.t_ns if begin_ns is None else begin_ns
-        t_s = (frame.t_ns - begin_ns) / NS_PER_S
+    for number, (imu, frames) in enumerate(packets):
+        begin_ns = frames.t_ns if begin_ns is None else begin_ns
+        t_s = (frames.t_ns - begin_ns) / NS_PER_S
         circumstances = Circumstances(
             np.random.default_rng((seed, number)),
             direction_rad=2.0 * np.pi * t_s / _TURN_S,
             phase=0.5 - 0.5 * float(np.cos(2.0 * np.pi * t_s / _SWING_S)),
         )
-        image = degradation(frame.image, circumstances)
+        (image,) = frames.images
+        assert image is not None
+        image = degradation(image, circumstances)
         image.flags.writeable = False
-        yield imu, Frame(frame.t_ns, image)
+        yield imu, FrameSet(frames.t_ns, (image,))
     if begin_ns is None:
         raise DatasetError(f"{dataset.name} has no image to process; check --start and --duration")
 
 
-def track_figures(
-    steps: Sequence[FrameTracks], dataset: Dataset, truth: Trajectory, grid: tuple[int, int]
-) -> Mapping[str, Any]:
+def track_figures(steps: Sequence[FrameTracks], dataset: Dataset, truth: Trajectory) -> Mapping[str, Any]:
     """What the tracks of a front-end amount to; what cannot be said of so few frames is None."""
     life = lives(steps)
     errors_px: Float = epipolar_errors_px(steps, truth, dataset.calibration, BASELINE_FRAMES)
@@ -173,7 +174,7 @@ def track_figures(
         "median_life": life.median,
         "epipolar_inliers": float(np.mean(errors_px <= INLIER_PX)) if len(errors_px) else None,
         "epipolar_median_px": float(np.median(errors_px)) if len(errors_px) else None,
-        "coverage": coverage(steps, dataset.calibration.camera.resolution, grid),
+        "coverage": coverage(steps, dataset.calibration.cameras[0].model.resolution, GRID),
     }
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from vioframe.errors import DatasetError
 from vioframe.interfaces import Dataset
 from vioframe.io.images import decode_image, to_gray8
-from vioframe.types import Float, Frame, Image
+from vioframe.types import Float, FrameSet, Image
 
 ItemT = TypeVar("ItemT")
 
@@ -44,10 +44,10 @@ def evenly(items: Sequence[ItemT], count: int | None) -> list[ItemT]:
     return [items[i] for i in np.round(np.linspace(0, len(items) - 1, count)).astype(int)]
 
 
-def frames_of(dataset: Dataset, count: int) -> Iterator[tuple[int, Frame]]:
+def frames_of(dataset: Dataset, count: int) -> Iterator[tuple[int, FrameSet]]:
     """At most ``count`` frames of a recording, evenly over it, each with its number."""
     every = max(1, (dataset.frame_count or count) // count)
-    frames = (measurement for measurement in dataset.measurements() if isinstance(measurement, Frame))
+    frames = (measurement for measurement in dataset.measurements() if isinstance(measurement, FrameSet))
     return islice(enumerate(frames), 0, every * count, every)
 
 

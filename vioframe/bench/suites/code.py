@@ -8,7 +8,6 @@ from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
 
-import vioframe
 from vioframe.parts.registry import Registry
 from vioframe.runs import machine
 
@@ -33,7 +32,7 @@ def _digest(modules: tuple[str, ...]) -> str:
 
 
 def _framework() -> Iterator[Path]:
-    root = Path(vioframe.__file__).parent
+    root = Path(__file__).parents[2]
     for path in sorted(root.rglob("*")):
         parts = path.relative_to(root).parts
         if path.suffix in _ENDINGS and not any(parts[: len(none)] == none for none in _NO_PART):

@@ -17,12 +17,13 @@ from vioframe.bench.suites.code import code_version
 from vioframe.bench.suites.sources import Flown
 from vioframe.bench.suites.suite import SEED_SHIFT_S, BackendContender, Contender, Suite, montecarlo_setup
 from vioframe.errors import ConfigError, DatasetError
+from vioframe.estimation.lifecycle import warm_up
 from vioframe.io.calibration import packaged_calibration
 from vioframe.parts import config as configuration
 from vioframe.parts.config import Config, DatasetConfig, PartConfig
 from vioframe.parts.registry import BACKEND, DETECTOR, Registry
-from vioframe.report.metrics import create_metrics
 from vioframe.report.suite.results import Data, Kind, Labels
+from vioframe.runs.metrics import create_metrics
 from vioframe.simulation.config import SimulationConfig
 from vioframe.simulation.flights import flight as named_flight
 
@@ -117,7 +118,7 @@ def _create(suite: Suite, installed: Registry) -> None:
     for detector in suite.detectors:
         installed.create_detector(detector.name, detector.options)
     for backend in suite.backends:
-        installed.create_backend(backend.name, calibration, backend.options)
+        warm_up(installed.create_backend(backend.name, backend.options), calibration)
         if backend.loop_closure is not None:
             closer = backend.loop_closure
             installed.create_loop_closer(closer.name, calibration, closer.options)
@@ -194,7 +195,9 @@ def _recording(sequence: str, config: SimulationConfig, data: str, code: str) ->
 
 def _trials(suite: Suite, installed: Registry) -> Iterator[TrialJob]:
     code, setup = code_version(installed), montecarlo_setup(suite)
-    named_flight(setup.flight, setup.duration_s, packaged_calibration("euroc").R_BC)  # says so where there is none
+    named_flight(
+        setup.flight, setup.duration_s, packaged_calibration("euroc").cameras[0].R_BC
+    )  # says so where there is none
     for backend, seed in product(suite.backends, range(suite.seeds)):
         options = installed.find(BACKEND, backend.name).validate(backend.options)
         labels = Labels(setup.flight, CLEAR, 0.0, "simulated tracks", backend.called, seed)

@@ -9,7 +9,6 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, model_validator
 
-import vioframe
 from vioframe.bench.montecarlo import Setup
 from vioframe.errors import ConfigError
 from vioframe.frontend import FrontendOptions
@@ -147,7 +146,7 @@ def shipped() -> dict[str, Path]:
     """The suites that come with vioframe, by name."""
     packaged = Path(str(files("vioframe"))) / "data" / "suites"
     # In a checkout they are where people look for them.
-    folder = packaged if packaged.is_dir() else Path(vioframe.__file__).parents[1] / "benchmarks" / "suites"
+    folder = packaged if packaged.is_dir() else Path(__file__).parents[3] / "benchmarks" / "suites"
     return {path.stem: path for path in sorted(folder.glob("*.yaml"))}
 
 

@@ -14,11 +14,10 @@ from vioframe.bench.suites.plan import AnyJob, FlightJob, RecordingJob, SpeedJob
 from vioframe.bench.suites.store import Store
 from vioframe.errors import TrajectoryError
 from vioframe.evaluation import Comparison
-from vioframe.report.evaluated import Evaluated, evaluate_path, with_loop_closure
-from vioframe.report.matched_truth import write_matched_truth
-from vioframe.report.metrics import create_metrics, measure
 from vioframe.report.suite.results import RUN_FOLDER
+from vioframe.runs.evaluated import Evaluated, evaluate_path, with_loop_closure, write_matched_truth
 from vioframe.runs.folder import RunFolder
+from vioframe.runs.metrics import create_metrics, measure
 from vioframe.simulation.record import record
 from vioframe.simulation.recording import SimulatedRecording
 from vioframe.types import NS_PER_S
@@ -114,7 +113,7 @@ def speed(job: SpeedJob) -> Figures:
         images, source = procedural_images(job.images, RESOLUTION, 0), "drawn surfaces"
     else:
         taken = frames_of(installed().open_dataset(job.recording), job.images)
-        images = [fit(frame.image, RESOLUTION) for _, frame in taken]
+        images = [fit(image, RESOLUTION) for _, frames in taken if (image := frames.images[0]) is not None]
         source = f"frames of {job.recording.stem}"
     rows = time_detectors(lined_up.ready, images, job.rounds)
     settings = speed_settings(source, len(images), job.rounds)

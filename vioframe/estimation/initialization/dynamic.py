@@ -64,7 +64,7 @@ def initialise(packets: Sequence[Packet], calibration: Calibration) -> InitialEs
     t_ns = np.array([tracks.t_ns for _, tracks in packets])
     held_out = int((t_ns > t_ns[-1] - _LOOKAHEAD_S * 1e9).sum())
     chosen = spread_indices(t_ns[:-held_out], _KEYFRAMES)
-    sigma = PIXEL_SIGMA / calibration.camera.focal_px
+    sigma = PIXEL_SIGMA / calibration.cameras[0].model.focal_px
 
     window = build_window(packets, [*chosen, len(packets) - 1], _MIN_VIEWS, _MOST_LANDMARKS)
     _require(window, "tracks are long enough")
@@ -73,8 +73,8 @@ def initialise(packets: Sequence[Packet], calibration: Calibration) -> InitialEs
     R_B0B = rotations(imu)
     _check_parallax(window, R_B0B, calibration)
 
-    window, structure = _structure(window, R_B0B @ calibration.R_BC, sigma)
-    alignment = align(structure.position, imu[:-1], calibration.p_BC, BIAS_ACCEL_SIGMA)
+    window, structure = _structure(window, R_B0B @ calibration.cameras[0].R_BC, sigma)
+    alignment = align(structure.position, imu[:-1], calibration.cameras[0].p_BC, BIAS_ACCEL_SIGMA)
     if alignment.scale <= 0.0:
         raise RefusalError("the readings contradict the direction of the motion in the images")
     x = _start_of_adjustment(window.without_last(), structure, alignment, bias_gyro, calibration)
@@ -115,7 +115,7 @@ def _preintegrate(
 def _with_gyro_bias(window: Window, calibration: Calibration, sigma: float) -> tuple[Window, Float]:
     """The tracks that lie on their epipolar lines, and the gyroscope's bias (3,) that puts them there."""
     imu = _preintegrate(window, np.zeros(3), np.zeros(3), calibration)
-    bias, distance = estimate_gyro_bias(window, imu, calibration.R_BC, sigma, BIAS_GYRO_SIGMA)
+    bias, distance = estimate_gyro_bias(window, imu, calibration.cameras[0].R_BC, sigma, BIAS_GYRO_SIGMA)
     if np.linalg.norm(bias) > 3.0 * BIAS_GYRO_SIGMA:
         raise RefusalError(f"gyroscope bias of {np.linalg.norm(bias):.2f} rad/s is not plausible")
     window = window.only(distance < _EPIPOLAR_LIMIT)
@@ -156,14 +156,15 @@ def _start_of_adjustment(
 
 def _camera(calibration: Calibration) -> Calibrated:
     # Contiguous, as what the solver makes of it is: kernels are compiled for each layout that they meet.
-    return Calibrated(np.ascontiguousarray(calibration.R_BC), np.ascontiguousarray(calibration.p_BC))
+    camera = calibration.cameras[0]
+    return Calibrated(np.ascontiguousarray(camera.R_BC), np.ascontiguousarray(camera.p_BC))
 
 
 def _adjusted(window: Window, x: Variables, calibration: Calibration) -> tuple[Problem, Solution]:
     """The adjustment of ``window`` from ``x``, its readings integrated at the biases there."""
     biases = zip(x.states.bias_gyro_B[:-1], x.states.bias_accel_B[:-1], strict=True)
     imu = [preintegrate(segment, *bias, calibration.imu) for segment, bias in zip(window.segments, biases, strict=True)]
-    problem = adjustment(window, imu, x, calibration.camera.focal_px)
+    problem = adjustment(window, imu, x, calibration.cameras[0].model.focal_px)
     return problem, adjusted(problem, x)
 
 
@@ -208,11 +209,11 @@ def _estimate(window: Window, adjusted: StateArrays, cov: Float, p_WF: Float) ->
 def _check_parallax(window: Window, R_B0B: Float, calibration: Calibration) -> None:
     """The median track must move by enough pixels that the rotations ``R_B0B`` (K, 3, 3) do not explain."""
     rays = np.concatenate([window.xy, np.ones((*window.xy.shape[:2], 1))], axis=2)
-    rays_B0 = rays @ np.swapaxes(R_B0B @ calibration.R_BC, -1, -2)
+    rays_B0 = rays @ np.swapaxes(R_B0B @ calibration.cameras[0].R_BC, -1, -2)
     rays_B0 /= np.linalg.norm(rays_B0, axis=2, keepdims=True)
     first = rays_B0[window.seen.argmax(axis=0), np.arange(len(window.ids))]
     angle = np.nanmax(np.linalg.norm(rays_B0 - first, axis=2), axis=0)
-    parallax = float(np.median(angle)) * calibration.camera.focal_px
+    parallax = float(np.median(angle)) * calibration.cameras[0].model.focal_px
     if not parallax >= _LEAST_PARALLAX_PX:
         raise RefusalError(f"parallax of {parallax:.1f} px, {_LEAST_PARALLAX_PX:.1f} px are needed")
 
@@ -244,13 +245,14 @@ def _check_lookahead(
     calibration: Calibration,
 ) -> None:
     """States predicted by the readings must see the landmarks ``ids`` (L,), ``p_WF`` (L, 3) where the frames do."""
+    camera = calibration.cameras[0]
     for state, tracks in zip(predicted, seen, strict=True):
         _, a, b = np.intersect1d(ids, tracks.ids, return_indices=True)
         if len(a) < _FEWEST_COMMON:
             raise RefusalError(f"only {len(a)} landmarks were still tracked in the frames held back")
-        p_C = ((p_WF[a] - state.p_WB) @ state.R_WB - calibration.p_BC) @ calibration.R_BC
+        p_C = ((p_WF[a] - state.p_WB) @ state.R_WB - camera.p_BC) @ camera.R_BC
         error = np.linalg.norm(p_C[:, :2] / p_C[:, 2:] - tracks.xy_normalised[b], axis=1)
-        px = float(np.median(np.where(p_C[:, 2] > 0.0, error, np.inf))) * calibration.camera.focal_px
+        px = float(np.median(np.where(p_C[:, 2] > 0.0, error, np.inf))) * camera.model.focal_px
         if not px <= _LARGEST_LOOKAHEAD_PX:
             raise RefusalError(f"the prediction misses a later frame by {px:.1f} px")
 

@@ -74,7 +74,7 @@ class RotationCalibrator:
     """
 
     def __init__(self, calibration: Calibration) -> None:
-        self._noise, self._focal_px = calibration.imu, calibration.camera.focal_px
+        self._noise, self._focal_px = calibration.imu, calibration.cameras[0].model.focal_px
         self._tracks: deque[FrameTracks] = deque(maxlen=_MOST_KEYFRAMES)
         self._imu: deque[Preintegrated] = deque(maxlen=_MOST_KEYFRAMES - 1)
         self._since_keyframe: list[ImuSegment] = []

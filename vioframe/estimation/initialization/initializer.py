@@ -26,17 +26,15 @@ _IN_MOTION = 2.0
 class Initializer:
     """Tries the static method at every frame, and the dynamic one every so often, until one is sure of itself.
 
-    With ``unknown_camera_rotation`` both wait for the hand-eye calibration of the camera's rotation, which is
-    done once. ``imu_noise_factor`` is what the back-end multiplies the IMU's white noise by
-    (:meth:`~vioframe.types.ImuNoise.in_flight`). Every attempt is logged to ``vioframe.estimation.initialization``.
+    Where the camera's rotation on the body is not known both wait for its hand-eye calibration, which is done once.
+    ``imu_noise_factor`` is that of :meth:`~vioframe.types.ImuNoise.in_flight`. Every attempt is logged to
+    ``vioframe.estimation.initialization``.
     """
 
-    def __init__(
-        self, calibration: Calibration, *, imu_noise_factor: float = 4.0, unknown_camera_rotation: bool = False
-    ) -> None:
+    def __init__(self, calibration: Calibration, imu_noise_factor: float = 4.0) -> None:
         self._calibration = calibration
         self._in_flight = replace(calibration, imu=calibration.imu.in_flight(_IN_MOTION * imu_noise_factor))
-        self._calibrator = RotationCalibrator(calibration) if unknown_camera_rotation else None
+        self._calibrator = None if calibration.cameras[0].rotation_known else RotationCalibrator(calibration)
         self._camera_rotation: CameraRotation | None = None
         self._refusals: dict[str, str] = {}
         self._packets: list[Packet] = []
@@ -95,8 +93,8 @@ class Initializer:
             return False
         self._refusals.clear()
         self._calibrator, self._camera_rotation = None, found
-        self._calibration = replace(self._calibration, R_BC=found.R_BC)
-        self._in_flight = replace(self._in_flight, R_BC=found.R_BC)
+        self._calibration = self._calibration.with_camera(0, R_BC=found.R_BC, rotation_known=True)
+        self._in_flight = self._in_flight.with_camera(0, R_BC=found.R_BC, rotation_known=True)
         return True
 
     def _static(self) -> InitialEstimate | None:

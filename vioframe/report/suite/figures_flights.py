@@ -10,12 +10,12 @@ import numpy as np
 
 from vioframe.evaluation import TrajectoryErrors
 from vioframe.evaluation.metrics import rotation_error_deg
-from vioframe.report.evaluated import Evaluated
 from vioframe.report.style import TRUTH
 from vioframe.report.suite.captions import data_caption
 from vioframe.report.suite.look import Look, explain, legend
 from vioframe.report.suite.pooled import BAND_M, inside
 from vioframe.report.suite.statistics import Group
+from vioframe.runs.evaluated import Evaluated
 from vioframe.types import NS_PER_S, Float, Int
 
 if TYPE_CHECKING:

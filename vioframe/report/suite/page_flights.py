@@ -8,13 +8,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vioframe.evaluation import TrajectoryErrors
-from vioframe.report.evaluated import Evaluated
-from vioframe.report.rows import ALIGNED_BY
+from vioframe.evaluation import ALIGNED_BY, TrajectoryErrors
 from vioframe.report.suite.page_blocks import Case, Plot
 from vioframe.report.suite.page_look import BAND_COLOUR, TRUTH_COLOUR, Look, axes, compact, panels, picture
 from vioframe.report.suite.pooled import BAND_M
 from vioframe.report.suite.statistics import CLEAR, Group, by_course
+from vioframe.runs.evaluated import Evaluated
 from vioframe.types import NS_PER_S, Float
 
 if TYPE_CHECKING:

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vioframe.bench.consistency import PARTS
-from vioframe.bench.consistency import Outcome as Trials
+from vioframe.evaluation.consistency import PARTS
+from vioframe.evaluation.consistency import Outcome as Trials
 from vioframe.report.suite.page_blocks import Case, Plot
 from vioframe.report.suite.page_look import BAND_COLOUR, TRUTH_COLOUR, Look, axes, compact, panels, picture
 from vioframe.report.suite.results import Data, TaskResult

@@ -20,10 +20,10 @@ from vioframe.evaluation import TrajectoryErrors, evaluate
 from vioframe.geometry.trajectory import Trajectory
 from vioframe.io.trajectories import load_trajectory
 from vioframe.parts.config import read_tree
+from vioframe.runs.evaluated import MATCHED_TRUTH
 from vioframe.runs.folder import RunFolder
 
 SUITE_FILE, TASKS_FOLDER, TASK_FILE, RUN_FOLDER = "suite.yaml", "tasks", "task.json", "run"
-MATCHED_TRUTH = "ground_truth_matched.tum"
 
 
 class Kind(StrEnum):

@@ -8,14 +8,15 @@ from collections.abc import Iterable, Mapping, Sequence
 from shlex import quote
 from typing import Any
 
-from vioframe.bench.consistency import PARTS
+from vioframe.evaluation.consistency import PARTS
 from vioframe.report.suite.captions import data_caption, links, run_path, task_path
 from vioframe.report.suite.flights import Flight
-from vioframe.report.suite.results import MATCHED_TRUTH, SuiteResults, TaskResult
+from vioframe.report.suite.results import SuiteResults, TaskResult
 from vioframe.report.suite.statistics import Group
 from vioframe.report.suite.table import Column, Row, Table, mean, number, text
 from vioframe.report.suite.tables_accuracy import LABELS, labels
 from vioframe.report.suite.trials import Campaign
+from vioframe.runs.evaluated import MATCHED_TRUTH
 
 _FACTS = ("vioframe", "commit", "python", "platform", "cpu", "cpu_count", "memory_gib", "threads")
 

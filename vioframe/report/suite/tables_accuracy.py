@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-from vioframe.report.rows import ALIGNED_BY
+from vioframe.evaluation import ALIGNED_BY
 from vioframe.report.suite.captions import condition_text, data_caption, links, runs_caption
 from vioframe.report.suite.flights import Flight
 from vioframe.report.suite.pooled import BAND_M, ate_sim3_m, inside_band

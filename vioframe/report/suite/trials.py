@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vioframe.bench.consistency import PARTS, Outcome, Trial
+from vioframe.evaluation.consistency import PARTS, Outcome, Trial
 from vioframe.report.suite.captions import condition_text, task_path
 from vioframe.report.suite.results import Kind, Labels, SuiteResults, TaskResult
 from vioframe.report.suite.statistics import listed_names

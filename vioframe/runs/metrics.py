@@ -8,18 +8,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from numbers import Real
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from vioframe.errors import PluginError, TrajectoryError, VioframeError
 from vioframe.evaluation import Comparison
 from vioframe.interfaces import Metric
 from vioframe.parts.config import parse_part
 from vioframe.parts.registry import METRIC, Part, Registry, describe
-
-if TYPE_CHECKING:
-    from vioframe.report.evaluated import Evaluated
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,23 +72,6 @@ def measure(metrics: Sequence[AskedMetric], comparison: Comparison) -> Measured:
         except Exception as error:
             raise PluginError(f"{asked.part} failed: {describe(error)}; leave it out or repair it") from error
     return Measured(figures, left_out)
-
-
-def measure_runs(runs: Sequence[Evaluated], metrics: Sequence[AskedMetric]) -> list[Evaluated]:
-    """``runs`` with what ``metrics`` say about those that have both an estimate and the truth.
-
-    However a run was aligned for its table, metrics get it aligned by position and yaw, so that one and the same figure
-    never means two things.
-    """
-    return [replace(run, measured=measure(metrics, found)) if (found := _comparison(run)) else run for run in runs]
-
-
-def _comparison(run: Evaluated) -> Comparison | None:
-    if run.estimate is None or run.ground_truth is None or run.errors is None:
-        return None
-    if run.errors.alignment_name == "posyaw":
-        return Comparison(run.estimate, run.ground_truth, run.errors)
-    return Comparison.of(run.estimate, run.ground_truth)
 
 
 def _checked(part: Part, figures: Any) -> dict[str, float]:

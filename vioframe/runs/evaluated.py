@@ -10,14 +10,19 @@ from typing import Any
 
 import numpy as np
 
-from vioframe.errors import VioframeError
-from vioframe.evaluation import TrajectoryErrors, evaluate
+from vioframe.errors import RunError, VioframeError
+from vioframe.evaluation import Comparison, TrajectoryErrors, associate, evaluate
+from vioframe.evaluation.landmarks import Landmarks, belonging
+from vioframe.evaluation.map_quality import MapQuality
 from vioframe.geometry.trajectory import Trajectory
-from vioframe.io.trajectories import load_trajectory
-from vioframe.report.map_quality import MapQuality
-from vioframe.report.metrics import Measured
+from vioframe.io.trajectories import load_trajectory, write_tum
 from vioframe.runs.folder import RunFolder
+from vioframe.runs.metrics import AskedMetric, Measured, measure
+from vioframe.runs.recorder import write_ply
 from vioframe.types import NS_PER_S, Int
+
+MATCHED_TRUTH = "ground_truth_matched.tum"
+"""The true pose at every stamp that was estimated, for tools that only pair equal stamps, such as evo."""
 
 _RUN_FIGURES = (
     "dataset",
@@ -40,7 +45,7 @@ class Evaluated:
     """``folder`` is None for a bare trajectory file; ``errors`` where there is no pose or no ground truth.
 
     ``map_quality`` is there where :func:`~vioframe.report.map_quality.measure_maps` found a world to compare with,
-    ``measured`` where :func:`~vioframe.report.metrics.measure_runs` was asked for metrics.
+    ``measured`` where :func:`measure_runs` was asked for metrics.
     ``segment_starts_ns`` are the stamps at which tracking began again after a reset. What loop closure made of a run is
     an evaluation of its own, without a folder. ``kept_in`` is the file of the run folder that an evaluation belongs in.
     """
@@ -58,6 +63,19 @@ class Evaluated:
     @property
     def summary(self) -> Mapping[str, Any]:
         return self.folder.summary if self.folder else {}
+
+    @property
+    def aligned(self) -> Trajectory | None:
+        """The whole estimate, also where the ground truth does not reach, in its world where there is one."""
+        return self.errors.alignment.apply(self.estimate) if self.errors and self.estimate else self.estimate
+
+    def landmarks(self) -> Landmarks | None:
+        """The landmarks in the same world, without those that stand alone; None where there are none."""
+        landmarks = self.folder.landmarks() if self.folder else None
+        if landmarks is None or not len(landmarks):
+            return None
+        kept = landmarks.select(belonging(landmarks.p_WF))
+        return kept.moved(self.errors.alignment) if self.errors else kept
 
     def breaks(self, t_ns: Int) -> Int:
         """Indices into the ascending stamps (N,) of poses that a line must not lead to: they begin a stretch anew."""
@@ -133,3 +151,51 @@ def evaluate_paths(
         replace(run, name=str(path)) if times[run.name] > 1 else run for path, run in zip(paths, evaluated, strict=True)
     ]
     return [each for run in named for each in (run, with_loop_closure(run, alignment)) if each is not None]
+
+
+def write_matched_truth(run_folder: str | Path) -> Path | None:
+    """Write :data:`MATCHED_TRUTH` beside the trajectory of a run; None where there is nothing to pair.
+
+    The pairing is that of :func:`vioframe.evaluation.evaluate`, so that whoever aligns ``trajectory.tum`` with it by
+    SE(3) finds ``ate_se3_m``. Raises :class:`RunError` or :class:`TrajectoryError` as reading the run does.
+    """
+    run = RunFolder.open(run_folder)
+    estimate, truth = run.trajectory(), run.ground_truth()
+    if estimate is None or truth is None:
+        return None
+    path = run.path / MATCHED_TRUTH
+    write_tum(associate(estimate, truth)[1], path)
+    return path
+
+
+def measure_runs(runs: Sequence[Evaluated], metrics: Sequence[AskedMetric]) -> list[Evaluated]:
+    """``runs`` with what ``metrics`` say about those that have both an estimate and the truth.
+
+    However a run was aligned for its table, metrics get it aligned by position and yaw, so that one and the same figure
+    never means two things.
+    """
+    return [replace(run, measured=measure(metrics, found)) if (found := _comparison(run)) else run for run in runs]
+
+
+def _comparison(run: Evaluated) -> Comparison | None:
+    if run.estimate is None or run.ground_truth is None or run.errors is None:
+        return None
+    if run.errors.alignment_name == "posyaw":
+        return Comparison(run.estimate, run.ground_truth, run.errors)
+    return Comparison.of(run.estimate, run.ground_truth)
+
+
+def export_map(run: Evaluated, path: Path) -> int:
+    """Write :meth:`Evaluated.landmarks` to a PLY file as ``map.ply`` is one, and return their number.
+
+    Raises :class:`RunError` where the run has no landmarks or the file cannot be written.
+    """
+    landmarks = run.landmarks()
+    if landmarks is None:
+        raise RunError(f"{run.name} has no landmarks: only a run folder whose map.ply holds some has a map to write")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_ply(path, landmarks.by_id())
+    except OSError as error:
+        raise RunError(f"cannot write {path}: {error.strerror}; choose another name") from error
+    return len(landmarks)

@@ -1,0 +1,176 @@
+"""The life of an estimate, the same for every back-end: it begins, follows, stands still, is lost and begins again.
+
+A back-end is its mathematics and nothing else: how it begins from a state, and what it does with a frame.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from vioframe.errors import ConfigError, DivergedError, PluginError
+from vioframe.estimation import initialization
+from vioframe.estimation.initialization import Initializer
+from vioframe.estimation.options import EstimationOptions
+from vioframe.estimation.recovery import check_plausible, continued_from
+from vioframe.estimation.soundness import defect_of
+from vioframe.estimation.standstill import StandstillDetector
+from vioframe.interfaces import Backend
+from vioframe.stopwatch import Stopwatch
+from vioframe.types import (
+    NS_PER_S,
+    Calibration,
+    CalibrationEstimate,
+    CameraSigma,
+    Estimate,
+    Float,
+    FrameTracks,
+    ImuSegment,
+    NavState,
+    Start,
+    Status,
+    g_W,
+)
+
+# How well a calibration is known (rad, m, s, px, distortion), as published for OpenVINS on EuRoC.
+_SIGMA_ROTATION, _SIGMA_POSITION, _SIGMA_OFFSET, _SIGMA_PIXELS, _SIGMA_DISTORTION = 0.005, 0.015, 0.01, 1.0, 0.005
+
+# The flight that compiles everything: frames, and how far the camera moves between two.
+_WARM_UP_FRAMES, _WARM_UP_PERIOD_NS, _WARM_UP_STEP_M = 30, NS_PER_S // 10, 0.2
+
+
+class LifeCycle:
+    """Takes ``backend``, called ``name`` in errors, through a flight, one frame at a time.
+
+    ``initial_state``, with covariance, stands for the state at the first frame and spares the initialisation; the
+    camera's rotation on the body must be known then.
+    """
+
+    def __init__(
+        self,
+        backend: Backend,
+        calibration: Calibration,
+        options: EstimationOptions | None = None,
+        initial_state: NavState | None = None,
+        name: str | None = None,
+    ) -> None:
+        camera = calibration.single("the initialisation")
+        if initial_state is not None and (initial_state.cov is None or not camera.rotation_known):
+            raise ConfigError("an initial state needs a covariance, and a camera whose rotation on the body is known")
+        self._options = options or EstimationOptions()
+        self._backend, self._name = backend, name or type(backend).__name__
+        self._initializer = Initializer(calibration, self._options.imu_noise_factor)
+        self._standstill = StandstillDetector(self._options.standstill_disparity_px)
+        self._initial_state = initial_state
+        self._following = False
+        self._last: NavState | None = None
+        self._corrected_ns = 0
+        self._known = CalibrationEstimate(calibration, (_prior(None),))
+
+    def process(self, imu: ImuSegment, tracks: FrameTracks) -> Estimate:
+        """Begin, or follow one frame; where that fails it says so, and begins anew from where it was."""
+        tracks = tracks.finite()
+        still = self._standstill.sees_standstill(tracks) and self._options.zero_velocity_update
+        if not self._following:
+            return self._begin(imu, tracks)
+        try:
+            estimate = self._backend.process(imu, tracks, still)
+            if (defect := defect_of(estimate, tracks.t_ns)) is not None:
+                raise PluginError(f"the back-end {self._name} at {tracks.t_ns} ns: {defect}; repair the plug-in")
+            self._check(estimate, tracks.t_ns)
+        except (DivergedError, np.linalg.LinAlgError) as error:
+            return self._lose(str(error))
+        self._last = estimate.state
+        if estimate.calibration is None:
+            return replace(estimate, calibration=self._known)
+        return estimate
+
+    def _begin(self, imu: ImuSegment, tracks: FrameTracks) -> Estimate:
+        if self._initial_state is not None:
+            state, self._initial_state = self._initial_state, None
+            return self._begun(self._start(state, imu, tracks), Stopwatch(), "state given")
+        watch = Stopwatch()
+        initial = self._initializer.add(imu, tracks)
+        watch.lap("initialise")
+        if initial is None:
+            refusal = self._initializer.refusal
+            refused = (f"initialisation refused: {refusal}",) if refusal else ()
+            return Estimate(Status.INITIALISING, events=refused, stage_seconds=watch.seconds)
+        state = initial.states[-1]
+        if self._last is not None:
+            state = continued_from(self._last, state)
+        return self._begun(self._start(state, imu, tracks), watch, initial.method)
+
+    def _begun(self, start: Start, watch: Stopwatch, method: str) -> Estimate:
+        self._backend.begin(start)
+        self._following, self._last, self._known = True, start.state, start.calibration
+        self._corrected_ns = start.state.t_ns
+        events = [f"initialised ({method})"]
+        if (found := self._initializer.camera_rotation) is not None:
+            events.append(str(found))
+        return Estimate(
+            Status.TRACKING,
+            start.state,
+            calibration=start.calibration,
+            events=tuple(events),
+            stage_seconds=watch.seconds,
+        )
+
+    def _start(self, state: NavState, imu: ImuSegment, tracks: FrameTracks) -> Start:
+        """From ``state``, with the camera's rotation that was found if it was unknown."""
+        found = self._initializer.camera_rotation
+        calibration = self._initializer.calibration
+        flying = replace(calibration, imu=calibration.imu.in_flight(self._options.imu_noise_factor))
+        prior = CalibrationEstimate(flying, (_prior(None if found is None else found.cov),))
+        return Start(state, prior, calibration.imu, imu, tracks)
+
+    def _check(self, estimate: Estimate, t_ns: int) -> None:
+        """Raise :class:`DivergedError` where the estimate can no longer be believed."""
+        if estimate.state is not None:
+            check_plausible(estimate.state)
+        if estimate.corrected:
+            self._corrected_ns = t_ns
+        blind_s = (t_ns - self._corrected_ns) * 1e-9
+        if blind_s > self._options.max_blind_s:
+            raise DivergedError(f"nothing usable was seen for {blind_s:.1f} s")
+
+    def _lose(self, why: str) -> Estimate:
+        self._following = False
+        self._initializer.reset()
+        return Estimate(Status.LOST, events=(f"lost: {why}",))
+
+
+def _prior(rotation_cov: Float | None) -> CameraSigma:
+    """How well a camera's calibration is known to begin with, its rotation as it was found, if it was."""
+    rotation = np.full(3, _SIGMA_ROTATION) if rotation_cov is None else np.sqrt(np.diag(rotation_cov))
+    intrinsics = np.repeat([_SIGMA_PIXELS, _SIGMA_DISTORTION], 4)
+    return CameraSigma(rotation, np.full(3, _SIGMA_POSITION), _SIGMA_OFFSET, intrinsics)
+
+
+def warm_up(backend: Backend, calibration: Calibration) -> None:
+    """Fly ``backend``, which is of no use afterwards, sideways along a wall of points that come and go.
+
+    Long enough to come through every step of a window of some ten frames once, so that all compiled code is there, or
+    loaded from the cache, before the first frame of a flight.
+    """
+    initialization.warm_up(calibration)
+    camera = calibration.cameras[0]
+    right_W = camera.R_BC[:, 0]
+    rng = np.random.default_rng(0)
+    wall_C = rng.uniform([-1.5, -1.0, 3.0], [_WARM_UP_FRAMES * _WARM_UP_STEP_M + 1.5, 1.0, 5.0], (600, 3))
+    cov = 1e-4 * np.eye(15)
+    speed = _WARM_UP_STEP_M / (_WARM_UP_PERIOD_NS / NS_PER_S)
+    state = NavState(0, np.eye(3), np.zeros(3), speed * right_W, np.zeros(3), np.zeros(3), cov)
+    for k in range(_WARM_UP_FRAMES):
+        t_ns = np.linspace((k - 1) * _WARM_UP_PERIOD_NS, k * _WARM_UP_PERIOD_NS, 3).astype(np.int64)
+        imu = ImuSegment(t_ns, np.zeros((3, 3)), np.tile(-g_W, (3, 1)))
+        p_C = wall_C - [k * _WARM_UP_STEP_M, 0.0, 0.0]
+        ids = np.flatnonzero(np.abs(p_C[:, 0] / p_C[:, 2]) < 0.35)
+        xy_normalised = p_C[ids, :2] / p_C[ids, 2:]
+        xy = camera.model.distort(xy_normalised)
+        tracks = FrameTracks(int(t_ns[-1]), ids, np.zeros_like(ids), xy, xy_normalised)
+        if k == 0:
+            backend.begin(Start(state, CalibrationEstimate(calibration, (_prior(None),)), calibration.imu, imu, tracks))
+        else:
+            backend.process(imu, tracks, False)

@@ -1,0 +1,31 @@
+"""What can be chosen about the estimation, whatever the back-end."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from vioframe.errors import ConfigError
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EstimationOptions:
+    """What every back-end's estimate has in common; raises :class:`ConfigError` on a value out of range."""
+
+    imu_noise_factor: float = 4.0
+    """How many times the calibration's white IMU noise is assumed in flight, where vibration adds to the sensor's own;
+    1 for an exact simulation."""
+    zero_velocity_update: bool = True
+    """Recognise standstill and use it."""
+    standstill_disparity_px: float = 0.7
+    """Median image motion over half a second below which the camera may be standing still."""
+    max_blind_s: float = 4.0
+    """Seconds in which nothing seen corrects the estimate, after which it is given up and begun anew."""
+
+    def __post_init__(self) -> None:
+        for name in ("imu_noise_factor", "max_blind_s"):
+            if not getattr(self, name) > 0.0:
+                raise ConfigError(f"estimation option {name} must be more than zero, got {getattr(self, name)!r}")
+        if not self.standstill_disparity_px >= 0.0:
+            raise ConfigError(
+                f"estimation option standstill_disparity_px must be zero or more, got {self.standstill_disparity_px!r}"
+            )

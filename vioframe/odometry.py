@@ -1,0 +1,169 @@
+"""Visual-inertial odometry, measurement by measurement: push what the sensors bring, get what is known after each frame.
+
+    measurements -> packets -> tracks -> estimate -> files -> report
+
+:class:`Odometry` is the main loop. A recording is pushed through it by :mod:`vioframe.pipeline`, a live camera by anybody;
+a recorder, a progress bar and a loop closer are consumers of the :class:`~vioframe.types.Step` objects it gives.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from functools import cache
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from vioframe.errors import DatasetError
+from vioframe.estimation.lifecycle import LifeCycle, warm_up
+from vioframe.estimation.options import EstimationOptions
+from vioframe.frontend import Frontend, FrontendOptions
+from vioframe.incidents import Incidents
+from vioframe.interfaces import Backend, Detector
+from vioframe.io.synchronise import Synchroniser
+from vioframe.parts import registry
+from vioframe.parts.registry import Registry
+from vioframe.types import (
+    Calibration,
+    FrameSet,
+    FrameTracks,
+    Image,
+    ImuSample,
+    ImuSegment,
+    Measurement,
+    NavState,
+    Step,
+)
+
+# More threads than this gain nothing on images of this size, and cost on machines that have many.
+_MAX_OPENCV_THREADS = 4
+
+
+class Odometry:
+    """Estimates motion from a camera and an IMU as their measurements come in; the same input gives the same bytes.
+
+    ``detector`` and ``backend`` are names of installed parts, with their options beside them, or the parts themselves.
+    ``initial_state``, with covariance, stands for the state at the first frame and spares the initialisation.
+
+    A frame waits until readings from ``wait_ms`` behind it are there, so that a reading may come that much later than
+    its turn. In a stream in order 0 gives the least latency: the first reading at or behind a frame lets it go.
+
+    ``incidents`` counts what was handled on the way: dropped samples, unusable images, failing detectors.
+    """
+
+    def __init__(
+        self,
+        calibration: Calibration,
+        detector: str | Detector = "shi_tomasi",
+        backend: str | Backend = "msckf",
+        *,
+        detector_options: Mapping[str, Any] | None = None,
+        backend_options: Mapping[str, Any] | None = None,
+        frontend: FrontendOptions | None = None,
+        estimation: EstimationOptions | None = None,
+        initial_state: NavState | None = None,
+        wait_ms: float = 50.0,
+        incidents: Incidents | None = None,
+        installed: Registry | None = None,
+    ) -> None:
+        self._registry = registry.load() if installed is None else installed
+        self.incidents = Incidents() if incidents is None else incidents
+        if isinstance(detector, str):
+            detector = self._registry.create_detector(detector, detector_options)
+        name = None
+        if isinstance(backend, str):
+            name = str(self._registry.find(registry.BACKEND, backend))
+            warm = self._registry.create_backend(backend, backend_options)
+            with self._registry.blaming(), limited_threads():
+                warm_up(warm, calibration)
+            backend = self._registry.create_backend(backend, backend_options)
+        camera = calibration.single("the odometry")
+        self._frontend = Frontend(detector, calibration, frontend or FrontendOptions(), self.incidents)
+        self._life = LifeCycle(backend, calibration, estimation, initial_state, name)
+        self._synchroniser = Synchroniser(self.incidents, time_offset_ns=camera.time_offset_ns, wait_ms=wait_ms)
+        self._waiting_tracks: dict[int, FrameTracks] = {}
+        self.calibration = self._given = calibration
+        """What is known of the rig by now: as given at first, then as the back-end has learned it."""
+
+    def add(self, measurement: Measurement) -> list[Step]:
+        """Take one measurement; the steps of the frames that are complete by it."""
+        return [self._step(imu, frames) for imu, frames in self._synchroniser.add(measurement)]
+
+    def add_imu(self, t_ns: ArrayLike, gyro_B: ArrayLike, accel_B: ArrayLike) -> list[Step]:
+        """Take readings at ``t_ns`` (N,) of the IMU's clock: (N, 3) rad/s and (N, 3) m/s^2; or a single one."""
+        stamps = np.atleast_1d(np.asarray(t_ns, np.int64))
+        gyro, accel = (np.asarray(a, np.float64).reshape(-1, 3) for a in (gyro_B, accel_B))
+        if not len(stamps) == len(gyro) == len(accel):
+            raise DatasetError(f"{len(stamps)} stamps came with {len(gyro)} and {len(accel)} readings; give one each")
+        samples = (ImuSample(*reading) for reading in zip(stamps.tolist(), gyro, accel, strict=True))
+        return [step for sample in samples for step in self.add(sample)]
+
+    def add_images(self, t_ns: int, *images: Image | None) -> list[Step]:
+        """Take the images of one exposure at ``t_ns`` of the camera's clock, (H, W) uint8, in the order of the rig."""
+        if len(images) != len(self.calibration.cameras) or all(image is None for image in images):
+            raise DatasetError(f"{len(images)} images came for a rig of {len(self.calibration.cameras)} cameras")
+        return self.add(FrameSet(int(t_ns), images))
+
+    def add_tracks(self, tracks: FrameTracks, images: tuple[Image | None, ...] = ()) -> list[Step]:
+        """Take a frame whose points somebody else has tracked, in the place of its images; detector and tracker rest.
+
+        ``images`` are passed on to the consumers of the step, such as a loop closer.
+        """
+        self._waiting_tracks[tracks.t_ns] = tracks
+        return self.add(FrameSet(tracks.t_ns, images))
+
+    def finish(self) -> list[Step]:
+        """The steps of the frames that still wait for readings: nothing more will come."""
+        return [self._step(imu, frames) for imu, frames in self._synchroniser.finish()]
+
+    def follow(self, measurements: Iterable[Measurement]) -> Iterator[Step]:
+        """The steps of a whole stream, to its end."""
+        for measurement in measurements:
+            yield from self.add(measurement)
+        yield from self.finish()
+
+    def _step(self, imu: ImuSegment, frames: FrameSet) -> Step:
+        with limited_threads(), self._registry.blaming():
+            tracks = self._waiting_tracks.pop(frames.t_ns, None)
+            seconds: Mapping[str, float] = {}
+            if tracks is None:
+                tracks = self._frontend.track(imu, frames, self._given)
+                seconds = self._frontend.stage_seconds
+            begin = perf_counter()
+            estimate = self._life.process(imu, tracks)
+            backend_s = perf_counter() - begin
+        if estimate.calibration is not None:
+            self.calibration = estimate.calibration.calibration
+        within = {f"backend.{stage}": seconds for stage, seconds in estimate.stage_seconds.items()}
+        return Step(frames, tracks, estimate, {**seconds, "backend": backend_s, **within})
+
+
+@contextmanager
+def limited_threads() -> Iterator[None]:
+    """One BLAS thread, and few of OpenCV's, as long as it lasts.
+
+    numpy and scipy bring a BLAS each; on matrices this small their threads only wait for one another.
+    """
+    import cv2
+
+    before = cv2.getNumThreads()
+    if before > _MAX_OPENCV_THREADS:
+        cv2.setNumThreads(_MAX_OPENCV_THREADS)
+    try:
+        with _blas_libraries().limit(limits=1):
+            yield
+    finally:
+        if before > _MAX_OPENCV_THREADS:
+            cv2.setNumThreads(before)
+
+
+@cache
+def _blas_libraries() -> Any:
+    """A handle on the libraries that are loaded by now: finding them takes a while, so it is done once."""
+    import scipy.linalg  # noqa: F401  its BLAS is to be among them
+    from threadpoolctl import ThreadpoolController
+
+    return ThreadpoolController().select(user_api="blas")

@@ -1,0 +1,1 @@
+"""The run folder: written by the recorder, read by evaluation and reports."""
