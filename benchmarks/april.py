@@ -9,10 +9,10 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
+from april_board import april_sequence, board_poses, read_board_views, reprojection_px
 from common import BACKEND_COLUMNS, backend_rows, benchmark, present
 
 from vioframe.bench import Row
-from vioframe.bench.april import april_sequence, board_poses, read_board_views, reprojection_px
 from vioframe.simulation import TrackSequence
 
 

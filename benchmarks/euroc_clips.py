@@ -14,11 +14,11 @@ from tempfile import TemporaryDirectory
 import click
 import numpy as np
 from common import benchmark, present
+from vioframe.experiment import prepare, record
 
 from vioframe.bench import Row
 from vioframe.bench.detectors.entrants import line_up, parse_entrants
 from vioframe.evaluation import evaluate
-from vioframe.experiment import prepare, record
 from vioframe.io.convert import convert
 from vioframe.parts import config as configuration
 from vioframe.parts import registry

@@ -12,7 +12,7 @@ from common import SHARED_DATA, present
 from threadpoolctl import threadpool_limits
 
 from vioframe.bench import Row
-from vioframe.bench.epipolar import epipolar_errors_px
+from vioframe.evaluation.epipolar import epipolar_errors_px
 from vioframe.frontend import Frontend, FrontendOptions
 from vioframe.incidents import Incidents
 from vioframe.interfaces import Dataset

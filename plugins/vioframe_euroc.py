@@ -5,7 +5,6 @@ A camera is a folder with a table ``data.csv`` and a folder ``data`` of images.
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Iterator, Mapping
 from heapq import merge
 from itertools import islice
@@ -17,7 +16,7 @@ import numpy as np
 from vioframe.errors import DatasetError
 from vioframe.interfaces import DatasetFactory
 from vioframe.io.calibration import match_cameras
-from vioframe.io.images import check_bit_depth, check_size, decode_image, gathered, single, to_gray8
+from vioframe.io.images import check_bit_depth, decode_image, frame_set, gathered
 from vioframe.parts.hooks import hookimpl
 from vioframe.types import FrameSet, ImuSample, Measurement, Unreadable
 
@@ -44,8 +43,8 @@ class EurocDataset:
         self._mav0 = _mav0(path)
         self._bit_depth = bit_depth
         wanted = [cameras] if isinstance(cameras, str) else cameras
-        folders = self._camera_folders(wanted)
         imu_file = self._table(imu)
+        folders = self._camera_folders(wanted)
         if calibration:
             files = [calibration] if isinstance(calibration, Path) else calibration
         else:
@@ -88,10 +87,8 @@ class EurocDataset:
 
     @property
     def frame_count(self) -> int:
-        counts: Counter[int] = Counter()
-        for camera in range(len(self._folders)):
-            counts |= Counter(t_ns for t_ns, place, _ in self._images if place == camera)
-        return counts.total()
+        stamps = [t_ns for t_ns, _, _ in self._images]
+        return len(stamps) if len(self._folders) == 1 else len(set(stamps))
 
     @property
     def ground_truth(self) -> Trajectory | None:
@@ -125,9 +122,7 @@ class EurocDataset:
             return Unreadable(t_ns, "frame_unreadable", f"{path.name}: {err.strerror}")
         if image is None:
             return Unreadable(t_ns, "frame_unreadable", f"{path.name} is damaged")
-        gray = to_gray8(image, self._bit_depth, str(folder))
-        check_size(gray, self.calibration.cameras[place].model, str(folder))
-        return single(t_ns, gray, place, len(self._folders))
+        return frame_set(t_ns, image, place, self.calibration, self._bit_depth, str(folder))
 
 
 def _mav0(path: Path) -> Path:

@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING, Annotated
 import numpy as np
 from pydantic import Field
 
+from vioframe.arrays import Float
 from vioframe.parts.hooks import hookimpl
-from vioframe.types import GRAVITY_M_S2, Float
+from vioframe.types import GRAVITY_M_S2
 
 if TYPE_CHECKING:
     from vioframe.interfaces import FlightFactory

@@ -23,10 +23,10 @@ from numpy.typing import NDArray
 from vioframe.errors import DatasetError
 from vioframe.interfaces import DatasetFactory
 from vioframe.io.calibration import PACKAGED, match_cameras, sidecar_folder
-from vioframe.io.images import check_bit_depth, check_size, decode_image, gathered, single, to_gray8
+from vioframe.io.images import check_bit_depth, decode_image, frame_set, gathered
 from vioframe.io.writers import GROUND_TRUTH_TOPIC, TRUE_VECTOR_TOPICS
 from vioframe.parts.hooks import hookimpl
-from vioframe.types import NS_PER_S, Image, ImuSample, Measurement, Unreadable
+from vioframe.types import NS_PER_S, FrameSet, ImuSample, Measurement, Unreadable
 
 if TYPE_CHECKING:
     from rosbags.highlevel import AnyReader
@@ -72,8 +72,9 @@ class RosbagDataset:
             files = self._calibration_files(calibration, reader, topics)
             self.calibration, self._topics = match_cameras(files, topics, wanted)
             _log.info("%s: using %s and %s", path.name, ", ".join(self._topics), self._imu_topic)
-            for topic, camera in zip(self._topics, self.calibration.cameras, strict=True):
-                check_size(self._first_image(reader, topic), camera.model, self._where(topic))
+            for topic in self._topics:
+                if not any(isinstance(m, FrameSet) for m in self._messages(reader, topic)):
+                    raise DatasetError(f"{path}: no image of {topic} can be read")
             counts = [reader.topics[topic].msgcount for topic in self._topics]
         # Which images of several cameras belong together is told by their stamps: to count these is to read them all.
         self.frame_count: int | None = counts[0] if len(counts) == 1 else None
@@ -113,25 +114,19 @@ class RosbagDataset:
 
     def measurements(self) -> Iterator[Measurement]:
         """IMU samples and frames in the order in which they were recorded."""
-        return gathered(self._read())
-
-    def _read(self) -> Iterator[Measurement]:
-        cameras = self.calibration.cameras
         with _opened(self._path) as reader:
-            for topic, message in self._deserialized(reader, *self._topics, self._imu_topic):
-                if topic == self._imu_topic:
-                    yield _imu_sample(message)
-                    continue
-                image, place = self._image(topic, message), self._topics.index(topic)
-                if image is None:
-                    detail = f"the image's data on {topic} are damaged or incomplete"
-                    yield Unreadable(_stamp_ns(message), "frame_unreadable", detail)
-                else:
-                    check_size(image, cameras[place].model, self._where(topic))
-                    yield single(_stamp_ns(message), image, place, len(cameras))
+            yield from gathered(self._messages(reader, *self._topics, self._imu_topic))
 
-    def _where(self, topic: str) -> str:
-        return f"{self._path} [{topic}]"
+    def _messages(self, reader: AnyReader, *topics: str) -> Iterator[Measurement]:
+        for topic, message in self._deserialized(reader, *topics):
+            yield _imu_sample(message) if topic == self._imu_topic else self._frame(topic, message)
+
+    def _frame(self, topic: str, message: Any) -> FrameSet | Unreadable:
+        t_ns, where = _stamp_ns(message), f"{self._path} [{topic}]"
+        image = _raw_image(message, where) if hasattr(message, "encoding") else decode_image(message.data)
+        if image is None:
+            return Unreadable(t_ns, "frame_unreadable", f"the image's data on {topic} are damaged or incomplete")
+        return frame_set(t_ns, image, self._topics.index(topic), self.calibration, self._bit_depth, where)
 
     def _deserialized(self, reader: AnyReader, *topics: str) -> Iterator[tuple[str, Any]]:
         """Topic and message, in the order of recording; raises :class:`DatasetError` for damage."""
@@ -144,18 +139,6 @@ class RosbagDataset:
         except Exception as err:
             raise _damaged(self._path, err) from err
 
-    def _image(self, topic: str, message: Any) -> Image | None:
-        """The image of a message, None where it is damaged."""
-        raw = hasattr(message, "encoding")
-        image = _raw_image(message, self._where(topic)) if raw else decode_image(message.data)
-        return None if image is None else to_gray8(image, self._bit_depth, self._where(topic))
-
-    def _first_image(self, reader: AnyReader, topic: str) -> Image:
-        for _, message in self._deserialized(reader, topic):
-            if (image := self._image(topic, message)) is not None:
-                return image
-        raise DatasetError(f"{self._path}: no image of {topic} can be read")
-
     def _calibration_files(self, given: list[Path] | Path | None, reader: AnyReader, topics: list[str]) -> list[Path]:
         if given:
             return [given] if isinstance(given, Path) else given
@@ -163,7 +146,8 @@ class RosbagDataset:
         if sidecar.is_dir():
             return [sidecar]
         as_eurocs = [topic for topic in topics if topic in _EUROC_CAMERA_TOPICS and self._imu_topic == _EUROC_IMU_TOPIC]
-        if as_eurocs and self._first_image(reader, as_eurocs[0]).shape == _EUROC_SHAPE:
+        _, first = next(self._deserialized(reader, *as_eurocs), (None, None))
+        if hasattr(first, "height") and (first.height, first.width) == _EUROC_SHAPE:
             _log.warning(
                 "%s brings no calibration and looks like EuRoC: using EuRoC's published calibration", self._path.name
             )

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 
+from vioframe.arrays import Float, Image
 from vioframe.errors import ConfigError
 from vioframe.parts.hooks import hookimpl
-from vioframe.types import Float, Image
 
 if TYPE_CHECKING:
     from vioframe.interfaces import WorldFactory

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
@@ -16,16 +16,16 @@ from vioframe.io.convert import convert
 from vioframe.io.trajectories import write_tum
 from vioframe.simulation.flights import flight
 from vioframe.simulation.imu import read_imu
-from vioframe.types import NS_PER_S, Calibration, Frame, ImuSample, Measurement
+from vioframe.types import NS_PER_S, Calibration, FrameSet, ImuSample, Measurement
 
 WIDTH, HEIGHT = 376, 240
 FRAME_RATE_HZ = 10
 DURATION_S = 11.5
-_EUROC = packaged_calibration("euroc")
 # EuRoC's camera, without its distortion, at half its resolution.
-CALIBRATION: Calibration = replace(
-    _EUROC, camera=Camera(229.0, 229.0, 187.5, 119.5, (0.0, 0.0, 0.0, 0.0), (WIDTH, HEIGHT))
+CALIBRATION: Calibration = packaged_calibration("euroc", cameras=["cam0"]).with_camera(
+    0, model=Camera(229.0, 229.0, 187.5, 119.5, (0.0, 0.0, 0.0, 0.0), (WIDTH, HEIGHT))
 )
+CAMERA = CALIBRATION.cameras[0]
 # The flight "stop_and_go" begins with 4 s of rest, more than initialisation needs.
 _BEGIN_S = 2.5
 _START_NS = 100 * NS_PER_S
@@ -54,7 +54,7 @@ class RenderedFlight:
 def rendered_flight() -> RenderedFlight:
     """1.5 s at rest, 8 s of flight, 2 s at rest: 10 images and 200 readings a second, with the noise of EuRoC's IMU."""
     rng = np.random.default_rng(0)
-    path = flight("stop_and_go", _BEGIN_S + DURATION_S + 1.0, CALIBRATION.R_BC)
+    path = flight("stop_and_go", _BEGIN_S + DURATION_S + 1.0, CAMERA.R_BC)
     frames_s = np.arange(round(DURATION_S * FRAME_RATE_HZ) + 1) / FRAME_RATE_HZ
     # Readings go on beyond the last frame, as in a recording.
     imu_s = np.arange(round(DURATION_S * 200) + 21) / 200
@@ -69,7 +69,8 @@ def rendered_flight() -> RenderedFlight:
     samples = zip(imu_ns.tolist(), readings.gyro_B, readings.accel_B, strict=True)
     measurements: list[Measurement] = [ImuSample(*sample) for sample in samples]
     for t_ns, R_WB, p_WB in zip(frames_ns.tolist(), motion.R_WB, motion.p_WB, strict=True):
-        measurements.append(Frame(t_ns, _render(R_WB @ CALIBRATION.R_BC, R_WB @ CALIBRATION.p_BC + p_WB, p_WF, looks)))
+        image = _render(R_WB @ CAMERA.R_BC, R_WB @ CAMERA.p_BC + p_WB, p_WF, looks)
+        measurements.append(FrameSet(t_ns, (image,)))
     measurements.sort(key=lambda m: m.t_ns)
     return RenderedFlight(measurements, Trajectory(frames_ns, motion.R_WB, motion.p_WB))
 
@@ -78,8 +79,8 @@ def _render(R_WC: np.ndarray, p_WC: np.ndarray, p_WF: np.ndarray, looks: np.ndar
     """(H, W) uint8: each dot a disc of its own radius (px) and grey level, drawn to a sixteenth of a pixel."""
     p_CF = (p_WF - p_WC) @ R_WC
     ahead = p_CF[:, 2] > 0.3
-    xy = CALIBRATION.camera.project(p_CF[ahead])
-    near = CALIBRATION.camera.contains(xy, -10.0)
+    xy = CAMERA.model.project(p_CF[ahead])
+    near = CAMERA.model.contains(xy, -10.0)
     image = np.full((HEIGHT, WIDTH), 120, np.uint8)
     scale = 1 << _SUBPIXEL_BITS
     for (x, y), (radius, grey) in zip(np.round(xy[near] * scale).astype(int), looks[ahead][near], strict=True):

@@ -10,7 +10,7 @@ from vioframe.simulation.imu import read_imu
 from vioframe.types import ImuSegment
 
 RATE_HZ = 200.0
-_NOISE = packaged_calibration("euroc").imu
+_NOISE = packaged_calibration("euroc", cameras=["cam0"]).imu
 
 
 def dead_reckoning_error_m(flight: Flight, duration_s: float = 10.0, between: int = 5) -> float:

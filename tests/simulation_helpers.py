@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -17,19 +18,23 @@ INSTALLED = registry.load()
 
 
 @cache
-def small_calibration(divisor: int = 4) -> Calibration:
-    """EuRoC's camera, distortion included, at a fraction of its resolution."""
-    euroc = packaged_calibration("euroc")
-    camera, (width, height) = euroc.camera, euroc.camera.resolution
-    fx, fy = camera.fx / divisor, camera.fy / divisor
-    cx, cy = (camera.cx + 0.5) / divisor - 0.5, (camera.cy + 0.5) / divisor - 0.5
-    small = replace(camera, fx=fx, fy=fy, cx=cx, cy=cy, resolution=(width // divisor, height // divisor))
-    return replace(euroc, camera=small)
+def small_calibration(divisor: int = 4, cameras: Sequence[str] = ("cam0",)) -> Calibration:
+    """EuRoC's cameras, distortion included, at a fraction of their resolution."""
+    rig = packaged_calibration("euroc", cameras=cameras)
+    for index, camera in enumerate(rig.cameras):
+        model, (width, height) = camera.model, camera.model.resolution
+        fx, fy = model.fx / divisor, model.fy / divisor
+        cx, cy = (model.cx + 0.5) / divisor - 0.5, (model.cy + 0.5) / divisor - 0.5
+        small = replace(model, fx=fx, fy=fy, cx=cx, cy=cy, resolution=(width // divisor, height // divisor))
+        rig = rig.with_camera(index, model=small)
+    return rig
 
 
-def small_simulation(folder: Path, workers: int = 1, divisor: int = 4, **settings: Any) -> SimulatedRecording:
-    """A recording of 188 x 120 px; its calibration is written to ``folder``."""
-    files = folder / f"calibration_{divisor}"
-    write_calibration(small_calibration(divisor), files)
+def small_simulation(
+    folder: Path, workers: int = 1, divisor: int = 4, rig: Calibration | None = None, **settings: Any
+) -> SimulatedRecording:
+    """A recording of 188 x 120 px, by one camera unless a ``rig`` is given; its calibration is kept in ``folder``."""
+    files = folder / f"calibration_{len(list(folder.iterdir()))}"
+    write_calibration(rig or small_calibration(divisor), files)
     config = SimulationConfig.model_validate({"duration_s": 1.0, "calibration": [files], **settings})
     return SimulatedRecording(complete(config, INSTALLED), INSTALLED, workers)

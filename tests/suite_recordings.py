@@ -9,8 +9,7 @@ from plugin_helpers import install
 
 from vioframe.io.calibration import packaged_calibration, write_calibration
 from vioframe.parts import registry
-from vioframe.simulation.config import SimulationConfig, complete
-from vioframe.simulation.files import simulation_folder
+from vioframe.simulation.config import SimulationConfig, complete, simulation_folder
 from vioframe.simulation.record import record
 from vioframe.simulation.recording import SimulatedRecording
 

@@ -12,12 +12,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from april_board import april_sequence
 from threadpoolctl import threadpool_limits
+from vioframe.experiment import prepare, record
 
 from vioframe.bench import Row, backend_row, run_backend
-from vioframe.bench.april import april_sequence
 from vioframe.evaluation import TrajectoryErrors, evaluate
-from vioframe.experiment import prepare, record
 from vioframe.io.convert import convert
 from vioframe.parts import registry
 from vioframe.parts.config import Config, DatasetConfig, PartConfig

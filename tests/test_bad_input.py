@@ -13,7 +13,6 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -26,7 +25,7 @@ from rendered_flight import DURATION_S, RenderedFlight, rendered_flight
 from vioframe.cli import main
 from vioframe.evaluation import evaluate
 from vioframe.runs.folder import RunFolder
-from vioframe.types import NS_PER_S, Frame, ImuSample, Measurement
+from vioframe.types import NS_PER_S, FrameSet, ImuSample, Measurement
 
 
 def vioframe_(*arguments: object) -> Result:
@@ -102,8 +101,8 @@ def bag_of(*kinds: type, image: Callable[[np.ndarray], np.ndarray] = lambda imag
         for m in flight.measurements[:400]:
             if isinstance(m, ImuSample) and ImuSample in kinds:
                 messages.append(imu_message("/imu0", m))
-            elif isinstance(m, Frame) and Frame in kinds:
-                messages.append(image_message("/cam0/image_raw", m.t_ns, image(m.image), encoding))
+            elif isinstance(m, FrameSet) and FrameSet in kinds:
+                messages.append(image_message("/cam0/image_raw", m.t_ns, image(m.images[0]), encoding))
         write_bag(Path("bad.bag"), messages)
         Path("bad.bag.calib").symlink_to("good.bag.calib")
 
@@ -137,19 +136,19 @@ REFUSED = {
     "directory without mav0": (written("bad/notes.txt", "?"), ("run", "bad"), "bad is a folder without mav0/"),
     "empty mav0": (lambda _: Path("bad/mav0").mkdir(parents=True), ("run", "bad"), "no sensor is there; copy it again"),
     "no camera": (bag_of(ImuSample), RUN_BAD, "has no camera messages"),
-    "no imu": (bag_of(Frame), RUN_BAD, "has no IMU messages"),
+    "no imu": (bag_of(FrameSet), RUN_BAD, "has no IMU messages"),
     "other image size": (
-        bag_of(ImuSample, Frame, image=lambda i: i[::2, ::2]),
+        bag_of(ImuSample, FrameSet, image=lambda i: i[::2, ::2]),
         RUN_BAD,
         "images of 188x120, but the calibration is for 376x240; name the right one",
     ),
     "16-bit images": (
-        bag_of(ImuSample, Frame, image=lambda i: i.astype(np.uint16) << 4, encoding="mono16"),
+        bag_of(ImuSample, FrameSet, image=lambda i: i.astype(np.uint16) << 4, encoding="mono16"),
         RUN_BAD,
         "has 16-bit images; set the reader's option bit_depth",
     ),
     "float images": (
-        bag_of(ImuSample, Frame, image=lambda i: i.astype(np.float32), encoding="32FC1"),
+        bag_of(ImuSample, FrameSet, image=lambda i: i.astype(np.float32), encoding="32FC1"),
         RUN_BAD,
         "convert the images to mono8, rgb8 or bgr8",
     ),
@@ -230,14 +229,14 @@ def test_what_cannot_be_done_is_refused_in_one_line(here, flight, spoil, command
 
 
 def test_16_bit_images_are_read_once_their_depth_is_told(here, flight):
-    bag_of(ImuSample, Frame, image=lambda i: i.astype(np.uint16) << 4, encoding="mono16")(flight)
+    bag_of(ImuSample, FrameSet, image=lambda i: i.astype(np.uint16) << 4, encoding="mono16")(flight)
     assert vioframe_(*RUN_BAD, "-o", "bit_depth=12", "--quiet").exit_code == 0
     assert RunFolder.open("out").trajectory() is not None
 
 
 def test_images_that_change_their_size_end_the_run_and_keep_what_was_done(here, flight):
     images = iter(range(99))
-    bag_of(ImuSample, Frame, image=lambda i: i if next(images) < 15 else i[::2, ::2])(flight)
+    bag_of(ImuSample, FrameSet, image=lambda i: i if next(images) < 15 else i[::2, ::2])(flight)
     line = error_line(*RUN_BAD, "--quiet")
     assert "images of 188x120" in line
     assert "what was estimated until then is in out" in line
@@ -278,7 +277,7 @@ def without(kind: type, begin: float, end: float) -> Disturbance:
 
 
 def painted(paint: Callable[[np.ndarray], np.ndarray]) -> Disturbance:
-    return each(lambda m: [replace(m, image=paint(m.image))], Frame, 5.0, 6.0)
+    return each(lambda m: [FrameSet(m.t_ns, (paint(m.images[0]),))], FrameSet, 5.0, 6.0)
 
 
 def read(gyro_B: list[float], accel_B: list[float], end: float) -> Disturbance:
@@ -313,8 +312,8 @@ HANDLED: dict[str, tuple[Disturbance, dict[str, int], float | None]] = {
         {},
         0.04,
     ),
-    "camera gap of 0.5 s": (without(Frame, 5.0, 5.5), {"camera_gap": 1}, 0.03),
-    "camera gap of 2 s": (without(Frame, 5.0, 7.0), {"camera_gap": 1}, 0.05),
+    "camera gap of 0.5 s": (without(FrameSet, 5.0, 5.5), {"camera_gap": 1}, 0.03),
+    "camera gap of 2 s": (without(FrameSet, 5.0, 7.0), {"camera_gap": 1}, 0.05),
     "imu gap of 0.3 s": (without(ImuSample, 5.0, 5.3), {"imu_gap": 1}, 0.05),
     "imu gap of 1 s": (without(ImuSample, 5.0, 6.0), {"imu_gap": 1}, None),
     "imu falls silent": (without(ImuSample, 8.0, 99.0), {"frame_after_imu": 36}, 0.03),
@@ -322,7 +321,7 @@ HANDLED: dict[str, tuple[Disturbance, dict[str, int], float | None]] = {
     "imu not a number": (read([np.nan] * 3, [0.0, 0.0, 9.81], 5.1), {"imu_nan": 20, "imu_gap": 1}, 0.04),
     "imu far out of range": (read([1e200] * 3, [-1e200] * 3, 5.005), {"imu_out_of_range": 1}, 0.02),
     "imu twice": (each(lambda m: [m, m], ImuSample, 4.0, 6.0), {"imu_duplicate": 400}, 0.02),
-    "images twice": (each(lambda m: [m, m], Frame, 4.0, 6.0), {"frame_duplicate": 20}, 0.02),
+    "images twice": (each(lambda m: [m, m], FrameSet, 4.0, 6.0), {"frame_duplicate": 20}, 0.02),
     "imu out of order": (shuffled, {"imu_out_of_order": 0}, 0.02),
     "imu a second late": (held_up, {"imu_out_of_order": 20, "imu_gap": 1}, 0.04),
 }

@@ -1,17 +1,19 @@
 """What the benchmark of detectors measures, against cases counted by hand."""
 
-import json
+from dataclasses import asdict
 from itertools import pairwise
 
 import numpy as np
+import pandas as pd
 import pytest
 from image_helpers import textured
 
 from vioframe.bench.detectors.degradations import KINDS, Circumstances, Degradation, choose, line_kernel
-from vioframe.bench.detectors.leads import lead_of_pairs, lead_of_shares
+from vioframe.bench.detectors.flight import _with_leads, coverage, lives
 from vioframe.bench.detectors.metrics import (
     PairScore,
     corner_error_px,
+    distinct,
     fit_homography,
     lands_inside,
     matching_score,
@@ -20,9 +22,8 @@ from vioframe.bench.detectors.metrics import (
     score_pair,
     warp,
 )
-from vioframe.bench.detectors.quality import quality_row, quality_rows
-from vioframe.bench.detectors.thinning import distinct
-from vioframe.bench.detectors.tracks import coverage, lives
+from vioframe.bench.detectors.quality import summary
+from vioframe.bench.detectors.tables import verdict
 from vioframe.errors import ConfigError
 from vioframe.types import FrameTracks, Keypoints
 
@@ -175,78 +176,83 @@ def test_what_needs_descriptors_is_left_open_without():
     assert score.corner_error_px < 1e-6
 
 
-# Rows
+# Summaries
 
 
-def scores(*repeatabilities, error_px=None):
-    return [PairScore(300, r, r, 1.0, None if error_px is None else 0.5, error_px) for r in repeatabilities]
+def scores(detector, *repeatabilities, error_px=None, degradation=Degradation()):  # noqa: B008
+    return [
+        {"detector": detector, **degradation.columns, "pair": k}
+        | asdict(PairScore(300, r, r, 1.0, None if error_px is None else 0.5, error_px))
+        for k, r in enumerate(repeatabilities)
+    ]
+
+
+def summarised(*scores, baseline="shi_tomasi"):
+    return summary(pd.DataFrame([row for rows in scores for row in rows]), baseline)
 
 
 @pytest.mark.parametrize(
-    ("error_px", "right"), [(0.5, [1, 1, 1]), (2.0, [0, 1, 1]), (4.0, [0, 0, 1]), (9.0, [0, 0, 0])]
+    ("error_px", "right"), [(0.5, [1, 1, 1]), (2.0, [0, 1, 1]), (4.0, [0, 0, 1]), (9.0, [0, 0, 0]), (np.inf, [0, 0, 0])]
 )
 def test_a_homography_is_right_within_one_three_or_five_pixels(error_px, right):
-    row = quality_row("one", Degradation(), scores(0.5, error_px=error_px), None)
-    assert list(row["homography"].values()) == right
+    (row,) = summarised(scores("one", 0.5, error_px=error_px)).itertuples()
+    assert [row.homography_1px, row.homography_3px, row.homography_5px] == right
 
 
 def test_a_row_states_mean_and_spread():
-    row = quality_row("one", Degradation(), scores(0.4, 0.6), None)
-    assert row["repeatability"] == {"mean": pytest.approx(0.5), "sd": pytest.approx(0.1), "of": 2}
-    assert "homography" not in row
-    assert row["matching_score"] is None
-    assert "lead" not in row
+    (row,) = summarised(scores("one", 0.4, 0.6)).itertuples()
+    assert (row.repeatability, row.repeatability_sd) == (pytest.approx(0.5), pytest.approx(0.1))
+    assert row.pairs == 2
+    assert np.isnan([row.homography_1px, row.matching_score]).all()
+    assert not hasattr(row, "lead_repeatability")
 
 
 def test_pairs_without_a_point_found_again_say_nothing_of_localisation():
-    none_again = PairScore(300, 0.0, 0.0, None)
-    row = quality_row("one", Degradation(), [*scores(0.5), none_again], None)
-    assert row["localisation_px"] == {"mean": 1.0, "sd": 0.0, "of": 1}
-    assert row["repeatability"]["mean"] == 0.25
+    none_again = {**scores("one", 0.0)[0], "pair": 1, "localisation_px": None}
+    (row,) = summarised(scores("one", 0.5), [none_again]).itertuples()
+    assert (row.localisation_px, row.localisation_px_sd, row.repeatability) == (1.0, 0.0, 0.25)
+
+
+def test_the_lead_is_that_of_the_differences_on_the_same_pairs():
+    base, ahead = np.array([0.5, 0.6, 0.4, 0.5]), np.array([0.1, -0.1, 0.12, -0.08])
+    row = summarised(scores("orb", *(base + ahead)), scores("shi_tomasi", *base)).iloc[0]
+    # Differences of 0.1, -0.1, 0.12, -0.08: mean 0.01, deviation 0.11605, of four.
+    assert row["lead_distinct"] == pytest.approx(0.01)
+    assert row["lead_distinct_half_width"] == pytest.approx(1.96 * 0.11605 / 2, rel=1e-3)
+    alone = summarised(scores("orb", 0.5), scores("shi_tomasi", 0.4))
+    assert alone["lead_repeatability_half_width"].isna().all()  # one difference has no spread
 
 
 def test_leads_are_won_lost_or_even():
-    base = np.array([0.5, 0.6, 0.4, 0.5])
-    clear, unclear = np.array([0.1, 0.11, 0.09, 0.1]), np.array([0.1, -0.1, 0.12, -0.08])
-    assert lead_of_pairs(base + clear, base)["verdict"] == "won"
-    assert lead_of_pairs(base - clear, base)["verdict"] == "lost"
-    even = lead_of_pairs(base + unclear, base)
-    assert even["verdict"] == "even"
-    # Differences of 0.1, -0.1, 0.12, -0.08: mean 0.01, deviation 0.11605, of four.
-    assert (even["mean"], even["half_width"]) == (pytest.approx(0.01), pytest.approx(1.96 * 0.11605 / 2, rel=1e-3))
-    assert lead_of_pairs(base[:1], base[:1]) is None
-
-
-def test_leads_of_shares_know_of_how_many():
-    assert lead_of_shares(0.6, 1000, 0.5, 1000)["verdict"] == "won"
-    few = lead_of_shares(0.6, 10, 0.5, 10)
-    assert few["verdict"] == "even"
-    assert few["half_width"] == pytest.approx(1.96 * np.sqrt(0.024 + 0.025))
+    assert [verdict(lead, 0.05) for lead in (0.1, -0.1, 0.04, -0.05)] == ["won", "lost", "even", "even"]
 
 
 def test_the_lead_is_over_shi_tomasi_at_the_same_degradation():
     hard = Degradation("noise", 0.1)
-    rows = quality_rows(
-        {
-            ("shi_tomasi", Degradation()): scores(0.5, 0.5),
-            ("orb", Degradation()): scores(0.6, 0.6),
-            ("shi_tomasi", hard): scores(0.4, 0.4),
-            ("orb", hard): scores(0.1, 0.1),
-        }
+    found = summarised(
+        scores("shi_tomasi", 0.5, 0.5),
+        scores("orb", 0.6, 0.6),
+        scores("shi_tomasi", 0.4, 0.4, degradation=hard),
+        scores("orb", 0.1, 0.1, degradation=hard),
     )
-    assert ["lead" in row for row in rows] == [False, True, False, True]
-    clean, noisy = (row["lead"]["repeatability"] for row in rows if "lead" in row)
-    assert (clean["mean"], clean["verdict"]) == (pytest.approx(0.1), "won")
-    assert (noisy["mean"], noisy["verdict"]) == (pytest.approx(-0.3), "lost")
-    json.dumps(rows, allow_nan=False)
+    assert list(found["detector"]) == ["shi_tomasi", "orb"] * 2
+    np.testing.assert_allclose(found["lead_repeatability"], [np.nan, 0.1, np.nan, -0.3])
+    over_orb = summarised(scores("orb", 0.6, 0.6), scores("sift", 0.4, 0.4), baseline="orb")
+    np.testing.assert_allclose(over_orb["lead_distinct"], [np.nan, -0.2])
 
 
-def test_the_lead_can_be_over_any_other():
-    both = {("orb", Degradation()): scores(0.6, 0.6), ("sift", Degradation()): scores(0.4, 0.4)}
-    orb, sift = quality_rows(both, "orb")
-    assert "lead" not in orb
-    assert sift["lead"]["distinct"]["mean"] == pytest.approx(-0.2)
-    assert all("lead" not in row for row in quality_rows(both))
+def test_leads_of_shares_know_of_how_many():
+    def led(tracks):
+        columns = {
+            f"{name}_{n}": value for n in (5, 10, 20) for name, value in (("survival", [0.5, 0.6]), ("tracks", tracks))
+        }
+        rows = pd.DataFrame({"detector": ["shi_tomasi", "orb"], "degradation": "none", "level": 0.0, **columns})
+        return _with_leads(rows, "shi_tomasi")
+
+    many, few = led([1000, 1000]), led([10, 10])
+    np.testing.assert_allclose(few["lead_survival_10"], [np.nan, 0.1])
+    assert few["lead_survival_10_half_width"][1] == pytest.approx(1.96 * np.sqrt(0.024 + 0.025))
+    assert many["lead_survival_5_half_width"][1] < 0.1 < few["lead_survival_5_half_width"][1]
 
 
 # Tracks
@@ -256,7 +262,7 @@ def tracks(*ids_by_frame, xy=None):
     out = []
     for k, ids in enumerate(ids_by_frame):
         places = np.zeros((len(ids), 2)) if xy is None else np.array(xy[k], float).reshape(-1, 2)
-        out.append(FrameTracks(k, np.array(ids, np.int64), places, places))
+        out.append(FrameTracks(k, np.array(ids, np.int64), np.zeros(len(ids), np.int64), places, places))
     return out
 
 

@@ -5,17 +5,18 @@ from io import StringIO
 
 import numpy as np
 import pytest
-
-from vioframe.bench import backend_row, record, run_backend, table
-from vioframe.bench.april import (
+from april_board import (
     BoardView,
     april_sequence,
     board_poses,
     corner_count,
+    gravity_in_frame,
     read_board_views,
     reprojection_px,
+    rotation_to_vertical,
 )
-from vioframe.bench.gravity import gravity_in_frame, rotation_to_vertical
+
+from vioframe.bench import backend_row, record, run_backend, table
 from vioframe.errors import DatasetError, TrajectoryError
 from vioframe.geometry import so3
 from vioframe.geometry.trajectory import Trajectory

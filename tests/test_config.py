@@ -100,28 +100,28 @@ def test_an_empty_file_is_the_default(tmp_path):
 
 
 def test_overrides_reach_the_part_they_name_or_the_only_one_that_has_the_key(installed, flight):
-    assignments = ["backend.max_clones=20", "max_points=99", "detector.min_distance_px=3.5", "camera=cam1"]
+    assignments = ["backend.max_clones=20", "max_points=99", "detector.min_distance_px=3.5", "cameras=cam1"]
     done = config.complete(config.override(with_data(flight), installed, assignments), installed)
     assert done.backend.options["max_clones"] == 20
     assert done.frontend["max_points"] == 99
     assert done.detector.options["min_distance_px"] == 3.5
     assert done.frontend["min_distance_px"] != 3.5
-    assert done.dataset.options["camera"] == "cam1"
+    assert done.dataset.options["cameras"] == "cam1"
 
 
 def test_override_values_are_yaml_where_the_option_wants_it_and_text_where_not(installed, flight):
-    assignments = ["grid=[3, 4]", "predict_with_gyro=false", "bit_depth=null", "camera=2", "equalisation=none"]
+    assignments = ["grid=[3, 4]", "predict_with_gyro=false", "bit_depth=null", "cameras=2", "equalisation=none"]
     done = config.complete(config.override(with_data(flight), installed, assignments), installed)
     assert done.frontend["grid"] == (3, 4)
     assert done.frontend["predict_with_gyro"] is False
     assert done.frontend["equalisation"] == "none"
     assert done.dataset.options["bit_depth"] is None
-    assert done.dataset.options["camera"] == "2"
+    assert done.dataset.options["cameras"] == "2"
 
 
 def test_overriding_leaves_the_original_alone(installed, flight):
     before = with_data(flight)
-    config.override(before, installed, ["max_clones=20", "camera=cam1"])
+    config.override(before, installed, ["max_clones=20", "cameras=cam1"])
     assert before == with_data(flight)
 
 

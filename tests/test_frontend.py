@@ -7,8 +7,8 @@ import cv2
 import numpy as np
 import pytest
 
-from vioframe.bench.epipolar import epipolar_errors_px
 from vioframe.errors import ConfigError, DatasetError, PluginError
+from vioframe.evaluation.epipolar import epipolar_errors_px
 from vioframe.frontend import Frontend, FrontendOptions
 from vioframe.frontend.flow import camera_rotation, predict
 from vioframe.frontend.refill import refine_whole_pixels, spread, thin

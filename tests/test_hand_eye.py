@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from initialization_helpers import Motion, judge, without_points
 from scipy.stats import chi2
-from vioframe.simulation.synthetic import simulated_sequence
 
 from vioframe.estimation.initialization import CameraRotation, Initializer, RotationCalibrator, hand_eye
 from vioframe.estimation.initialization.epipolar_pairs import BearingPairs, _noise_of_normals
@@ -24,7 +23,7 @@ from vioframe.io.calibration import packaged_calibration
 from vioframe.io.synchronise import synchronise
 from vioframe.io.trajectories import load_trajectory
 from vioframe.pipeline import run
-from vioframe.simulation import Packet, TrackSequence
+from vioframe.simulation import Packet, TrackSequence, simulated_sequence
 from vioframe.simulation.flights import ShapedFlight, levelled
 from vioframe.types import Calibration, Estimate, Float, NavState, Status
 from vioframe_euroc import EurocDataset

@@ -8,11 +8,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from april_board import april_sequence
 from initialization_helpers import Errors, Motion, first_estimate, judge, seen_by, velocity_of, without_points
-from vioframe.simulation.poses import interpolate_poses
-from vioframe.simulation.synthetic import simulated_sequence
 
-from vioframe.bench.april import april_sequence
 from vioframe.estimation.initialization import InitialEstimate, Initializer
 from vioframe.frontend import Frontend, FrontendOptions
 from vioframe.geometry import so3
@@ -20,7 +18,8 @@ from vioframe.geometry.trajectory import Trajectory
 from vioframe.incidents import Incidents
 from vioframe.io.synchronise import synchronise
 from vioframe.io.trajectories import load_trajectory
-from vioframe.simulation import Packet, TrackSequence, real_motion_sequence
+from vioframe.simulation import Packet, TrackSequence, real_motion_sequence, simulated_sequence
+from vioframe.simulation.scenario import interpolate_poses
 from vioframe.types import DP, DTHETA, GRAVITY_M_S2, Calibration
 from vioframe_euroc import EurocDataset
 from vioframe_shi_tomasi import ShiTomasi

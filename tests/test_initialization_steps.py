@@ -7,8 +7,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 from scipy.stats import chi2
-from vioframe.simulation.segments import cut_segments
-from vioframe.simulation.synthetic import simulated_sequence
 
 from vioframe.estimation.factors.inertial import StateArrays
 from vioframe.estimation.factors.landmarks import camera_poses, positions
@@ -36,6 +34,7 @@ from vioframe.geometry import so3
 from vioframe.io.calibration import packaged_calibration
 from vioframe.simulation.flights import flight
 from vioframe.simulation.imu import ImuErrors, read_imu
+from vioframe.simulation.tracks import cut_segments, simulated_sequence
 from vioframe.types import DBA, DTHETA, GRAVITY_M_S2, Float, FrameTracks, ImuNoise, ImuSegment
 
 CALIBRATION = packaged_calibration("euroc")

@@ -2,7 +2,6 @@
 
 import subprocess
 import sys
-from functools import partial
 
 import cv2
 import numpy as np
@@ -10,21 +9,16 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from keypointnet_helpers import ARCHITECTURES, TINY, network, texture, weights  # noqa: E402
+from keypointnet_helpers import TINY, network, texture, weights  # noqa: E402
 
+from vioframe.bench.detectors.images import random_homography  # noqa: E402
 from vioframe.bench.detectors.metrics import score_pair  # noqa: E402
-from vioframe.bench.detectors.pairs import random_homography  # noqa: E402
 from vioframe.errors import ConfigError  # noqa: E402
 from vioframe.testing import check_detector  # noqa: E402
-from vioframe.types import Keypoints  # noqa: E402
 from vioframe_keypointnet import vioframe_detectors  # noqa: E402
 from vioframe_keypointnet import weights as weights_file  # noqa: E402
-from vioframe_keypointnet.folding import fold  # noqa: E402
-from vioframe_keypointnet.peaks import Peaks  # noqa: E402
-from vioframe_keypointnet.runtimes import cuda  # noqa: E402
-from vioframe_keypointnet.selection import OFFSET_PX, Rules, candidate_places, padded_to_cells, select  # noqa: E402
-from vioframe_keypointnet.tensors import ranged_layers  # noqa: E402
-from vioframe_keypointnet.torch_selection import TorchPeaks, TorchSelection  # noqa: E402
+from vioframe_keypointnet.architecture import ranged_layers  # noqa: E402
+from vioframe_keypointnet.selection import Rules, candidate_places, padded_to_cells, peaks, select  # noqa: E402
 
 FACTORY = vioframe_detectors()["keypointnet"]
 NO_RULES = Rules(nms_px=0.0, min_contrast=0)
@@ -40,12 +34,6 @@ def tiny(tmp_path_factory):
 
 def random_heads(h=30, w=40, seed=0):
     return np.random.default_rng(seed).normal(size=(3, h, w)).astype(np.float32)
-
-
-def scores_and_offsets(heads):
-    """What the device gets of the same heads."""
-    tensor = torch.from_numpy(heads)
-    return tensor[0], OFFSET_PX * torch.tanh(tensor[1:])
 
 
 def by_definition(heads, image, shape, rules):
@@ -85,28 +73,14 @@ def test_selection_is_as_defined(nms_px):
     assert np.array_equal(first, expected[:7])
 
 
-@pytest.mark.parametrize("nms_px", [0.0, 4.0, 15.0])
-@pytest.mark.parametrize("shape", [(240, 320), (235, 317)])
-def test_selection_on_the_device_is_the_same(nms_px, shape):
-    heads, rules = random_heads(), Rules(nms_px, min_contrast=4)
-    image = padded_to_cells(half_blank(shape))
-    xy, score = select(heads, image, shape, 300, rules)
-    selection = TorchSelection(image.shape, shape, rules, "cpu")
-    rows = selection(*scores_and_offsets(heads), torch.from_numpy(image).float(), None, 300)
-    found = cuda.keypoints(rows.numpy())
-    assert len(found.xy) == len(xy) > 20
-    assert np.abs(found.xy - xy).max() < 1e-4
-    assert np.abs(found.score - score).max() < 1e-6
-
-
 def response_of_peaks(shape=(120, 160), seed=0):
     return cv2.GaussianBlur(np.random.default_rng(seed).normal(size=shape).astype(np.float32), (0, 0), 1.0)
 
 
-def folded(response, f=2):
-    """As networks give it: (H/f, W/f, f^2)."""
-    rows, columns = response.shape[0] // f, response.shape[1] // f
-    return np.ascontiguousarray(response.reshape(rows, f, columns, f).swapaxes(1, 2)).reshape(rows, columns, f * f)
+def folded(response):
+    """As networks give it: (H/2, W/2, 4)."""
+    rows, columns = response.shape[0] // 2, response.shape[1] // 2
+    return response.reshape(rows, 2, columns, 2).swapaxes(1, 2).reshape(rows, columns, 4)
 
 
 def peaks_by_definition(response, image, shape, rules):
@@ -122,51 +96,30 @@ def peaks_by_definition(response, image, shape, rules):
     return np.array(kept)
 
 
-@pytest.mark.parametrize("f", [2, 4, 8])
 @pytest.mark.parametrize("nms_px", [0.0, 3.0, 4.0, 4.5, 15.0])
-def test_peaks_are_as_defined(nms_px, f):
+def test_peaks_are_as_defined(nms_px):
     response, image, rules = response_of_peaks(), half_blank((120, 160)), Rules(nms_px, min_contrast=4)
-    xy, score = Peaks(rules)(folded(response, f), image, (110, 155), 1000)
+    xy, score = peaks(folded(response), image, (110, 155), 1000, rules)
     expected = peaks_by_definition(response, image, (110, 155), rules)
     assert len(expected) > 5
     assert np.array_equal(np.round(xy)[:, ::-1], expected)
     assert np.allclose(score, 1.0 / (1.0 + np.exp(-response[tuple(expected.T)])))
     assert 0.05 < np.abs(xy - np.round(xy)).mean() < 0.35
-    first, _ = Peaks(rules)(folded(response, f), image, (110, 155), 7)
+    first, _ = peaks(folded(response), image, (110, 155), 7, rules)
     assert np.array_equal(first, xy[:7])
 
 
 def test_a_peak_between_pixels_is_found_there():
     rows, columns = np.indices((40, 48), dtype=np.float32)
     response = -((columns - 20.3) ** 2) - (rows - 17.6) ** 2
-    xy, _ = Peaks(Rules(4.0, 0))(folded(response), texture((40, 48)), (40, 48), 5)
+    xy, _ = peaks(folded(response), texture((40, 48)), (40, 48), 5, Rules(4.0, 0))
     assert np.abs(xy - [[20.3, 17.6]]).max() < 1e-3
-
-
-@pytest.mark.parametrize("nms_px", [0.0, 3.0, 15.0])
-@pytest.mark.parametrize("shape", [(120, 160), (115, 157)])
-def test_peaks_on_the_device_are_the_same(nms_px, shape):
-    response, rules = response_of_peaks(), Rules(nms_px, min_contrast=4)
-    image = padded_to_cells(half_blank(shape))
-    xy, score = Peaks(rules)(folded(response), image, shape, 100)
-    rows = TorchPeaks(image.shape, shape, rules, "cpu")(
-        torch.from_numpy(response), torch.from_numpy(image).float(), None, 100
-    )
-    found = cuda.keypoints(rows.numpy())
-    assert len(found.xy) == len(xy) > 5
-    assert np.abs(found.xy - xy).max() < 1e-4
-    assert np.abs(found.score - score).max() < 1e-6
 
 
 def test_of_a_plateau_the_first_pixel_is_the_peak():
     response = np.zeros((40, 48), np.float32)
     response[20:22, 30:33] = 1.0
-    image, rules = texture((40, 48)), Rules(3.0, 0)
-    xy, _ = Peaks(rules)(folded(response), image, (40, 48), 1)
-    rows = TorchPeaks((40, 48), (40, 48), rules, "cpu")(
-        torch.from_numpy(response), torch.from_numpy(image).float(), None, 1
-    )
-    assert np.array_equal(xy, rows[:, :2].numpy())
+    xy, _ = peaks(folded(response), texture((40, 48)), (40, 48), 1, Rules(3.0, 0))
     assert np.abs(xy - [[30.5, 20.5]]).max() < 1e-6
 
 
@@ -178,10 +131,6 @@ def test_equal_scores_leave_one_of_two_neighbours():
     xy, _ = select(heads, image, (240, 320), 10_000, rules)
     gap = np.linalg.norm(xy[:, None] - xy[None], axis=2)
     assert gap[np.triu_indices(len(xy), 1)].min() >= 4.0
-    selection = TorchSelection((240, 320), (240, 320), rules, "cpu")
-    rows = selection(*scores_and_offsets(heads), torch.from_numpy(image).float(), None, 10_000)
-    same = cuda.keypoints(rows.numpy()).xy
-    assert {tuple(p) for p in np.round(same, 3)} == {tuple(p) for p in np.round(xy, 3)}
 
 
 def test_the_outermost_cells_are_left_out():
@@ -240,12 +189,12 @@ def test_colour_and_other_depths_are_refused(tiny):
             detector.detect(image, 10)
 
 
-@pytest.mark.parametrize("runtime", ["torch", "onnxruntime", "openvino"])
+@pytest.mark.parametrize("runtime", ["torch", "openvino"])
 def test_all_runtimes_find_the_same_keypoints(tiny, runtime):
     pytest.importorskip(runtime)
     image = texture((117, 155))
-    expected = FACTORY(weights=tiny, runtime="torch", device="cpu", threads=1, descriptors=True).detect(image, 60)
-    found = FACTORY(weights=tiny, runtime=runtime, device="cpu", threads=1, descriptors=True).detect(image, 60)
+    expected = FACTORY(weights=tiny, runtime="torch", threads=1, descriptors=True).detect(image, 60)
+    found = FACTORY(weights=tiny, runtime=runtime, threads=1, descriptors=True).detect(image, 60)
     assert len(found.xy) == 60
     assert np.abs(found.xy - expected.xy).max() < 1e-3
     assert np.abs(found.score - expected.score).max() < 1e-5
@@ -253,35 +202,12 @@ def test_all_runtimes_find_the_same_keypoints(tiny, runtime):
     assert np.allclose(np.linalg.norm(found.descriptors, axis=1), 1.0, atol=1e-5)
 
 
-@pytest.mark.parametrize("architecture", ARCHITECTURES.values(), ids=ARCHITECTURES)
-def test_what_the_gpu_records_finds_the_same_keypoints(architecture):
-    """The very operations that are recorded there, run here on the CPU."""
-    made, image, rules = weights(network(architecture)), texture((117, 155)), Rules(4.0, 4)
-    network_ = fold(made, descriptors=True)
-    padded = padded_to_cells(image)
-    detect = cuda.detection(network_, rules, padded.shape, image.shape, 60, torch.float32, "cpu")
-    with torch.inference_mode():
-        found = cuda.keypoints(detect(torch.from_numpy(padded)[None, None]).numpy())
-    expected = on_cpu(network_, rules, image)
-    assert np.abs(found.xy - expected.xy).max() < 1e-3
-    assert np.abs(found.score - expected.score).max() < 1e-5
-    assert np.abs(found.descriptors - expected.descriptors).max() < 1e-4
-
-
-def on_cpu(folded, rules, image) -> Keypoints:
-    from vioframe_keypointnet.detector import OnCpu
-    from vioframe_keypointnet.runtimes.torch import TorchOnCpu
-
-    choose = Peaks(rules) if folded.architecture.peaks else partial(select, rules=rules)
-    return OnCpu(TorchOnCpu(folded, 1), choose)(padded_to_cells(image), image.shape, 60)
-
-
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
 @pytest.mark.parametrize(("precision", "tolerance_px"), [("float32", 0.01), ("float16", 0.5)])
 def test_a_gpu_finds_the_same_keypoints(tiny, precision, tolerance_px):
     image = texture((117, 155))
-    expected = FACTORY(weights=tiny, device="cpu", runtime="torch").detect(image, 60)
-    found = FACTORY(weights=tiny, device="cuda", precision=precision).detect(image, 60)
+    expected = FACTORY(weights=tiny, runtime="torch").detect(image, 60)
+    found = FACTORY(weights=tiny, runtime="cuda", precision=precision).detect(image, 60)
     distance = np.linalg.norm(found.xy[:, None] - expected.xy[None], axis=2).min(axis=1)
     assert np.mean(distance < tolerance_px) > 0.9
 
@@ -289,13 +215,13 @@ def test_a_gpu_finds_the_same_keypoints(tiny, precision, tolerance_px):
 def test_without_a_gpu_cuda_is_refused(tiny, monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     with pytest.raises(ConfigError, match="torch finds no CUDA device"):
-        FACTORY(weights=tiny, device="cuda")
+        FACTORY(weights=tiny, runtime="cuda")
 
 
-@pytest.mark.parametrize("runtime", ["torch", "onnxruntime", "openvino"])
+@pytest.mark.parametrize("runtime", ["torch", "openvino"])
 def test_the_conformance_kit_agrees_whatever_the_weights(tiny, runtime):
     pytest.importorskip(runtime)
-    check_detector(FACTORY, weights=tiny, runtime=runtime, device="cpu", threads=1)
+    check_detector(FACTORY, weights=tiny, runtime=runtime, threads=1)
 
 
 @pytest.mark.parametrize("name", weights_file.shipped())
@@ -303,7 +229,7 @@ def test_weights_that_ship_conform_and_say_what_they_are(name):
     shipped = weights_file.load(name)
     assert shipped.card
     assert set(shipped.activation_ranges) == set(ranged_layers(shipped.architecture))
-    check_detector(FACTORY, weights=name, device="cpu", threads=1)
+    check_detector(FACTORY, weights=name, threads=1)
 
 
 @pytest.mark.parametrize("name", weights_file.shipped())
@@ -313,7 +239,7 @@ def test_int8_costs_weights_that_ship_little_repeatability(name, shared_data):
     files = sorted((shared_data / "photographs" / "bsds500_val").glob("*.jpg"))[:25]
     assert len(files) == 25
     precise, coarse = (
-        repeatability(FACTORY(weights=name, device="cpu", runtime="openvino", precision=p, threads=1), files)
+        repeatability(FACTORY(weights=name, runtime="openvino", precision=p, threads=1), files)
         for p in ("float32", "int8")
     )
     assert coarse > precise - 0.02
@@ -331,8 +257,6 @@ def repeatability(detector, files):
 
 def test_naming_the_detector_loads_nothing_heavy():
     program = "import sys, vioframe_keypointnet as k; k.vioframe_detectors(); k.vioframe_trainers(); "
-    program += (
-        "sys.exit(' '.join({'torch', 'onnx', 'onnxruntime', 'openvino', 'cv2', 'numba'} & set(sys.modules)) or 0)"
-    )
+    program += "sys.exit(' '.join({'torch', 'onnx', 'openvino', 'cv2', 'numba'} & set(sys.modules)) or 0)"
     done = subprocess.run([sys.executable, "-c", program], check=False, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr

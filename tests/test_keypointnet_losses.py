@@ -14,7 +14,6 @@ from vioframe.bench.detectors.metrics import warp as transfer  # noqa: E402
 from vioframe_keypointnet.architecture import COMPACT, FULL, Architecture  # noqa: E402
 from vioframe_keypointnet.network import (  # noqa: E402
     Detection,
-    InlierOutlierNet,
     KeypointNet,
     cells_of,
     describe,
@@ -22,14 +21,16 @@ from vioframe_keypointnet.network import (  # noqa: E402
     locally_normalised,
     peak_places,
 )
-from vioframe_keypointnet.training import losses  # noqa: E402
-from vioframe_keypointnet.training.homography import (  # noqa: E402
-    HomographyRange,
-    homography_of,
-    random_homography,
+from vioframe_keypointnet.training import losses, samples  # noqa: E402
+from vioframe_keypointnet.training.losses import (  # noqa: E402
+    Candidates,
+    InlierOutlierNet,
+    corners,
+    lesson,
+    lesson_loss,
+    matching_loss,
 )
-from vioframe_keypointnet.training.lessons import corners, lesson, lesson_loss, matching_loss  # noqa: E402
-from vioframe_keypointnet.training.losses import Candidates  # noqa: E402
+from vioframe_keypointnet.training.samples import random_homography  # noqa: E402
 
 SIZE = (96, 64)
 
@@ -119,16 +120,16 @@ def test_descriptor_loss_takes_the_hardest_negative_outside_the_box():
     anchors, positives = exact(unit(0.0))[None], exact(unit(20.0))[None]
     others = exact(unit(5.0), unit(30.0), unit(90.0))[None]
     xy = exact([12.0, 10.0], [30.0, 10.0], [50.0, 50.0])[None]
-    loss = losses.descriptor_loss(
-        anchors, positives, others, exact([10.0, 10.0])[None], xy, torch.tensor([[True]]), margin=0.2
-    )
+    loss = losses.descriptor_loss(anchors, positives, others, exact([10.0, 10.0])[None], xy, torch.tensor([[True]]))
     # The first is the most alike, but within 4 px: it may be the very point.
     apart = [2.0 * math.sin(math.radians(angle / 2)) for angle in (20.0, 30.0)]
     assert float(loss) == pytest.approx(apart[0] - apart[1] + 0.2, abs=1e-6)
-    assert losses.descriptor_loss(anchors, positives, others, xy[:, :1], xy, torch.tensor([[False]]), 0.2) == 0.0
+    assert losses.descriptor_loss(anchors, positives, others, xy[:, :1], xy, torch.tensor([[False]])) == 0.0
 
 
-def test_inlier_loss_labels_matches_within_four_pixels():
+def test_inlier_loss_labels_matches_within_four_pixels(monkeypatch):
+    monkeypatch.setattr(losses, "_TOP", 2)
+
     class Judge(torch.nn.Module):
         def forward(self, matches):
             self.matches = matches
@@ -139,7 +140,7 @@ def test_inlier_loss_labels_matches_within_four_pixels():
     b = candidates([[13.0, 10.0], [40.0, 39.0], [70.0, 50.0]], [0.5, 0.5, 0.5])
     descriptors = torch.eye(3, dtype=torch.float64)[None]
     size = exact(96.0, 64.0)
-    loss = losses.inlier_loss(judge, a, b, a.xy, descriptors, descriptors, size, top=2)
+    loss = losses.inlier_loss(judge, a, b, a.xy, descriptors, descriptors, size)
     # Of the two best, the first match is 3 px off and right, the second 9 px off and wrong.
     assert float(loss) == pytest.approx(0.5 * ((0.5 - 1.0) ** 2 + (0.5 + 1.0) ** 2) / 2)
     np.testing.assert_allclose(
@@ -186,7 +187,7 @@ def test_gradients_of_the_losses_are_those_of_differences(moving, checked):
     """
     torch.manual_seed(1)
     judge = InlierOutlierNet().double().eval()
-    H = torch.from_numpy(random_homography(np.random.default_rng(3), SIZE, HomographyRange(rotation_deg=10.0)))[None]
+    H = torch.from_numpy(random_homography(np.random.default_rng(3), SIZE))[None]
     leaves = [*free_detection(0), *free_detection(1)]
 
     def values(*leaves):
@@ -229,28 +230,23 @@ def test_homography_there_and_back():
     rng = np.random.default_rng(0)
     xy = rng.uniform(0.0, 60.0, (50, 2))
     for _ in range(20):
-        H = random_homography(rng, SIZE, HomographyRange())
+        H = random_homography(rng, SIZE)
         there = transfer(H, xy)
         np.testing.assert_allclose(transfer(np.linalg.inv(H), there), xy, atol=1e-8)
         by_torch = losses.warp(torch.from_numpy(H)[None], torch.from_numpy(xy)[None])[0]
         np.testing.assert_allclose(by_torch, there, atol=1e-8)
 
 
-def test_homographies_show_what_is_in_the_image():
+def test_homographies_show_what_is_in_the_image(monkeypatch):
     """The view's corners come from within the image, whatever was drawn."""
     rng = np.random.default_rng(1)
-    limits = HomographyRange(rotation_deg=5.0, scale=(0.9, 1.0))
+    monkeypatch.setattr(samples, "_ROTATION_DEG", 5.0)
+    monkeypatch.setattr(samples, "_SCALE", (0.9, 1.0))
     corners_px = np.array([[0, 0], [95, 0], [95, 63], [0, 63]], np.float64)
     for _ in range(100):
-        seen = transfer(np.linalg.inv(random_homography(rng, SIZE, limits)), corners_px)
+        seen = transfer(np.linalg.inv(random_homography(rng, SIZE)), corners_px)
         assert (seen >= -1.0).all()
         assert (seen <= np.array(SIZE) + 1.0).all()
-
-
-def test_four_points_determine_a_homography():
-    source = np.array([[0.0, 0.0], [10.0, 0.0], [10.0, 10.0], [0.0, 10.0]])
-    target = np.array([[1.0, 2.0], [12.0, 1.0], [11.0, 13.0], [2.0, 11.0]])
-    np.testing.assert_allclose(transfer(homography_of(source, target), source), target, atol=1e-10)
 
 
 def squares():

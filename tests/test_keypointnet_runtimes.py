@@ -1,6 +1,7 @@
 """Every runtime computes what the trained network does, within what its precision allows."""
 
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,13 +12,12 @@ from keypointnet_helpers import ARCHITECTURES, COMPACT, NARROW, QUICK, network, 
 
 from vioframe.errors import ConfigError  # noqa: E402
 from vioframe_keypointnet import runtimes  # noqa: E402
-from vioframe_keypointnet.description import describe  # noqa: E402
-from vioframe_keypointnet.folding import fold  # noqa: E402
+from vioframe_keypointnet.graph import onnx_model  # noqa: E402
 from vioframe_keypointnet.network import describe as describe_in_torch  # noqa: E402
 from vioframe_keypointnet.quantisation import measure_ranges  # noqa: E402
-from vioframe_keypointnet.selection import candidate_places  # noqa: E402
+from vioframe_keypointnet.selection import by_pixels, candidate_places, describe  # noqa: E402
 
-NOT_TORCH = [runtime for runtime in runtimes.ON_CPU if runtime != "torch"]
+ON_CPU = ("openvino", "torch")
 each_architecture = pytest.mark.parametrize("architecture", ARCHITECTURES.values(), ids=ARCHITECTURES)
 
 
@@ -38,9 +38,9 @@ def as_trained(net, image):
     return [output.numpy() for output in (heads, found.descriptors[0])], found
 
 
-def run_by(runtime, precision, net, image, ranges=None):
+def run_by(runtime, precision, made, image):
     """The same by a runtime."""
-    return runtimes.on_cpu(runtime, precision, fold(weights(net), descriptors=True), ranges, 1)(image)
+    return runtimes.start(runtime, precision, made, descriptors=True, threads=1)(image)
 
 
 def relative_error(found, expected):
@@ -49,21 +49,21 @@ def relative_error(found, expected):
 
 
 @each_architecture
-@pytest.mark.parametrize("runtime", runtimes.ON_CPU)
+@pytest.mark.parametrize("runtime", ON_CPU)
 def test_folding_and_runtime_change_nothing(architecture, runtime):
     """At the border too, where what is padded with matters."""
     pytest.importorskip(runtime)
     net, image = network(architecture), texture()
-    outputs, (expected, _) = run_by(runtime, "float32", net, image), as_trained(net, image)
+    outputs, (expected, _) = run_by(runtime, "float32", weights(net), image), as_trained(net, image)
     assert [output.shape for output in outputs] == [output.shape for output in expected]
     assert max(np.abs(o - e).max() for o, e in zip(outputs, expected, strict=True)) < 1e-4
 
 
-@pytest.mark.parametrize("runtime", runtimes.ON_CPU)
+@pytest.mark.parametrize("runtime", ON_CPU)
 def test_one_runtime_takes_images_of_several_sizes(runtime):
     pytest.importorskip(runtime)
     net = network(ARCHITECTURES["tiny"])
-    run = runtimes.on_cpu(runtime, "float32", fold(weights(net)), None, 1)
+    run = runtimes.start(runtime, "float32", weights(net), descriptors=False, threads=1)
     for shape in ((48, 64), (64, 48), (8, 8), (48, 64)):
         image = texture(shape, seed=5)
         (heads,) = run(image)
@@ -71,13 +71,13 @@ def test_one_runtime_takes_images_of_several_sizes(runtime):
 
 
 @pytest.mark.parametrize("architecture", [COMPACT, QUICK, NARROW], ids=lambda a: a.name)
-@pytest.mark.parametrize("runtime", NOT_TORCH)
-def test_int8_is_near(architecture, runtime):
-    pytest.importorskip(runtime)
+def test_int8_is_near(architecture):
+    pytest.importorskip("openvino")
     net = network(architecture)
-    ranges = measure_ranges(weights(net), [texture(seed=number) for number in range(4)])
+    made = weights(net)
+    made = replace(made, activation_ranges=measure_ranges(made, [texture(seed=number) for number in range(4)]))
     image = texture(seed=9)
-    outputs, (expected, _) = run_by(runtime, "int8", net, image, ranges), as_trained(net, image)
+    outputs, (expected, _) = run_by("openvino", "int8", made, image), as_trained(net, image)
     errors = [relative_error(o, e) for o, e in zip(outputs, expected, strict=True)]
     assert errors[0] > 1e-3
     assert max(errors) < INT8_ERROR[architecture.name]
@@ -85,13 +85,6 @@ def test_int8_is_near(architecture, runtime):
 
 INT8_ERROR = {"compact": 0.13, "quick": 0.13, "full-x0.125": 0.2}
 """The narrow network has twice as many layers that each add to the error, and half as many channels to average it."""
-
-
-def test_bfloat16_is_near():
-    pytest.importorskip("openvino")
-    net, image = network(COMPACT), texture(seed=9)
-    outputs, (expected, _) = run_by("openvino", "bfloat16", net, image), as_trained(net, image)
-    assert max(relative_error(o, e) for o, e in zip(outputs, expected, strict=True)) < 0.06
 
 
 def test_ranges_leave_out_what_is_rare_and_far():
@@ -116,16 +109,16 @@ def test_places_are_those_of_the_trained_network():
 @pytest.mark.parametrize("architecture", [COMPACT, QUICK], ids=lambda a: a.name)
 def test_the_response_of_each_pixel_is_that_of_the_trained_network(architecture):
     (response, _), found = as_trained(network(architecture), texture())
-    rows, columns, f = *response.shape[:2], architecture.fold
-    by_pixels = response.reshape(rows, columns, f, f).swapaxes(1, 2).reshape(f * rows, f * columns)
-    assert np.array_equal(by_pixels, torch.nn.functional.pixel_shuffle(found.response, 8)[0, 0].numpy())
+    assert np.array_equal(by_pixels(response), torch.nn.functional.pixel_shuffle(found.response, 8)[0, 0].numpy())
 
 
 @pytest.mark.parametrize("descriptors", [False, True])
-def test_only_what_is_needed_is_run(descriptors):
-    made = weights(network(COMPACT))
-    names = [layer.name for layer in fold(made, descriptors).encoder]
-    assert names == (["2a", "2b", "2c", "3a", "4a"] if descriptors else ["2a", "2b", "2c"])
+def test_only_what_is_needed_is_in_the_graph(descriptors):
+    onnx = pytest.importorskip("onnx")
+    model = onnx.load_from_string(onnx_model(weights(network(COMPACT)), (48, 64), descriptors=descriptors))
+    convolutions = [node for node in model.graph.node if node.op_type == "Conv"]
+    assert len(convolutions) == (2 + 1 + 1 + 4 + 2 if descriptors else 3 + 1)
+    assert len(model.graph.output) == (2 if descriptors else 1)
 
 
 def test_descriptors_are_sampled_as_in_training():
@@ -140,37 +133,38 @@ def test_descriptors_are_sampled_as_in_training():
     assert describe(maps, xy[:0]).shape == (0, 8)
 
 
-def test_auto_takes_the_fastest_that_is_installed(monkeypatch):
-    monkeypatch.setattr(runtimes, "_has_cuda", lambda: False)
-    installed = {"openvino", "onnxruntime", "onnx", "torch"}
-    monkeypatch.setattr(runtimes, "find_spec", lambda name: name if name in installed else None)
-    assert runtimes.choose("auto", "auto", "auto", True) == ("openvino", "int8", "cpu")
-    assert runtimes.choose("auto", "auto", "auto", False) == ("openvino", "float32", "cpu")
-    installed.remove("openvino")
-    assert runtimes.choose("auto", "auto", "auto", False)[0] == "onnxruntime"
-    installed.remove("onnx")
-    assert runtimes.choose("auto", "auto", "cpu", True) == ("torch", "float32", "cpu")
-    installed.clear()
-    assert runtimes.choose("auto", "auto", "cpu", True)[0] == "openvino"  # whose error says what to install
+@pytest.fixture
+def here(monkeypatch):
+    """The runtimes that are installed."""
+    names = {"openvino", "torch"}
+    monkeypatch.setattr(runtimes, "_is_here", lambda name: name in names)
+    return names
 
 
-def test_auto_takes_cuda_unless_the_rest_says_otherwise(monkeypatch):
-    monkeypatch.setattr(runtimes, "_has_cuda", lambda: True)
-    assert runtimes.choose("auto", "auto", "auto", True) == ("torch", "float16", "cuda")
-    assert runtimes.choose("torch", "float32", "auto", True) == ("torch", "float32", "cuda")
-    assert runtimes.choose("auto", "int8", "auto", True) == ("openvino", "int8", "cpu")
-    assert runtimes.choose("onnxruntime", "auto", "auto", True)[::2] == ("onnxruntime", "cpu")
-    assert runtimes.choose("auto", "auto", "cpu", True)[2] == "cpu"
+def test_auto_takes_the_fastest_that_is_installed(here):
+    assert runtimes.choose("auto", "auto", True) == ("openvino", "int8")
+    assert runtimes.choose("auto", "auto", False) == ("openvino", "float32")
+    assert runtimes.choose("torch", "auto", True) == ("torch", "float32")
+    here.remove("openvino")
+    assert runtimes.choose("auto", "auto", True) == ("torch", "float32")
+    here.clear()
+    assert runtimes.choose("auto", "auto", True)[0] == "openvino"  # whose error says what to install
+
+
+def test_auto_takes_cuda_unless_the_rest_says_otherwise(here):
+    here.add("cuda")
+    assert runtimes.choose("auto", "auto", True) == ("cuda", "float16")
+    assert runtimes.choose("auto", "float32", True) == ("cuda", "float32")
+    assert runtimes.choose("auto", "int8", True) == ("openvino", "int8")
+    assert runtimes.choose("openvino", "auto", True) == ("openvino", "int8")
 
 
 @pytest.mark.parametrize(
     ("wanted", "complaint"),
     [
-        (("openvino", "auto", "cuda"), "on CUDA the runtime is torch, not openvino"),
-        (("auto", "int8", "cuda"), "on CUDA the precision is float16 or float32, not int8"),
-        (("torch", "int8", "cpu"), "on a CPU torch has the precision float32, not int8"),
-        (("onnxruntime", "bfloat16", "auto"), "onnxruntime has the precision float32 or int8, not bfloat16"),
-        (("auto", "float16", "cpu"), "no runtime has the precision float16"),
+        (("cuda", "int8"), "the runtime cuda has the precision float16 or float32, not int8"),
+        (("torch", "int8"), "the runtime torch has the precision float32, not int8"),
+        (("openvino", "float16"), "the runtime openvino has the precision int8 or float32, not float16"),
     ],
 )
 def test_what_does_not_go_together_is_said(wanted, complaint):
@@ -180,14 +174,13 @@ def test_what_does_not_go_together_is_said(wanted, complaint):
 
 def test_int8_needs_ranges():
     with pytest.raises(ConfigError, match="--calibrate"):
-        runtimes.choose("auto", "int8", "cpu", False)
+        runtimes.choose("auto", "int8", False)
 
 
-@pytest.mark.parametrize("runtime", runtimes.ON_CPU)
+@pytest.mark.parametrize("runtime", ON_CPU)
 def test_a_library_that_is_absent_is_named_with_its_extra(runtime, monkeypatch):
-    folded = fold(weights(network(COMPACT)))
+    made = weights(network(COMPACT))
     monkeypatch.setitem(sys.modules, runtime, None)
-    monkeypatch.delitem(sys.modules, "vioframe_keypointnet.runtimes.torch", raising=False)
     extra = "keypointnet" if runtime == "torch" else runtime
     with pytest.raises(ConfigError, match=rf"{runtime}.*pip install 'vioframe\[{extra}\]'"):
-        runtimes.on_cpu(runtime, "float32", folded, None, 1)(texture())
+        runtimes.start(runtime, "float32", made, descriptors=False, threads=1)

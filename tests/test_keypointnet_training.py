@@ -13,21 +13,22 @@ torch = pytest.importorskip("torch")
 
 from keypointnet_helpers import texture  # noqa: E402
 
+from vioframe.bench.detectors.degradations import line_kernel  # noqa: E402
 from vioframe.cli import main  # noqa: E402
 from vioframe.errors import ConfigError  # noqa: E402
 from vioframe.interfaces import Trainer  # noqa: E402
 from vioframe.parts import registry  # noqa: E402
 from vioframe.types import TrainingJob  # noqa: E402
-from vioframe_keypointnet import vioframe_trainers, weights  # noqa: E402
-from vioframe_keypointnet.folding import fold  # noqa: E402
-from vioframe_keypointnet.runtimes.torch import TorchOnCpu  # noqa: E402
+from vioframe_keypointnet import (  # noqa: E402
+    runtimes,
+    vioframe_trainers,
+    weights,
+)
 from vioframe_keypointnet.selection import padded_to_cells  # noqa: E402
-from vioframe_keypointnet.training.images import Picture, gather, split  # noqa: E402
-from vioframe_keypointnet.training.loop import Training, step_losses  # noqa: E402
+from vioframe_keypointnet.training import samples  # noqa: E402
 from vioframe_keypointnet.training.options import TrainingOptions  # noqa: E402
-from vioframe_keypointnet.training.photometric import PhotometricRange, disturbed, motion_kernel  # noqa: E402
-from vioframe_keypointnet.training.samples import batch, pair  # noqa: E402
-from vioframe_keypointnet.training.validation import validate  # noqa: E402
+from vioframe_keypointnet.training.samples import Picture, batch, disturbed, gather, pair, split  # noqa: E402
+from vioframe_keypointnet.training.trainer import Training, step_losses, validate  # noqa: E402
 
 SMALL = TrainingOptions(width=0.25, size=(96, 64), batch=2, epochs=2, epoch_samples=4, threads=1)
 PUBLISHED = replace(SMALL, network="full", width=0.0625)
@@ -82,14 +83,14 @@ def test_descriptors_alone_are_trained_beside_a_detector_left_as_it_is(pictures,
     if options.network == "full":
         pictures = [Picture(p.name, np.repeat(p.pixels[..., None], 3, axis=2)) for p in pictures]
     training = Training(replace(options, descriptors_only=True, lesson_epochs=1), pictures)
-    before = weights.Weights(options.architecture, training.tensors())
+    before = training.weights()
     totals = [values["total"] for values in training.steps()]
-    after = weights.Weights(options.architecture, training.tensors())
+    after = training.weights()
     assert len(totals) == 4
     assert np.isfinite(totals).all()
     grey = pictures[0].pixels if options.network == "compact" else pictures[0].pixels[..., 0]
     image = padded_to_cells(np.ascontiguousarray(grey))
-    found = [TorchOnCpu(fold(w, descriptors=True), 1)(image) for w in (before, after)]
+    found = [runtimes.start("torch", "float32", w, descriptors=True, threads=1)(image) for w in (before, after)]
     np.testing.assert_array_equal(found[0][0], found[1][0])
     assert np.abs(found[0][1] - found[1][1]).max() > 1e-4
 
@@ -134,57 +135,52 @@ def test_the_learning_rate_is_halved_where_asked(pictures):
     assert rates == [1e-3, 1e-3, 5e-4, 5e-4]
 
 
-def test_pairs_are_views_of_one_image(pictures):
+def test_pairs_are_views_of_one_image(pictures, monkeypatch):
     """The target, warped back by the homography, is the source, where light does not differ."""
-    options = replace(SMALL, photometric_probability=0.0)
+    monkeypatch.setattr(samples, "_DISTURBED", 0.0)
     for number in range(6):
-        one = pair(pictures[0], options, number)
+        one = pair(pictures[0], SMALL, number)
         back = cv2.warpPerspective(
-            one.target, np.linalg.inv(one.homography), options.size, borderMode=cv2.BORDER_CONSTANT, borderValue=np.nan
+            one.target, np.linalg.inv(one.homography), SMALL.size, borderMode=cv2.BORDER_CONSTANT, borderValue=np.nan
         )
         seen = np.isfinite(back)
         assert seen.mean() > 0.2
         assert np.median(np.abs(back - one.source)[seen]) < 0.03
-        again = pair(pictures[0], options, number)
+        again = pair(pictures[0], SMALL, number)
         np.testing.assert_array_equal(again.source, one.source)
         np.testing.assert_array_equal(again.homography, one.homography)
 
 
-def test_an_epoch_takes_every_image(pictures, monkeypatch):
-    from vioframe_keypointnet.training import samples
-
+def test_an_epoch_takes_every_image():
     order = [samples._order(k, 7, seed=0) for k in range(21)]
     assert sorted(order[:7]) == sorted(order[7:14]) == list(range(7))
     assert order[:7] != order[7:14]
 
 
-def test_each_photometric_effect_does_what_it_says():
+LIGHT = ("_EXPOSURE", "_GAMMA", "_CONTRAST", "_BRIGHTNESS", "_BLUR_SIGMA_PX", "_MOTION_BLUR_PX", "_NOISE_SIGMA")
+UNCHANGED = ((1.0, 1.0), (1.0, 1.0), (1.0, 1.0), 0.0, 0.1001, 1.0, 0.0)
+
+
+def test_each_photometric_effect_does_what_it_says(monkeypatch):
     rng = np.random.default_rng(0)
     image = np.clip(rng.normal(0.5, 0.15, (60, 80)), 0.0, 1.0).astype(np.float32)
-    none = PhotometricRange(1.0, 0.0, (1.0, 1.0), (1.0, 1.0), (1.0, 1.0), 0.0, 0.0, 0.0)
-    np.testing.assert_allclose(disturbed(image, rng, none), image, atol=1e-6)
-    np.testing.assert_allclose(
-        disturbed(image, rng, replace(none, exposure=(1.5, 1.5))), np.minimum(1.5 * image, 1.0), atol=1e-6
-    )
-    np.testing.assert_allclose(disturbed(image, rng, replace(none, gamma=(2.0, 2.0))), image**2, atol=1e-6)
-    assert disturbed(image, rng, replace(none, contrast=(0.4, 0.4))).std() == pytest.approx(0.4 * image.std(), rel=1e-3)
-    noisy = disturbed(image, np.random.default_rng(2), replace(none, noise_sigma=0.1))
-    assert 0.001 < (noisy - image).std() < 0.1
-    assert disturbed(image, rng, replace(none, motion_blur_px=9.0)).std() < 0.9 * image.std()
-    assert disturbed(image, rng, replace(none, blur_sigma_px=2.0)).std() < 0.99 * image.std()
-    assert abs(disturbed(image, np.random.default_rng(1), replace(none, brightness=0.2)).mean() - image.mean()) > 0.005
 
+    def in_light(seed=0, **effect):
+        for name, value in (dict(zip(LIGHT, UNCHANGED, strict=True)) | effect).items():
+            monkeypatch.setattr(samples, name, value)
+        return disturbed(image, np.random.default_rng(seed))
 
-def test_motion_blur_moves_nothing():
-    for length, angle in ((1.0, 0.3), (7.3, 1.1), (9.0, np.pi / 2)):
-        kernel = motion_kernel(length, angle)
-        half = kernel.shape[0] // 2
-        rows, columns = np.indices(kernel.shape) - half
-        assert kernel.sum() == pytest.approx(1.0)
-        assert (kernel * rows).sum() == pytest.approx(0.0, abs=1e-6)
-        assert (kernel * columns).sum() == pytest.approx(0.0, abs=1e-6)
-        spread = np.sqrt((kernel * (rows**2 + columns**2)).sum())
-        assert spread == pytest.approx(length / np.sqrt(12.0), abs=0.6)
+    monkeypatch.setattr(samples, "_DISTURBED", 1.0)
+    # A line of one pixel is shared out over two.
+    monkeypatch.setattr(samples, "line_kernel", lambda px, _: line_kernel(px, 0.3) if px > 1.0 else np.ones((1, 1)))
+    np.testing.assert_allclose(in_light(), image, atol=1e-6)
+    np.testing.assert_allclose(in_light(_EXPOSURE=(1.5, 1.5)), np.minimum(1.5 * image, 1.0), atol=1e-6)
+    np.testing.assert_allclose(in_light(_GAMMA=(2.0, 2.0)), image**2, atol=1e-6)
+    assert in_light(_CONTRAST=(0.4, 0.4)).std() == pytest.approx(0.4 * image.std(), rel=1e-3)
+    assert 0.001 < (in_light(2, _NOISE_SIGMA=0.1) - image).std() < 0.1
+    assert in_light(_MOTION_BLUR_PX=9.0).std() < 0.9 * image.std()
+    assert in_light(_BLUR_SIGMA_PX=2.0).std() < 0.99 * image.std()
+    assert abs(in_light(1, _BRIGHTNESS=0.2).mean() - image.mean()) > 0.005
 
 
 def test_images_come_from_folders_in_grey_or_colour(tmp_path):
@@ -222,7 +218,7 @@ def test_images_are_held_out_by_name(pictures):
 
 def test_validation_of_points_that_never_move(pictures):
     """A network whose score and place are those of the view's pixels finds nothing again; validation is a share."""
-    found = validate(Training(SMALL, pictures).network, pictures, seed=0)
+    found = validate(Training(SMALL, pictures).weights(), pictures, seed=0)
     assert 0.0 <= found.repeatability < 0.8
     assert 0.0 < found.localisation_px <= 3.0
 
@@ -293,7 +289,7 @@ def test_command_reads_options_from_a_file(folder, tmp_path):
     ("arguments", "message"),
     [
         (["--images", "/nowhere"], "/nowhere does not exist"),
-        (["--images", "{folder}", "-o", "epochs=0"], "epochs must be at least 1"),
+        (["--images", "{folder}", "-o", "epochs=0"], "epochs=0: Input should be greater than 0"),
         (["--images", "{folder}", "-o", "epoch=1"], "did you mean 'epochs'"),
         (["--images", "{folder}", "-o", "size=[90, 64]"], "multiples of 8"),
         (["--images", "{folder}", "--resume"], "nothing to resume"),

@@ -17,11 +17,10 @@ import cv2  # noqa: E402
 from keypointnet_helpers import ARCHITECTURES, TINY, network, texture, weights  # noqa: E402
 
 from vioframe.errors import ConfigError  # noqa: E402
-from vioframe_keypointnet import checkpoint  # noqa: E402
 from vioframe_keypointnet import weights as weights_file  # noqa: E402
-from vioframe_keypointnet.architecture import COMPACT, FULL  # noqa: E402
+from vioframe_keypointnet.__main__ import convert  # noqa: E402
+from vioframe_keypointnet.architecture import COMPACT, FULL, ranged_layers, shapes  # noqa: E402
 from vioframe_keypointnet.network import KeypointNet  # noqa: E402
-from vioframe_keypointnet.tensors import ranged_layers, shapes  # noqa: E402
 
 REMEDY = "vioframe train keypointnet --images DIR"
 
@@ -194,9 +193,7 @@ def test_the_converter_measures_ranges_where_images_are_given(saved, tmp_path):
     path, made = saved
     for number in range(3):
         cv2.imwrite(str(tmp_path / f"{number}.png"), texture(seed=number))
-    done = CliRunner().invoke(
-        checkpoint.convert, [str(path), str(tmp_path / "o.safetensors"), "--calibrate", str(tmp_path)]
-    )
+    done = CliRunner().invoke(convert, [str(path), str(tmp_path / "o.safetensors"), "--calibrate", str(tmp_path)])
     assert done.exit_code == 0, done.output
     found = weights_file.load(tmp_path / "o.safetensors")
     assert found.card == {"epochs": 3}
@@ -206,7 +203,7 @@ def test_the_converter_measures_ranges_where_images_are_given(saved, tmp_path):
 
 def test_the_converter_complains_in_one_line(tmp_path):
     (tmp_path / "a.ckpt").write_bytes(b"garbage")
-    done = CliRunner().invoke(checkpoint.convert, [str(tmp_path / "a.ckpt"), str(tmp_path / "o.safetensors")])
+    done = CliRunner().invoke(convert, [str(tmp_path / "a.ckpt"), str(tmp_path / "o.safetensors")])
     assert done.exit_code == 1
     assert done.output.startswith("Error: ")
     assert done.output.count("\n") == 1

@@ -20,16 +20,15 @@ from plugin_helpers import install
 from scipy.stats import chi2
 
 from vioframe.bench import run_backend
-from vioframe.bench.contenders import Contender, parse_contenders
 from vioframe.bench.montecarlo import Setup, nees_by_stretch, run_montecarlo
 from vioframe.bench.processes import installed, usable_cores
 from vioframe.cli import main
 from vioframe.errors import ConfigError, PluginError
 from vioframe.evaluation import evaluate
-from vioframe.evaluation.consistency import PARTS, Outcome, Trial, average_band
+from vioframe.evaluation.consistency import PARTS, Trial, Trials, average_band
 from vioframe.geometry import so3
 from vioframe.geometry.so3 import rotation_z
-from vioframe.parts import registry
+from vioframe.parts.config import PartConfig
 from vioframe.simulation import simulated_sequence
 from vioframe.types import Estimate, NavState, Status
 
@@ -114,7 +113,7 @@ def results(folder: str) -> list[dict]:
 # The statistics
 
 
-def honest_outcome(trials: int, instants: int, factor: float = 1.0) -> Outcome:
+def honest_outcome(trials: int, instants: int, factor: float = 1.0) -> Trials:
     """Trials that begin one instant after the other, with NEES drawn independently at each."""
     rng = np.random.default_rng(1)
     made = []
@@ -122,7 +121,7 @@ def honest_outcome(trials: int, instants: int, factor: float = 1.0) -> Outcome:
         t_ns = np.arange(seed % 5, instants) * 50_000_000
         nees = {part: factor * rng.chisquare(dof, len(t_ns)) for part, dof in PARTS.items()}
         made.append(Trial(seed, "f", "b", None, "", {"ate_m": 1.0}, t_ns, nees))
-    return Outcome("b", "b", {}, {"flight": "f"}, tuple(made))
+    return Trials("b", "b", {}, {"flight": "f"}, tuple(made))
 
 
 def test_bounds_of_the_average_are_those_of_the_chi2_distribution():
@@ -150,7 +149,7 @@ def test_a_wrong_covariance_is_called_so(factor, verdict):
 def test_each_flight_counts_once_however_long_it_was_tracked():
     short = Trial(0, "f", "b", None, t_ns=np.arange(10), nees=dict.fromkeys(PARTS, np.full(10, 8.0)))
     long = Trial(1, "f", "b", None, t_ns=np.arange(90), nees=dict.fromkeys(PARTS, np.full(90, 2.0)))
-    nees = Outcome("b", "b", {}, {"flight": "f"}, (short, long)).nees("pose")
+    nees = Trials("b", "b", {}, {"flight": "f"}, (short, long)).nees("pose")
     assert nees.mean == 5.0
     assert nees.values[[0, 9, 10, 89]].tolist() == [5.0, 5.0, 2.0, 2.0]
     assert nees.trials[[9, 10]].tolist() == [2, 1]
@@ -196,21 +195,7 @@ def test_nees_is_taken_in_the_gauge_of_each_stretchs_first_pose():
     assert whole["position"] > 1000.0
 
 
-# What is compared
-
-
-def test_contenders_share_options_and_have_their_own(parts):
-    installed = registry.load()
-    drawn, own, msckf = parse_contenders(
-        ["drawn", "drawn:error_factor=3,pause_s=0.1", "msckf"],
-        ["error_factor=2", "backend.max_clones=7"],
-        installed,
-    )
-    assert (drawn.name, drawn.options) == ("drawn", {"error_factor": 2.0, "pause_s": 0.0})
-    assert own.name == "drawn:error_factor=3,pause_s=0.1"
-    assert own.options == {"error_factor": 3.0, "pause_s": 0.1}
-    assert msckf.options["max_clones"] == 7
-    assert len(parse_contenders(["drawn", "drawn"], [], installed)) == 1
+# What is refused
 
 
 @pytest.mark.parametrize(
@@ -225,9 +210,8 @@ def test_contenders_share_options_and_have_their_own(parts):
         (["--pixel-sigma", "-1"], "cannot be -1 px"),
         (["--outliers", "1"], "the part of outliers cannot be 1"),
         (["--max-points", "0"], "0 landmarks"),
-        (["-o", "max_clone=5"], "no part has such an option (did you mean"),
-        (["-o", "max_features"], "-o takes key=value"),
-        (["-o", "frontend.max_points=5"], "no part has such an option"),
+        (["--backend", "msckf:max_clone=5"], "max_clone"),
+        (["--backend", "msckf:max_clones"], "options are given as msckf:KEY=VALUE"),
         (["--backend", "msckf:max_clones=1"], "needs max_clones >= 3"),
         (["--backend", "msckf:max_clones=many"], "should be a valid integer"),
     ],
@@ -328,7 +312,7 @@ def test_ctrl_c_ends_all_processes_and_leaves_nothing(parts, tmp_path):
     command = [sys.executable, "-m", "vioframe", "montecarlo", "--backend", "drawn:pause_s=0.05", "--duration", "10"]
     process = subprocess.Popen(
         [*command, "--seeds", "50", "--workers", "2", "--flight", "standstill", "--out", "out"],
-        env=os.environ | {"PYTHONPATH": str(tmp_path / "site")},
+        env=os.environ | {"PYTHONPATH": os.pathsep.join([str(tmp_path / "site"), os.environ.get("PYTHONPATH", "")])},
         stderr=subprocess.PIPE,
         stdout=subprocess.PIPE,
         text=True,
@@ -356,7 +340,7 @@ def test_a_setup_says_what_is_wrong_with_it():
     with pytest.raises(ConfigError, match="at least 10 s"):
         Setup("hover", 5.0)
     with pytest.raises(PluginError, match="no backend is called"):
-        run_montecarlo([Setup("hover", 10.0)], [Contender("nothing")], 1)
+        run_montecarlo([Setup("hover", 10.0)], {"nothing": PartConfig(name="nothing")}, 1)
 
 
 # What the project promises
@@ -366,7 +350,8 @@ def test_a_setup_says_what_is_wrong_with_it():
 def test_the_msckf_is_accurate_and_honest_and_not_without_first_estimates():
     """25 flights of 60 s at EuRoC's noise, which it is told, with its own initialisation: every figure promised."""
     setup = Setup("figure_eight", 60.0)
-    (honest,) = run_montecarlo([setup], [Contender("msckf", {"imu_noise_factor": 1.0})], 25, workers=usable_cores())
+    told = PartConfig(name="msckf", options={"imu_noise_factor": 1.0})
+    (honest,) = run_montecarlo([setup], {"msckf": told}, 25, workers=usable_cores())
     assert sum(honest.failures.values()) == 0
     assert honest.total("resets") == 0
     assert honest.mean("completion") == 1.0
@@ -375,8 +360,8 @@ def test_the_msckf_is_accurate_and_honest_and_not_without_first_estimates():
     for part in PARTS:
         assert 0.7 <= honest.nees(part).per_axis <= 1.5
 
-    without = Contender("msckf", {"imu_noise_factor": 1.0, "first_estimate_jacobians": False})
-    (sure,) = run_montecarlo([setup], [without], 6, workers=usable_cores())
+    without = PartConfig(name="msckf", options={"imu_noise_factor": 1.0, "first_estimate_jacobians": False})
+    (sure,) = run_montecarlo([setup], {"without": without}, 6, workers=usable_cores())
     for part in PARTS:
         assert sure.nees(part).per_axis > 1.5
         assert sure.nees(part).verdict == "overconfident"

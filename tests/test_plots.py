@@ -7,7 +7,7 @@ from vioframe.cli import main
 from vioframe.evaluation import evaluate
 from vioframe.geometry.trajectory import Trajectory
 from vioframe.io.trajectories import write_tum
-from vioframe.report import plot_cost, plot_errors, plot_paths
+from vioframe.report import figures
 from vioframe.report.figures import write_figures
 from vioframe.runs.evaluated import evaluate_path, evaluate_paths
 
@@ -78,7 +78,7 @@ def test_a_run_without_a_pose_does_not_spoil_the_others(tmp_path, folder):
     assert {path.stem for path in written} == EVERYTHING
 
 
-@pytest.mark.parametrize(("draw", "axes"), [(plot_paths.path_top, (0, 1)), (plot_paths.path_side, (0, 2))])
+@pytest.mark.parametrize(("draw", "axes"), [(figures.path_top, (0, 1)), (figures.path_side, (0, 2))])
 def test_a_metre_is_a_metre_on_both_axes_and_nothing_is_cut_off(runs, draw, axes):
     ax = draw(runs).axes[0]
     assert ax.get_aspect() == 1.0
@@ -91,17 +91,17 @@ def test_a_metre_is_a_metre_on_both_axes_and_nothing_is_cut_off(runs, draw, axes
 
 
 def test_the_3d_axes_are_to_scale(runs):
-    ax = plot_paths.path_3d(runs).axes[0]
+    ax = figures.path_3d(runs).axes[0]
     sizes = np.array([np.ptp(limits) for limits in (ax.get_xlim(), ax.get_ylim(), ax.get_zlim())])
     np.testing.assert_allclose(ax._box_aspect / ax._box_aspect[0], sizes / sizes[0], rtol=1e-6)
 
 
 def test_every_run_is_named_and_the_alignment_stated(runs):
-    figures = [plot_paths.path_3d(runs), plot_paths.path_top(runs), plot_paths.path_side(runs)]
-    for figure in figures:
+    drawn = [figures.path_3d(runs), figures.path_top(runs), figures.path_side(runs)]
+    for figure in drawn:
         assert legend(figure) == ["ground truth", "a", "b"]
-    figures += [plot_errors.translation_error(runs), plot_errors.rotation_error(runs)]
-    for figure in figures:
+    drawn += [figures.translation_error(runs), figures.rotation_error(runs)]
+    for figure in drawn:
         assert "position + yaw" in figure._supxlabel.get_text()
         assert set(legend(figure)) >= {"a", "b"}
 
@@ -109,8 +109,8 @@ def test_every_run_is_named_and_the_alignment_stated(runs):
 def test_the_curves_are_the_errors(runs):
     expected = evaluate(runs[1].estimate, runs[1].ground_truth)
     for draw, series in [
-        (plot_errors.translation_error, expected.position_m),
-        (plot_errors.rotation_error, expected.rotation_rpy_deg),
+        (figures.translation_error, expected.position_m),
+        (figures.rotation_error, expected.rotation_rpy_deg),
     ]:
         figure = draw(runs)
         for k, ax in enumerate(figure.axes):
@@ -121,19 +121,19 @@ def test_the_curves_are_the_errors(runs):
 
 
 def test_the_band_is_as_wide_as_asked(runs):
-    with_band = plot_errors.translation_error(runs, band_m=0.2)
+    with_band = figures.translation_error(runs, band_m=0.2)
     assert "±20 cm" in with_band._supxlabel.get_text()
     for ax in with_band.axes:
         (band,) = ax.patches
         assert (band.get_y(), band.get_height()) == (-0.2, 0.4)
-    assert all(not ax.patches for ax in plot_errors.translation_error(runs).axes)
+    assert all(not ax.patches for ax in figures.translation_error(runs).axes)
 
 
 def test_no_line_is_drawn_across_a_gap():
     truth = flight()
     holed = truth.select(np.r_[0:100, 200:400])
     (run,) = [evaluate_run(holed, truth)]
-    ax = plot_errors.translation_error([run]).axes[0]
+    ax = figures.translation_error([run]).axes[0]
     (line,) = [line for line in ax.get_lines() if line.get_label() == "holed"]
     assert np.flatnonzero(np.isnan(line.get_ydata())).tolist() == [100]
 
@@ -147,13 +147,13 @@ def evaluate_run(estimate, truth):
 def test_a_short_path_shows_fractions_of_itself():
     truth = flight()
     short = Trajectory(truth.t_ns, truth.R_WB, truth.p_WB / 20.0)
-    lower = plot_errors.relative_error([evaluate_run(disturbed(short, 0.001, 0.001), short)]).axes[1]
+    lower = figures.relative_error([evaluate_run(disturbed(short, 0.001, 0.001), short)]).axes[1]
     assert lower.get_xlabel() == "length of the stretch [% of the path]"
     assert [tick.get_text() for tick in lower.get_xticklabels()] == ["10", "20", "30", "40", "50"]
 
 
 def test_the_bars_add_up_to_the_time_a_frame(runs):
-    ax = plot_cost.timing(runs).axes[0]
+    ax = figures.timing(runs).axes[0]
     ends = [bar.get_x() + bar.get_width() for bar in ax.patches]
     assert max(ends) == pytest.approx(sum(runs[0].stage_ms().values()), rel=1e-9)
     assert f"{max(ends):.1f} ms" in {text.get_text() for text in ax.texts}
@@ -161,7 +161,7 @@ def test_the_bars_add_up_to_the_time_a_frame(runs):
 
 def test_a_run_without_times_has_no_bar(runs):
     truth = flight()
-    ax = plot_cost.timing([evaluate_run(truth, truth), *runs]).axes[0]
+    ax = figures.timing([evaluate_run(truth, truth), *runs]).axes[0]
     assert [label.get_text() for label in ax.get_yticklabels()] == [run.name for run in runs]
 
 

@@ -1,24 +1,33 @@
 """Readers: what is in a recording comes out exactly; what is wrong with one is said in a line, or counted."""
 
 import logging
+import re
 import shutil
+from collections.abc import Callable, Iterator
 from dataclasses import replace
+from itertools import count
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 from recordings import (
     CALIBRATION,
+    CAMERA,
     HEIGHT,
+    PAIR,
     T0_NS,
     WIDTH,
     Message,
     assert_equal,
+    assert_same_rig,
     compressed_message,
     image_message,
     imu_message,
     measurements,
+    pair_measurements,
+    true_trajectory,
     write_bag,
 )
 
@@ -27,8 +36,11 @@ from vioframe.incidents import Incidents
 from vioframe.interfaces import Dataset
 from vioframe.io.calibration import packaged_calibration, sidecar_folder, write_calibration
 from vioframe.io.convert import convert
+from vioframe.io.images import gathered
+from vioframe.io.memory import ArrayDataset
 from vioframe.io.synchronise import synchronise
-from vioframe.types import Frame, ImuSample, Measurement, Unreadable
+from vioframe.testing import check_dataset
+from vioframe.types import FrameSet, Image, ImuSample, Measurement, Unreadable
 from vioframe_euroc import EurocDataset
 from vioframe_rosbag import RosbagDataset
 
@@ -45,8 +57,15 @@ def bag(tmp_path: Path) -> Path:
     return tmp_path / "flight.bag"
 
 
-def frames_of(dataset: Dataset) -> list[Frame]:
-    return [m for m in dataset.measurements() if isinstance(m, Frame)]
+def frames_of(dataset: Dataset) -> list[FrameSet]:
+    return [m for m in dataset.measurements() if isinstance(m, FrameSet)]
+
+
+def image_of(frames: FrameSet) -> Image:
+    """That of a lone camera."""
+    (image,) = frames.images
+    assert image is not None
+    return image
 
 
 def incidents_of(dataset: Dataset) -> dict[str, int]:
@@ -71,8 +90,7 @@ class TestAsl:
             dataset = EurocDataset(path)
             assert isinstance(dataset, Dataset)
             assert (dataset.name, dataset.frame_count, dataset.ground_truth) == ("flight", 6, None)
-            assert dataset.calibration.camera == CALIBRATION.camera
-            assert dataset.calibration.time_offset_ns == CALIBRATION.time_offset_ns
+            assert_same_rig(dataset.calibration, CALIBRATION)
             assert_equal(dataset.measurements(), measurements())
             assert_equal(dataset.measurements(), measurements())
 
@@ -138,7 +156,7 @@ class TestAsl:
         # ITU-R BT.601 weights, channels in OpenCV's order.
         expected = colour @ np.array([0.114, 0.587, 0.299])
         for frame in frames_of(EurocDataset(asl)):
-            assert np.abs(frame.image - expected).max() <= 0.51
+            assert np.abs(image_of(frame) - expected).max() <= 0.51
 
     def test_16_bit_images_need_their_depth(self, asl: Path) -> None:
         deep = np.random.default_rng(1).integers(0, 4096, (HEIGHT, WIDTH), dtype=np.uint16)
@@ -147,9 +165,11 @@ class TestAsl:
         with pytest.raises(DatasetError, match=r"cam0 has 16-bit images; set the reader's option bit_depth"):
             frames_of(EurocDataset(asl))
         for frame in frames_of(EurocDataset(asl, bit_depth=12)):
-            np.testing.assert_array_equal(frame.image, deep // 16)
+            np.testing.assert_array_equal(image_of(frame), deep // 16)
         # Values above the stated depth saturate instead of wrapping round.
-        np.testing.assert_array_equal(frames_of(EurocDataset(asl, bit_depth=10))[0].image, np.minimum(deep // 4, 255))
+        np.testing.assert_array_equal(
+            image_of(frames_of(EurocDataset(asl, bit_depth=10))[0]), np.minimum(deep // 4, 255)
+        )
         with pytest.raises(DatasetError, match="bit_depth must lie between 8 and 16, not 7"):
             EurocDataset(asl, bit_depth=7)
 
@@ -163,14 +183,14 @@ class TestAsl:
         shutil.copytree(asl / "mav0" / "cam0", asl / "mav0" / "cam1")
         sensor = asl / "mav0" / "cam1" / "sensor.yaml"
         sensor.write_text(sensor.read_text().replace("40.0", "44.0"))
-        assert EurocDataset(asl).calibration.camera.fx == 40.0
-        assert EurocDataset(asl, camera="cam1").calibration.camera.fx == 44.0
+        assert EurocDataset(asl).calibration.cameras[0].model.fx == 40.0
+        assert EurocDataset(asl, cameras="cam1").calibration.cameras[0].model.fx == 44.0
         write_calibration(CALIBRATION, tmp_path / "other")
         sensor = tmp_path / "other" / "cam0" / "sensor.yaml"
         sensor.write_text(sensor.read_text().replace("40.0", "55.0"))
         imu = tmp_path / "other" / "imu0" / "sensor.yaml"
-        assert EurocDataset(asl, calibration=tmp_path / "other").calibration.camera.fx == 55.0
-        assert EurocDataset(asl, calibration=[sensor, imu]).calibration.camera.fx == 55.0
+        assert EurocDataset(asl, calibration=tmp_path / "other").calibration.cameras[0].model.fx == 55.0
+        assert EurocDataset(asl, calibration=[sensor, imu]).calibration.cameras[0].model.fx == 55.0
 
     def test_ground_truth(self, asl: Path) -> None:
         folder = asl / "mav0" / "state_groundtruth_estimate0"
@@ -189,8 +209,8 @@ class TestAsl:
         assert not EurocDataset.accepts(tmp_path / "empty")
         with pytest.raises(DatasetError, match=r"empty holds no mav0/; name the folder of one sequence"):
             EurocDataset(tmp_path / "empty")
-        with pytest.raises(DatasetError, match=r"cam1/data.csv is missing; choose camera and imu among: cam0, imu0"):
-            EurocDataset(asl, camera="cam1")
+        with pytest.raises(DatasetError, match=r"cam1/data.csv is missing; choose cameras and imu among: cam0, imu0"):
+            EurocDataset(asl, cameras="cam1")
         mav0 = asl / "mav0"
         (mav0 / "imu0" / "sensor.yaml").rename(mav0 / "imu0" / "sensor.txt")
         with pytest.raises(CalibrationError, match=r"imu0/sensor.yaml: No such file"):
@@ -208,7 +228,7 @@ class TestAsl:
         with pytest.raises(DatasetError, match=r"'1.4e18,a.png' does not begin with a stamp in integer nanoseconds"):
             EurocDataset(asl)
         (mav0 / "imu0" / "data.csv").unlink()
-        with pytest.raises(DatasetError, match=r"imu0/data.csv is missing; choose camera and imu among: cam0"):
+        with pytest.raises(DatasetError, match=r"imu0/data.csv is missing; choose cameras and imu among: cam0"):
             EurocDataset(asl)
 
 
@@ -248,8 +268,7 @@ class TestRosbag:
         assert isinstance(dataset, Dataset)
         assert (dataset.frame_count, dataset.ground_truth) == (6, None)
         assert dataset.name == ("flight.ros2" if path.is_dir() else "flight")
-        assert dataset.calibration.camera == CALIBRATION.camera
-        assert dataset.calibration.time_offset_ns == CALIBRATION.time_offset_ns
+        assert_same_rig(dataset.calibration, CALIBRATION)
         assert_equal(dataset.measurements(), measurements())
         assert_equal(dataset.measurements(), measurements())
 
@@ -284,7 +303,7 @@ class TestRosbag:
     def test_damage_further_on_leaves_what_came_before(self, tmp_path: Path) -> None:
         path = tmp_path / "flight.bag"
         source = measurements(frame_count=40, size=(480, 640))
-        calibration = replace(CALIBRATION, camera=replace(CALIBRATION.camera, resolution=(640, 480)))
+        calibration = CALIBRATION.with_camera(0, model=replace(CAMERA.model, resolution=(640, 480)))
         convert(source, calibration, path, compression="bz2")
         data = bytearray(path.read_bytes())
         # Ten chunks of four images: this is in the middle of the sixth.
@@ -295,7 +314,7 @@ class TestRosbag:
         with pytest.raises(DatasetError, match="cannot read") as caught:
             read.extend(RosbagDataset(path).measurements())
         one_line(caught)
-        assert 16 <= sum(isinstance(m, Frame) for m in read) <= 24
+        assert 16 <= sum(isinstance(m, FrameSet) for m in read) <= 24
         assert_equal(read, source[: len(read)])
 
     @pytest.mark.parametrize("suffix", [".bag", ".db3", ".mcap"])
@@ -335,7 +354,7 @@ class TestRosbag:
         messages = [
             imu_message("/imu0", m, recorded_ns=m.t_ns + 1_000_000)
             if isinstance(m, ImuSample)
-            else image_message("/cam0/image_raw", m.t_ns, m.image, "mono8", recorded_ns=m.t_ns + 30_000_000)
+            else image_message("/cam0/image_raw", m.t_ns, image_of(m), "mono8", recorded_ns=m.t_ns + 30_000_000)
             for m in source
             if not isinstance(m, Unreadable)
         ]
@@ -355,7 +374,7 @@ class TestRosbag:
     @pytest.mark.parametrize("encoding", ["mono8", "8UC1"])
     def test_gray_images_with_and_without_padding(self, tmp_path: Path, encoding: str, padding: int) -> None:
         path = bag_with(tmp_path, image_message("/cam0/image_raw", T0_NS, IMAGE, encoding, padding))
-        np.testing.assert_array_equal(frames_of(RosbagDataset(path))[0].image, IMAGE)
+        np.testing.assert_array_equal(image_of(frames_of(RosbagDataset(path))[0]), IMAGE)
 
     @pytest.mark.parametrize("padding", [0, 16])
     @pytest.mark.parametrize(("encoding", "channels"), [("bgr8", 3), ("rgb8", 3), ("bgra8", 4), ("rgba8", 4)])
@@ -363,7 +382,7 @@ class TestRosbag:
         colour = np.random.default_rng(3).integers(0, 256, (HEIGHT, WIDTH, channels), dtype=np.uint8)
         path = bag_with(tmp_path, image_message("/camera/color", T0_NS, colour, encoding, padding))
         weights = np.array([0.299, 0.587, 0.114] if encoding.startswith("r") else [0.114, 0.587, 0.299])
-        image = frames_of(RosbagDataset(path))[0].image
+        image = image_of(frames_of(RosbagDataset(path))[0])
         assert np.abs(image - colour[:, :, :3] @ weights).max() <= 0.51
 
     @pytest.mark.parametrize("encoding", ["bayer_rggb8", "bayer_bggr8", "bayer_gbrg8", "bayer_grbg8"])
@@ -373,7 +392,7 @@ class TestRosbag:
         mosaic = np.zeros((HEIGHT, WIDTH), np.uint8)
         mosaic[place // 2 :: 2, place % 2 :: 2] = 200
         path = bag_with(tmp_path, image_message("/camera/raw", T0_NS, mosaic, encoding))
-        image = frames_of(RosbagDataset(path))[0].image
+        image = image_of(frames_of(RosbagDataset(path))[0])
         assert np.abs(image[4:-4, 4:-4] - 0.299 * 200).max() <= 1.0
 
     def test_compressed_images(self, tmp_path: Path) -> None:
@@ -387,9 +406,9 @@ class TestRosbag:
         ]
         dataset = RosbagDataset(bag_with(tmp_path, *messages))
         first, second, third = frames_of(dataset)
-        np.testing.assert_array_equal(first.image, IMAGE)
-        assert np.abs(second.image - colour @ np.array([0.114, 0.587, 0.299])).max() <= 0.51
-        assert third.image.shape == IMAGE.shape
+        np.testing.assert_array_equal(image_of(first), IMAGE)
+        assert np.abs(image_of(second) - colour @ np.array([0.114, 0.587, 0.299])).max() <= 0.51
+        assert image_of(third).shape == IMAGE.shape
         assert [m.t_ns for m in dataset.measurements() if isinstance(m, Unreadable)] == [T0_NS + 3]
 
     def test_16_bit_images_need_their_depth(self, tmp_path: Path) -> None:
@@ -397,7 +416,7 @@ class TestRosbag:
         path = bag_with(tmp_path, image_message("/cam0/image_raw", T0_NS, deep, "mono16", padding=6))
         with pytest.raises(DatasetError, match=r"image_raw\] has 16-bit images; set the reader's option bit_depth"):
             RosbagDataset(path)
-        np.testing.assert_array_equal(frames_of(RosbagDataset(path, bit_depth=12))[0].image, deep // 16)
+        np.testing.assert_array_equal(image_of(frames_of(RosbagDataset(path, bit_depth=12))[0]), deep // 16)
 
     @pytest.mark.parametrize("encoding", ["32FC1", "8UC3", "unheard of"])
     def test_other_encodings_are_refused(self, tmp_path: Path, encoding: str) -> None:
@@ -446,23 +465,28 @@ class TestRosbag:
         )
 
         def image(**options: str) -> np.ndarray:
-            return frames_of(RosbagDataset(path, **options))[0].image
+            return image_of(frames_of(RosbagDataset(path, **options))[0])
 
         np.testing.assert_array_equal(image(), IMAGE)
-        np.testing.assert_array_equal(image(camera_topic="/stereo/right"), IMAGE + 2)
-        np.testing.assert_array_equal(image(camera_topic="/cam0/a_compressed"), IMAGE + 3)
+        np.testing.assert_array_equal(image(cameras="/stereo/right"), IMAGE + 2)
+        np.testing.assert_array_equal(image(cameras="/cam0/a_compressed"), IMAGE + 3)
         calibration = sidecar_folder(path)
         shutil.copytree(calibration / "cam0", calibration / "cam1")
-        np.testing.assert_array_equal(image(camera="cam1"), IMAGE + 1)
-        np.testing.assert_array_equal(image(camera="cam1", camera_topic="/stereo/right"), IMAGE + 2)
+        np.testing.assert_array_equal(image(cameras="cam1"), IMAGE + 1)
+        np.testing.assert_array_equal(image(cameras="cam1:/stereo/right"), IMAGE + 2)
+        for cameras, images in ((None, (IMAGE, IMAGE + 1)), (["cam1", "cam0"], (IMAGE + 1, IMAGE))):
+            (frames,) = frames_of(RosbagDataset(path, cameras=cameras))
+            np.testing.assert_array_equal(frames.images, images)
         with pytest.raises(CalibrationError, match=r"describes no camera '/stereo/right'; choose one of: cam0, cam1"):
-            image(camera_topic="/stereo/right")
+            image(cameras="/stereo/right")
         samples = [m for m in RosbagDataset(path, imu_topic="/other_imu").measurements() if isinstance(m, ImuSample)]
         assert [m.t_ns for m in samples] == [T0_NS]
         with pytest.raises(DatasetError, match=r"no IMU messages on /imu9; its IMU topics: /imu0, /other_imu"):
             image(imu_topic="/imu9")
         with pytest.raises(DatasetError, match=r"no camera messages on /cam9; its camera topics: /cam0/image_raw, "):
-            image(camera_topic="/cam9")
+            image(cameras="/cam9")
+        with pytest.raises(DatasetError, match=r"no camera messages on /cam9; its camera topics: /cam0/image_raw, "):
+            image(cameras="cam1:/cam9")
         assert RosbagDataset(path).ground_truth is None
 
 
@@ -482,10 +506,10 @@ class TestCalibrationOfABag:
         self, tmp_path: Path, caplog: pytest.LogCaptureFixture, camera: str
     ) -> None:
         dataset = RosbagDataset(self.euroc_like(tmp_path, f"/{camera}/image_raw"))
-        assert dataset.calibration.camera == packaged_calibration("euroc", camera).camera
+        assert_same_rig(dataset.calibration, packaged_calibration("euroc", [camera]))
         (record,) = caplog.records
         assert (record.name, record.levelno) == ("vioframe.rosbag", logging.WARNING)
-        assert f"using EuRoC's published calibration of {camera}" in record.getMessage()
+        assert "using EuRoC's published calibration" in record.getMessage()
 
     def test_any_other_bag_needs_one(self, tmp_path: Path) -> None:
         for options in ({"topic": "/camera/image_raw"}, {"width": 640}):
@@ -505,15 +529,212 @@ class TestCalibrationOfABag:
             write_calibration(packaged_calibration("euroc"), folder)
             sensor = folder / "cam0" / "sensor.yaml"
             sensor.write_text(sensor.read_text().replace("458.654", fx))
-        assert RosbagDataset(path).calibration.camera.fx == 500.0
-        assert RosbagDataset(path, calibration=tmp_path / "option").calibration.camera.fx == 600.0
+        assert RosbagDataset(path).calibration.cameras[0].model.fx == 500.0
+        assert RosbagDataset(path, calibration=tmp_path / "option").calibration.cameras[0].model.fx == 600.0
         files = [tmp_path / "option" / "cam0" / "sensor.yaml", tmp_path / "option" / "imu0" / "sensor.yaml"]
-        assert RosbagDataset(path, calibration=files).calibration.camera.fx == 600.0
+        assert RosbagDataset(path, calibration=files).calibration.cameras[0].model.fx == 600.0
         assert not caplog.records
 
 
+class TestSeveralCameras:
+    @pytest.fixture(params=["pair", "pair.bag"])
+    def pair(self, request: pytest.FixtureRequest, tmp_path: Path) -> Path:
+        convert(pair_measurements(), PAIR, tmp_path / request.param)
+        return tmp_path / request.param
+
+    def open(self, path: Path, **options: object) -> Dataset:
+        return (EurocDataset if path.is_dir() else RosbagDataset)(path, **options)
+
+    def test_all_come_by_default_in_the_order_of_their_names(self, pair: Path) -> None:
+        """Together, apart, and while the second is silent."""
+        dataset = self.open(pair)
+        assert_same_rig(dataset.calibration, PAIR)
+        assert_equal(dataset.measurements(), pair_measurements())
+        assert dataset.frame_count == (8 if pair.is_dir() else None)
+
+    def test_some_are_chosen_in_the_order_wanted(self, pair: Path) -> None:
+        dataset = self.open(pair, cameras=["cam1", "cam0"])
+        assert [camera.name for camera in dataset.calibration.cameras] == ["cam1", "cam0"]
+        expected = [FrameSet(m.t_ns, m.images[::-1]) if isinstance(m, FrameSet) else m for m in pair_measurements()]
+        assert_equal(dataset.measurements(), expected)
+        alone = self.open(pair, cameras="cam0")
+        assert alone.frame_count == 6
+        assert_equal(alone.measurements(), measurements())
+
+    def test_an_image_that_cannot_be_read_takes_none_of_the_others_with_it(self, tmp_path: Path) -> None:
+        convert(pair_measurements(), PAIR, tmp_path / "pair")
+        first = sorted((tmp_path / "pair" / "mav0" / "cam1" / "data").iterdir())[0]
+        first.write_bytes(b"")
+        read = list(EurocDataset(tmp_path / "pair").measurements())
+        (lost,) = [m for m in read if isinstance(m, Unreadable)]
+        frames = next(m for m in read if isinstance(m, FrameSet))
+        assert (lost.t_ns, lost.kind, frames.t_ns) == (int(first.stem), "frame_unreadable", lost.t_ns)
+        assert frames.images[0] is not None
+        assert frames.images[1] is None
+
+    def test_a_camera_without_images_or_calibration_is_left_out_unless_asked_for(self, tmp_path: Path) -> None:
+        convert(pair_measurements(), PAIR, tmp_path / "pair")
+        mav0 = tmp_path / "pair" / "mav0"
+        shutil.copytree(mav0 / "cam1", mav0 / "cam2")
+        (mav0 / "cam2" / "sensor.yaml").unlink()
+        (mav0 / "cam1" / "data.csv").write_text("#timestamp [ns],filename\n")
+        assert [camera.name for camera in EurocDataset(tmp_path / "pair").calibration.cameras] == ["cam0"]
+        with pytest.raises(DatasetError, match=r"cam1/data.csv lists no image"):
+            EurocDataset(tmp_path / "pair", cameras=["cam0", "cam1"])
+        with pytest.raises(CalibrationError, match=r"cam2/sensor.yaml: No such file"):
+            EurocDataset(tmp_path / "pair", cameras="cam2")
+
+    def test_messages_of_one_stamp_are_gathered_in_whatever_order_they_come(self, tmp_path: Path) -> None:
+        """Readings between them, the second camera first or two frames late; and what is repeated stays apart."""
+        second = IMAGE[:24, :32]
+
+        def left(stamp: int, at: int) -> Message:
+            return image_message("/cam0/image_raw", T0_NS + stamp, IMAGE, "mono8", recorded_ns=T0_NS + at)
+
+        def right(stamp: int, at: int) -> Message:
+            return image_message("/cam1/image_raw", T0_NS + stamp, second, "mono8", recorded_ns=T0_NS + at)
+
+        def imu(stamp: int) -> Message:
+            return imu_message("/imu0", ImuSample(T0_NS + stamp, np.ones(3), np.ones(3)))
+
+        messages = [
+            left(1, 1),
+            imu(2),
+            right(1, 3),
+            imu(4),
+            right(5, 5),
+            left(5, 6),
+            left(7, 7),
+            left(8, 8),
+            left(9, 9),
+        ]
+        messages += [imu(10), right(7, 11), right(8, 12), right(9, 13), right(9, 14), imu(15)]
+        path = write_bag(tmp_path / "test.bag", messages)
+        write_calibration(PAIR, sidecar_folder(path))
+        read = [
+            (m.t_ns - T0_NS, *(image is not None for image in m.images)) if isinstance(m, FrameSet) else m.t_ns - T0_NS
+            for m in RosbagDataset(path).measurements()
+        ]
+        both = (True, True)
+        sets = [(1, *both), 2, 4, (5, *both), (7, *both), (8, *both), (9, *both), 10, (9, False, True), 15]
+        assert read == sets
+
+    def test_a_silent_camera_holds_up_a_bounded_number_of_measurements(self) -> None:
+        """What comes long after the first image of its stamp is a set of its own."""
+        taken = 0
+
+        def endless() -> Iterator[Measurement]:
+            nonlocal taken
+            for taken in count():
+                images = (IMAGE, None) if taken % 5 == 0 else None
+                yield FrameSet(taken, images) if images else ImuSample(taken, np.zeros(3), np.zeros(3))
+
+        read = gathered(endless())
+        for expected in range(1000):
+            assert next(read).t_ns == expected
+            assert taken - expected < 200
+        late = [FrameSet(0, (IMAGE, None)), *(ImuSample(1 + i, np.zeros(3), np.zeros(3)) for i in range(200))]
+        assert [m.t_ns for m in gathered([*late, FrameSet(0, (None, IMAGE))])] == [*range(201), 0]
+
+
+class TestArrays:
+    def arrays(self) -> dict[str, object]:
+        source = measurements()
+        imu = [m for m in source if isinstance(m, ImuSample)]
+        frames = [m for m in source if isinstance(m, FrameSet)]
+        return {
+            "imu_t_ns": np.array([m.t_ns for m in imu]),
+            "gyro_B": np.array([m.gyro_B for m in imu]),
+            "accel_B": np.array([m.accel_B for m in imu]),
+            "frame_t_ns": np.array([m.t_ns for m in frames]),
+            "images": np.array([image_of(m) for m in frames]),
+        }
+
+    def test_what_goes_in_comes_out(self) -> None:
+        arrays = self.arrays()
+        for images in (arrays["images"], list(arrays["images"]), {"cam0": arrays["images"]}):
+            dataset = ArrayDataset(CALIBRATION, **(arrays | {"images": images}), name="mine")
+            assert isinstance(dataset, Dataset)
+            assert (dataset.name, dataset.frame_count, dataset.ground_truth) == ("mine", 6, None)
+            assert_equal(dataset.measurements(), measurements())
+            assert_equal(dataset.measurements(), measurements())
+        assert arrays["images"].flags.writeable  # the caller's own is left as it is
+
+    def test_several_cameras_and_conversion_with_the_truth(self, tmp_path: Path) -> None:
+        source = [m for m in pair_measurements() if isinstance(m, FrameSet)]
+        frames = {
+            "frame_t_ns": [m.t_ns for m in source],
+            "images": {name: [m.images[place] for m in source] for place, name in enumerate(("cam0", "cam1"))},
+        }
+        dataset = ArrayDataset(PAIR, **(self.arrays() | frames), ground_truth=true_trajectory())
+        assert_equal(dataset.measurements(), pair_measurements())
+        convert(dataset.measurements(), dataset.calibration, tmp_path / "a.bag", truth=dataset.ground_truth)
+        assert_equal(RosbagDataset(tmp_path / "a.bag").measurements(), pair_measurements())
+
+    def test_the_example_of_the_documentation(self) -> None:
+        page = Path(__file__).parents[1] / "docs" / "data.md"
+        (example,) = re.findall(r"^```python\n(.*?)^```", page.read_text(), re.MULTILINE | re.DOTALL)
+        defined: dict[str, Any] = {}
+        exec(example, defined)
+        assert len(list(synchronise(defined["dataset"].measurements(), incidents=Incidents()))) == 198
+
+    @pytest.mark.parametrize(
+        ("name", "change", "message"),
+        [
+            ("imu_t_ns", lambda t: t * 1e-9, r"imu_t_ns must be \(N,\) integer nanoseconds, got \(71,\) float64"),
+            ("imu_t_ns", lambda t: t[::-1], r"imu_t_ns must increase, but \d+ \(place 1\) follows"),
+            ("imu_t_ns", lambda t: t[:0], r"imu_t_ns must be \(N,\)"),
+            ("frame_t_ns", lambda t: t // 10**9, r"frame_t_ns must increase"),
+            ("frame_t_ns", lambda t: t[1:], r"there are 6 images of cam0 for 5 stamps"),
+            ("gyro_B", lambda w: w.T, r"gyro_B must be \(71, 3\) to match imu_t_ns, got \(3, 71\)"),
+            ("accel_B", lambda a: a[:-1], r"accel_B must be \(71, 3\)"),
+            ("images", lambda i: i.astype(float), r"images of cam0 must be \(H, W\) uint8, got \(48, 64\) float64"),
+            ("images", lambda i: i[..., None], r"images of cam0 must be \(H, W\) uint8"),
+            ("images", lambda i: i[:, ::2], r"images of cam0 must be of the calibrated size 64x48, got 64x24"),
+            ("images", lambda i: {"cam1": i}, r"images are given for \['cam1'\], but the cameras are \['cam0'\]"),
+            ("images", lambda i: [None, *i[1:]], r"no camera has an image at \d+ ns \(place 0 of frame_t_ns\)"),
+        ],
+    )
+    def test_what_does_not_fit_is_said(self, name: str, change: Callable[[Any], Any], message: str) -> None:
+        arrays = self.arrays()
+        with pytest.raises(DatasetError, match=message) as caught:
+            ArrayDataset(CALIBRATION, **(arrays | {name: change(arrays[name])}))
+        one_line(caught)
+
+
+class TestConformance:
+    @pytest.mark.parametrize(("reader", "name"), [(EurocDataset, "pair"), (RosbagDataset, "pair.mcap")])
+    def test_the_built_in_readers_conform(self, tmp_path: Path, reader: type[Dataset], name: str) -> None:
+        convert(pair_measurements(), PAIR, tmp_path / name, truth=true_trajectory())
+        check_dataset(reader, tmp_path / name)
+        check_dataset(reader, tmp_path / name, cameras=["cam1"])
+
+    @pytest.mark.parametrize(
+        ("spoil", "message"),
+        [
+            (lambda images: images[:1], "a frame set has 1 places, the calibration 2 cameras"),
+            (lambda images: list(images), "the images of a frame set are a list, not a tuple"),
+            (lambda images: (None, None), "a frame set holds no image"),
+            (lambda images: (images[0], images[0]), r"an image of cam1 is \(64, 48\), the calibration for \(32, 24\)"),
+            (lambda images: (images[0].copy(), images[1]), "an image of cam0 is writeable"),
+            (lambda images: (images[0], images[1] * 1.0), r"an image of cam1 is \(24, 32\) float64"),
+        ],
+    )
+    def test_a_reader_that_breaks_a_promise_is_found_out(
+        self, tmp_path: Path, spoil: Callable[[Any], Any], message: str
+    ) -> None:
+        class Spoilt(EurocDataset):
+            def measurements(self) -> Iterator[Measurement]:
+                for m in super().measurements():
+                    yield FrameSet(m.t_ns, spoil(m.images)) if isinstance(m, FrameSet) else m
+
+        convert(pair_measurements(alone=()), PAIR, tmp_path / "pair")
+        with pytest.raises(AssertionError, match=message):
+            check_dataset(Spoilt, tmp_path / "pair")
+
+
 def test_the_real_recordings(shared_data: Path) -> None:
-    moving = EurocDataset(shared_data / "euroc" / "MH_01_easy_15s")
+    moving = EurocDataset(shared_data / "euroc" / "MH_01_easy_15s", cameras="cam0")
     assert (moving.name, moving.frame_count) == ("MH_01_easy_15s", 300)
     assert incidents_of(moving) == {}
     truth = moving.ground_truth
@@ -523,7 +744,7 @@ def test_the_real_recordings(shared_data: Path) -> None:
     packets = list(synchronise(resting.measurements(), incidents=Incidents()))
     assert len(packets) == resting.frame_count == 95
     imu, frame = packets[-1]
-    assert frame.image.shape == (480, 752)
+    assert image_of(frame).shape == (480, 752)
     # Every frame of EuRoC falls on an IMU sample: eleven stamps, both ends included.
     assert len(imu.t_ns) == 11
     assert np.linalg.norm(imu.accel_B.mean(axis=0)) == pytest.approx(9.81, abs=0.2)

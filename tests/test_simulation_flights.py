@@ -24,7 +24,7 @@ from vioframe.types import g_W
 ROOT = Path(__file__).resolve().parents[1]
 INSTALLED = registry.load()
 FLIGHTS = INSTALLED.names(registry.FLIGHT)
-R_BC = packaged_calibration("euroc").R_BC
+R_BC = packaged_calibration("euroc", cameras=["cam0"]).cameras[0].R_BC
 
 
 def still(t_s):

@@ -11,15 +11,15 @@ from vioframe.errors import ConfigError
 from vioframe.geometry import so3
 from vioframe.geometry.cameras import Camera
 from vioframe.io.calibration import packaged_calibration
-from vioframe.simulation.camera import Shot, SimulatedCamera, Studio, take_pictures
-from vioframe.simulation.movers import draw_movers
+from vioframe.simulation.camera import Photographer, Shot, Studio, take_pictures
 from vioframe.simulation.renderer import Renderer
 from vioframe.simulation.textures import SIZE, images_as_textures, procedural_textures
-from vioframe.simulation.world import MeshBuilder, MeshWorld
+from vioframe.simulation.world import MeshBuilder, MeshWorld, draw_movers
 
 pytest.importorskip("open3d", exc_type=ImportError)
 
-EUROC = packaged_calibration("euroc").camera
+EUROC = packaged_calibration("euroc", cameras=["cam0"]).cameras[0].model
+SMALL = small_calibration().cameras[0].model
 FISHEYE = Camera(230.0, 229.0, 370.0, 236.0, (-0.01, 0.03, -0.02, 0.004), (752, 480), "equidistant")
 BLACK, WHITE = (np.full((8, 8), value, np.uint8) for value in (40, 220))
 SQUARE_M = 0.3
@@ -88,7 +88,7 @@ def test_a_vertex_is_drawn_where_it_projects_to(camera, seed):
 
 def test_light_is_that_of_the_texture_and_of_the_surface():
     """Straight on, a white wall is as bright everywhere; what is beyond it is grey."""
-    renderer = Renderer(small_calibration().camera, board())
+    renderer = Renderer(SMALL, board())
     light = renderer.render(np.eye(3), np.array([0.0, 0.0, -1.0]))
     levels = np.unique(np.round(light[40:80, 60:120], 3))
     assert levels[-1] / levels[0] == pytest.approx(220 / 40, rel=0.02)
@@ -101,13 +101,13 @@ def test_far_textures_do_not_alias():
     stripes = np.tile(np.array([[0, 255]], np.uint8), (64, 32))
     builder = MeshBuilder()
     builder.quad(np.array([-20.0, -20.0, 0.0]), *(40.0 * np.eye(3)[:2]), 0, 0.5, np.zeros(2))
-    renderer = Renderer(small_calibration().camera, MeshWorld(builder.build(), (stripes,)))
+    renderer = Renderer(SMALL, MeshWorld(builder.build(), (stripes,)))
     light = renderer.render(np.eye(3), np.array([0.0, 0.0, -8.0]))
     assert light[30:90, 50:140].std() < 0.01 * light[30:90, 50:140].mean()
 
 
 def test_fog_and_contrast():
-    camera, pose = small_calibration().camera, (np.eye(3), np.array([0.0, 0.0, -2.0]))
+    camera, pose = SMALL, (np.eye(3), np.array([0.0, 0.0, -2.0]))
     centre = np.s_[50:70, 80:110]
     clear = Renderer(camera, board()).render(*pose)[centre]
     foggy = Renderer(camera, board(), fog_per_m=0.5).render(*pose)[centre]
@@ -123,11 +123,11 @@ def test_fog_and_contrast():
 
 def shots(count: int, instants: int = 1) -> list[Shot]:
     R = np.stack([so3.exp([0.0, 0.02 * k, 0.0]) for k in range(instants)])
-    return [Shot(R, np.tile([0.0, 0.1 * k, -2.0], (instants, 1)), None, 1.0, (1, k)) for k in range(count)]
+    return [Shot(0, R, np.tile([0.0, 0.1 * k, -2.0], (instants, 1)), None, 1.0, (1, k)) for k in range(count)]
 
 
 def test_the_number_of_processes_makes_no_difference():
-    studio = Studio(small_calibration().camera, board(), noise_deviation=0.05)
+    studio = Studio((SMALL,), board(), noise_deviation=0.05)
     alone, together = (list(take_pictures(studio, shots(11), workers)) for workers in (1, 2))
     assert len(alone) == len(together) == 11
     assert all(np.array_equal(a, b) for a, b in zip(alone, together, strict=True))
@@ -136,52 +136,50 @@ def test_the_number_of_processes_makes_no_difference():
 
 def test_noise_is_as_strong_as_asked_and_gain_saturates():
     grey = np.full((8, 8), 110, np.uint8)
-    studio = Studio(small_calibration().camera, MeshWorld(board().mesh, (grey, grey)))
+    studio = Studio((SMALL,), MeshWorld(board().mesh, (grey, grey)))
     (shot,) = shots(1)
     inside = np.s_[40:80, 60:130]
-    clean = SimulatedCamera(studio).take(shot)[inside].astype(float)
-    noisy = SimulatedCamera(replace(studio, noise_deviation=0.05)).take(shot)[inside].astype(float)
+    clean = Photographer(studio).take(shot)[inside].astype(float)
+    noisy = Photographer(replace(studio, noise_deviation=0.05)).take(shot)[inside].astype(float)
     assert (noisy - clean).std() == pytest.approx(0.05 * 255, rel=0.1)
     assert abs((noisy - clean).mean()) < 1.0
-    dark = SimulatedCamera(replace(studio, light=0.03)).take(shot)[inside].astype(float)
+    dark = Photographer(replace(studio, light=0.03)).take(shot)[inside].astype(float)
     assert dark.mean() == pytest.approx(clean.mean(), abs=2.0)
     assert (dark - clean).std() > 8.0
-    assert (SimulatedCamera(studio).take(replace(shot, gain=8.0))[inside] == 255).all()
+    assert (Photographer(studio).take(replace(shot, gain=8.0))[inside] == 255).all()
 
 
 def test_blur_is_the_mean_over_the_exposure():
-    studio = Studio(small_calibration().camera, board())
-    sharp = [
-        SimulatedCamera(studio).take(replace(s, R_WC=R[None], p_WC=s.p_WC[:1])) for s in shots(1, 4) for R in s.R_WC
-    ]
+    studio = Studio((SMALL,), board())
+    sharp = [Photographer(studio).take(replace(s, R_WC=R[None], p_WC=s.p_WC[:1])) for s in shots(1, 4) for R in s.R_WC]
     (blurred,) = take_pictures(studio, shots(1, 4), 1)
     np.testing.assert_allclose(blurred, np.mean(sharp, axis=0), atol=1.0)
 
 
 def test_a_rolling_shutter_sees_every_row_from_its_own_pose():
-    camera = small_calibration().camera
+    camera = SMALL
     height = camera.resolution[1]
-    studio = Studio(camera, board())
+    studio = Studio((camera,), board())
     R_rows = so3.exp(np.column_stack([np.zeros(height), np.linspace(-0.1, 0.1, height), np.zeros(height)]))
     p_rows = np.tile([0.0, 0.0, -2.0], (height, 1))
-    (rolled,) = take_pictures(studio, [Shot(R_rows[None], p_rows[None], None, 1.0, (0,))], 1)
+    (rolled,) = take_pictures(studio, [Shot(0, R_rows[None], p_rows[None], None, 1.0, (0,))], 1)
     for row in (10, 60, 110):
-        still = SimulatedCamera(studio).take(Shot(R_rows[row][None], p_rows[row][None], None, 1.0, (0,)))
+        still = Photographer(studio).take(Shot(0, R_rows[row][None], p_rows[row][None], None, 1.0, (0,)))
         # But for where surfaces meet: which pixels those are depends on the rows beside it.
         assert np.mean(rolled[row] != still[row]) < 0.2
-        assert not np.array_equal(rolled[row], SimulatedCamera(studio).take(shots(1)[0])[row]) or row == 60
+        assert not np.array_equal(rolled[row], Photographer(studio).take(shots(1)[0])[row]) or row == 60
 
 
 def test_moving_boxes_hide_what_is_behind_them_and_keep_clear_of_the_flight():
     rng, t_s = np.random.default_rng(2), np.linspace(0.0, 10.0, 200)
     path = np.column_stack([np.sin(t_s), np.cos(t_s), np.zeros(200)])
-    movers = draw_movers(8, t_s, path, 2, rng)
+    movers = draw_movers(8, t_s, path[None], 2, rng)
     assert movers.centre_W.shape == (8, 3)
     places = movers.at(t_s)
     assert np.linalg.norm(places - path[:, None], axis=2).min() > 1.2
     assert np.ptp(places, axis=0).max() > 1.0
 
-    camera, world = small_calibration().camera, board()
+    camera, world = SMALL, board()
     renderer = Renderer(camera, world, movers)
     pose = np.eye(3), np.array([0.0, 0.0, -2.0])
     empty = renderer.render(*pose)

@@ -9,7 +9,7 @@ from vioframe.errors import DatasetError, TrajectoryError
 from vioframe.geometry import so3
 from vioframe.simulation import REAL_MOTION_SEQUENCES, real_motion_sequence
 from vioframe.simulation.flights import flight
-from vioframe.simulation.poses import interpolate_poses
+from vioframe.simulation.scenario import interpolate_poses
 from vioframe.types import g_W
 
 

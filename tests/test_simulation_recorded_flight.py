@@ -8,8 +8,7 @@ from vioframe.errors import ConfigError, TrajectoryError
 from vioframe.geometry import so3
 from vioframe.geometry.trajectory import Trajectory
 from vioframe.io.trajectories import load_trajectory, write_tum
-from vioframe.simulation.flights import flight
-from vioframe.simulation.recorded_flight import fit_flight, flight_from_file
+from vioframe.simulation.flights import fit_flight, flight, flight_from_file
 from vioframe.testing import check_flight
 
 EUROC = {
@@ -130,7 +129,10 @@ def test_a_step_in_the_recording_is_smoothed():
         (without(recording(), 4.0, 5.5), r"no pose from 4\.000 s to 5\.500 s .*start_s"),
         (moved(recording(), 6.0, by_m=0.5), r"jumps at [45]\d m/s 5\.990 s after its first pose"),
         (moved(recording(), 6.0, turned_rad=0.5), r"jumps at \d+ rad/s 5\.990 s after"),
-        (moved(recording(20.0), 6.0, by_m=1.3), r"asks for \d+ m/s\^2 \d\.\d+ s after its first pose.*knot_interval_s"),
+        (
+            moved(recording(20.0), 6.0, by_m=1.3),
+            r"asks for \d+ m/s\^2 \d\.\d+ s after its first pose.*smooth the recording",
+        ),
     ],
 )
 def test_what_nothing_can_fly_is_refused_with_the_time(trajectory, why):
@@ -143,11 +145,9 @@ def test_a_piece_beyond_the_end_is_refused():
         fit_flight(recording(), 30.0)
 
 
-@pytest.mark.parametrize(
-    "options", [{"start_s": -1.0}, {"duration_s": 0.0}, {"start_s": np.nan}, {"knot_interval_s": 0.0}]
-)
+@pytest.mark.parametrize("options", [{"start_s": -1.0}, {"duration_s": 0.0}, {"start_s": np.nan}])
 def test_settings_out_of_range_are_refused(options):
-    with pytest.raises(ConfigError, match=r"above 0|begins at start_s"):
+    with pytest.raises(ConfigError, match="begins at start_s"):
         fit_flight(recording(), **options)
 
 

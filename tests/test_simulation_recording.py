@@ -3,7 +3,7 @@
 import errno
 import subprocess
 import sys
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,13 +16,14 @@ from vioframe.cli import main
 from vioframe.errors import ConfigError, DatasetError, TrajectoryError
 from vioframe.geometry import so3
 from vioframe.io.calibration import sidecar_folder, write_calibration
-from vioframe.io.trajectories import load_trajectory
-from vioframe.io.writers import Ros1Writer
+from vioframe.io.trajectories import load_trajectory, true_values
+from vioframe.io.writers import TRUE_VECTOR_TOPICS, Ros1Writer
 from vioframe.simulation.conditions import CONDITIONS, Conditions
-from vioframe.simulation.files import MANIFEST, TRUTH, WORLD, simulation_folder
+from vioframe.simulation.config import MANIFEST, MESH, TRUTH, simulation_folder
 from vioframe.simulation.record import record
+from vioframe.simulation.renderer import Renderer
 from vioframe.simulation.world import MeshBuilder, write_mesh
-from vioframe.types import Frame, ImuSample
+from vioframe.types import Calibration, FrameSet, ImuSample
 
 pytest.importorskip("open3d", exc_type=ImportError)
 
@@ -31,15 +32,15 @@ def content(recording) -> list[tuple]:
     """The measurements as plain values that compare exactly."""
     rows = []
     for m in recording.measurements():
-        if isinstance(m, Frame):
-            rows.append((m.t_ns, m.image.tobytes()))
+        if isinstance(m, FrameSet):
+            rows.append((m.t_ns, *(image.tobytes() for image in m.images)))
         else:
             rows.append((m.t_ns, m.gyro_B.tobytes(), m.accel_B.tobytes()))
     return rows
 
 
 def images(recording) -> np.ndarray:
-    return np.array([m.image for m in recording.measurements() if isinstance(m, Frame)], np.float64)
+    return np.array([m.images[0] for m in recording.measurements() if isinstance(m, FrameSet)], np.float64)
 
 
 def readings(recording) -> tuple[np.ndarray, np.ndarray]:
@@ -69,15 +70,15 @@ def test_measurements_are_complete_and_in_order(clear):
     measured = list(clear.measurements())
     stamps = [m.t_ns for m in measured]
     assert stamps == sorted(stamps)
-    frames = [m for m in measured if isinstance(m, Frame)]
+    frames = [m for m in measured if isinstance(m, FrameSet)]
     assert len(frames) == clear.frame_count == 11
-    assert frames[0].image.shape == (120, 188)
+    assert frames[0].images[0].shape == (120, 188)
     assert len(measured) - len(frames) == clear.imu_count == 101
-    assert [s.t_ns for s in clear.truth] == readings(clear)[0].tolist()
+    assert clear.ground_truth.t_ns.tolist() == readings(clear)[0].tolist()
 
 
 def test_every_condition_has_a_level_and_an_explanation():
-    assert list(CONDITIONS) == [field.name for field in fields(Conditions)]
+    assert list(CONDITIONS) == list(Conditions().model_dump())
     assert all(CONDITIONS.values())
 
 
@@ -127,11 +128,11 @@ def test_vibration_shakes_the_imu_and_not_the_camera(tmp_path, clear):
 
 def test_a_wrong_calibration_is_wrong_by_the_amount_asked_for(tmp_path, clear):
     wrong = under(tmp_path, "wrong_calibration", 0.5)
-    told, true = wrong.calibration, wrong.true_calibration
-    assert true.camera == clear.calibration.camera
+    (told,), (true,) = wrong.calibration.cameras, wrong.true_calibration.cameras
+    assert true.model == clear.calibration.cameras[0].model
     assert np.rad2deg(np.linalg.norm(so3.log(true.R_BC.T @ told.R_BC))) == pytest.approx(0.5)
     assert np.linalg.norm(told.p_BC - true.p_BC) == pytest.approx(0.01)
-    off = [getattr(told.camera, name) - getattr(true.camera, name) for name in ("fx", "fy", "cx", "cy")]
+    off = [getattr(told.model, name) - getattr(true.model, name) for name in ("fx", "fy", "cx", "cy")]
     assert np.linalg.norm(off[:2]) == pytest.approx(5.0)
     assert np.linalg.norm(off[2:]) == pytest.approx(5.0)
     assert np.array_equal(images(wrong), images(clear))
@@ -139,7 +140,7 @@ def test_a_wrong_calibration_is_wrong_by_the_amount_asked_for(tmp_path, clear):
 
 def test_the_imu_is_exact_or_as_wrong_as_asked(tmp_path, clear):
     exact = small_simulation(tmp_path, duration_s=0.5, exact_imu=True)
-    assert not any(state.bias_accel_B.any() for state in exact.truth)
+    assert not exact.ground_truth.values[:, 10:].any()
     scale = [0.1, 0.0, -0.05]
     scaled = readings(small_simulation(tmp_path, duration_s=0.5, exact_imu=True, imu={"accel_scale": scale}))[1]
     np.testing.assert_allclose(scaled[:, 3:], readings(exact)[1][:, 3:] * (1.0 + np.array(scale)), rtol=1e-12)
@@ -149,11 +150,11 @@ def test_the_imu_is_exact_or_as_wrong_as_asked(tmp_path, clear):
 
 
 def test_a_known_time_offset_is_in_the_stamps_and_in_the_calibration(tmp_path):
-    offset = replace(small_calibration(), time_offset_ns=7_000_000)
+    offset = small_calibration().with_camera(0, time_offset_ns=7_000_000)
     write_calibration(offset, tmp_path / "offset")
     recording = small_simulation(tmp_path, duration_s=0.2, calibration=[tmp_path / "offset"])
-    assert recording.calibration.time_offset_ns == 7_000_000
-    assert readings(recording)[0][0] == recording.truth[0].t_ns + 7_000_000
+    assert recording.calibration.cameras[0].time_offset_ns == 7_000_000
+    assert readings(recording)[0][0] == recording.ground_truth.t_ns[0] + 7_000_000
 
 
 def test_a_real_sequence_keeps_its_readings_stamps_and_poses(shared_data, tmp_path):
@@ -161,7 +162,7 @@ def test_a_real_sequence_keeps_its_readings_stamps_and_poses(shared_data, tmp_pa
     files = {"recorded": folder / "imu0" / "data.csv.gz", "start_s": 20.0, "duration_s": 0.5}
     recording = small_simulation(tmp_path, **files)
     stamps = np.loadtxt(folder / "cam0" / "timestamps_ns.txt.gz", dtype=np.int64)
-    frames = np.array([m.t_ns for m in recording.measurements() if isinstance(m, Frame)])
+    frames = np.array([m.t_ns for m in recording.measurements() if isinstance(m, FrameSet)])
     assert np.isin(frames, stamps).all()
     assert len(frames) == 11
     rows = np.loadtxt(folder / "imu0" / "data.csv.gz", delimiter=",")
@@ -173,12 +174,68 @@ def test_a_real_sequence_keeps_its_readings_stamps_and_poses(shared_data, tmp_pa
     np.testing.assert_array_equal(truth.p_WB[at], recording.ground_truth.p_WB)
 
 
+def rig(folder: Path, **settings):
+    """Both of EuRoC's cameras, the second one smaller and with a clock of its own."""
+    left, right = small_calibration(4, ("cam0", "cam1")).cameras
+    smaller = small_calibration(8, ("cam1",)).cameras[0].model
+    cameras = left, replace(right, model=smaller, time_offset_ns=left.time_offset_ns + 5_000_000)
+    return small_simulation(folder, rig=Calibration(cameras, small_calibration().imu), duration_s=0.3, **settings)
+
+
+def test_every_camera_of_a_rig_sees_the_world_from_where_it_is(tmp_path):
+    both = rig(tmp_path)
+    sets = [m for m in both.measurements() if isinstance(m, FrameSet)]
+    assert [[image.shape for image in frames.images] for frames in sets] == 7 * [[(120, 188), (60, 94)]]
+    # The first camera of a rig sees what it sees alone.
+    alone = images(small_simulation(tmp_path, duration_s=0.3))
+    np.testing.assert_array_equal([frames.images[0] for frames in sets], alone)
+    # The second sees what a camera there sees alone, at the instant of its own clock.
+    second = both.calibration.cameras[1]
+    R_WB, p_WB, _ = both._scenario.motion(np.array([sets[3].t_ns + 5_000_000]))
+    renderer = Renderer(second.model, both.world)
+    light = renderer.render(R_WB[0] @ second.R_BC, R_WB[0] @ second.p_BC + p_WB[0])
+    np.testing.assert_array_equal(sets[3].images[1], np.clip(np.round(255.0 * light), 0.0, 255.0).astype(np.uint8))
+
+
+def test_conditions_are_the_same_for_all_cameras_and_the_noise_is_not(tmp_path):
+    left, right = small_calibration(4, ("cam0", "cam1")).cameras
+    # Two cameras in one place: but for their noise they see the same.
+    twins = Calibration((left, replace(left, name="cam1")), small_calibration().imu)
+    conditions = {"noise": 0.5, "exposure": 0.5, "motion_blur": 0.5, "wrong_calibration": 0.5, "moving_objects": 0.3}
+    recording = small_simulation(tmp_path, rig=twins, duration_s=0.2, conditions=conditions)
+    for frames in (m for m in recording.measurements() if isinstance(m, FrameSet)):
+        first, second = (image.astype(float) for image in frames.images)
+        difference = (first - second)[(first > 0) & (first < 255) & (second > 0) & (second < 255)]
+        assert difference.std() == pytest.approx(np.sqrt(2.0) * 0.04 * 255, rel=0.1)
+        assert abs(difference.mean()) < 1.0
+    told = recording.calibration.cameras
+    assert np.linalg.norm(told[0].p_BC - told[1].p_BC) > 0.001
+    assert [camera.R_BC is right.R_BC for camera in told] == [False, False]
+
+
+@pytest.mark.parametrize("name", ["flight.bag", "flight.ros2", "flight.mcap", "flight"])
+def test_a_recording_holds_every_camera_of_its_rig_and_the_truth(tmp_path, name):
+    recording = rig(tmp_path)
+    record(recording, [tmp_path / name])
+    read = INSTALLED.open_dataset(tmp_path / name)
+    assert [camera.name for camera in read.calibration.cameras] == ["cam0", "cam1"]
+    assert [camera.time_offset_ns for camera in read.calibration.cameras] == [0, 5_000_000]
+    assert content(read) == content(recording)
+    np.testing.assert_array_equal(true_values(read.ground_truth), recording.ground_truth.values)
+
+
+def test_a_camera_that_nobody_knows_how_it_is_turned_cannot_be_rendered(tmp_path):
+    with pytest.raises(ConfigError, match="how cam0 is turned"):
+        small_simulation(tmp_path, rig=small_calibration().with_camera(0, rotation_known=False))
+
+
 def test_twenty_seconds_of_bag_and_folder_hold_what_was_simulated(tmp_path):
     recording = small_simulation(tmp_path, duration_s=20.0, divisor=8, workers=2)
     bag, folder = tmp_path / "flight.bag", tmp_path / "flight"
     record(recording, [bag, folder])
 
     topics = {"/cam0/image_raw": 401, "/imu0": 4001, "/vioframe/ground_truth": 4001}
+    topics |= dict.fromkeys(TRUE_VECTOR_TOPICS, 4001)
     # Of the tools that rosbags has, its releases of 0.11 install this one, which reads every message.
     tool = Path(sys.executable).with_name("rosbags-convert")
     subprocess.run([tool, "--src", bag, "--dst", tmp_path / "converted", "--dst-storage", "mcap"], check=True)
@@ -194,11 +251,11 @@ def test_twenty_seconds_of_bag_and_folder_hold_what_was_simulated(tmp_path):
         np.testing.assert_array_equal(read.ground_truth.t_ns, recording.ground_truth.t_ns)
         np.testing.assert_array_equal(read.ground_truth.p_WB, recording.ground_truth.p_WB)
         np.testing.assert_allclose(read.ground_truth.R_WB, recording.ground_truth.R_WB, atol=1e-15)
-        assert read.calibration.camera == recording.calibration.camera
-        assert {file.name for file in simulation_folder(path).iterdir()} == {MANIFEST, TRUTH, WORLD}
+        assert read.calibration.cameras[0].model == recording.calibration.cameras[0].model
+        assert {file.name for file in simulation_folder(path).iterdir()} == {MANIFEST, TRUTH, MESH}
     states = np.loadtxt(simulation_folder(bag) / TRUTH, delimiter=",")
     assert states.shape == (4001, 17)
-    np.testing.assert_array_equal(states[:, 14:], [state.bias_accel_B for state in recording.truth])
+    np.testing.assert_array_equal(states[:, 1:], recording.ground_truth.values)
 
 
 def simulate(*arguments: object):
@@ -264,9 +321,9 @@ def repeating_file(tmp_path: Path) -> Path:
     ("arguments", "problem"),
     [
         (["-c", "fogg=0.5"], "did you mean 'fog'"),
-        (["-c", "fog=1.5"], "must lie between 0 (none) and 1, not 1.5"),
-        (["-c", "fog=nan"], "must lie between 0 (none) and 1"),
-        (["-c", "fog=much"], "must be a number"),
+        (["-c", "fog=1.5"], "conditions: fog: Input should be less than or equal to 1, got"),
+        (["-c", "fog=nan"], "should be a finite number"),
+        (["-c", "fog=much"], "should be a valid number"),
         (["--flight", "figure_ate"], "did you mean 'figure_eight'"),
         (["--flight", "missing.tum"], "no such trajectory file"),
         (["--flight", jumping_file], "jump"),
@@ -336,8 +393,8 @@ def test_a_simulated_recording_is_replaced_only_by_a_complete_one(tmp_path, smal
 
 
 def test_errors_of_the_library_have_their_types(tmp_path):
-    with pytest.raises(ConfigError, match="level of fog"):
-        Conditions(fog=-0.1)
+    with pytest.raises(ConfigError, match="fog"):
+        Conditions.of({"fog": -0.1})
     with pytest.raises(TrajectoryError, match="jump"):
         small_simulation(tmp_path, trajectory=jumping_file(tmp_path), duration_s=4.0)
     with pytest.raises(DatasetError, match="exists already"):

@@ -8,7 +8,7 @@ from trajectory_helpers import PEERS, flight
 
 from vioframe.errors import TrajectoryError
 from vioframe.geometry.trajectory import Trajectory
-from vioframe.io.trajectories import load_trajectory, tum_line, write_tum
+from vioframe.io.trajectories import TrueTrajectory, load_trajectory, tum_line, write_euroc, write_tum
 
 TUM = "1403636579.763555584 1 2 3 0 0 0 1\n1403636579.813555584 1 2 3 0 0 0 1\n"
 EUROC_HEADER = "#timestamp, p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m], q_RS_w [], q_RS_x [], q_RS_y [], q_RS_z []"
@@ -75,6 +75,26 @@ def test_euroc_csv(tmp_path, columns):
     assert found.t_ns.tolist() == [1403636579763555584]
     np.testing.assert_array_equal(found.p_WB, [[1.0, 2.0, 3.0]])
     np.testing.assert_allclose(found.quat_xyzw, [[0.1, -0.7, 0.5, 0.5]], atol=1e-14)
+
+
+@pytest.mark.parametrize("columns", [8, 11, 17])
+def test_euroc_round_trip_keeps_every_number(tmp_path, columns):
+    """Velocity and biases too, and a quaternion that is rounded to six digits stays as it is."""
+    rng = np.random.default_rng(columns)
+    values = rng.normal(size=(5, columns - 1))
+    values[:, 3:7] = np.round(values[:, 3:7] / np.linalg.norm(values[:, 3:7], axis=1, keepdims=True), 6)
+    truth = TrueTrajectory.of(1403636579763555584 + np.arange(5), values)
+    write_euroc(truth, tmp_path / "truth.csv")
+    again = load_trajectory(tmp_path / "truth.csv")
+    assert isinstance(again, TrueTrajectory)
+    np.testing.assert_array_equal(again.t_ns, truth.t_ns)
+    np.testing.assert_array_equal(again.values, values)
+    np.testing.assert_array_equal(again.R_WB, truth.R_WB)
+
+
+def test_a_velocity_that_is_not_known_everywhere_is_no_error(tmp_path):
+    path = write(tmp_path, "10,1,2,3,1,0,0,0,0.1,0.2,0.3\n20,1,2,3,1,0,0,0,nan,,x\n")
+    np.testing.assert_array_equal(load_trajectory(path).values[:, 7:], [[0.1, 0.2, 0.3], [np.nan] * 3])
 
 
 def test_a_comma_at_the_line_end_and_a_header_without_a_hash_are_fine(tmp_path):

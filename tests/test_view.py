@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 from map_helpers import box, write_ply_mesh
-from recordings import CALIBRATION, measurements
+from recordings import PAIR, pair_measurements
 from trajectory_helpers import disturbed, flight, moved, write_run
 
 from vioframe.cli import main
@@ -19,7 +19,7 @@ from vioframe.io.convert import convert
 from vioframe.io.trajectories import write_tum
 from vioframe.report.style import colour
 from vioframe.runs.recorder import write_ply
-from vioframe.types import Frame
+from vioframe.types import FrameSet
 
 pytest.importorskip("rerun")
 # rerun warns, and goes on, where it is given what it cannot take.
@@ -138,27 +138,33 @@ def test_runs_of_one_flight_share_the_truth_and_keep_their_colours(run, tmp_path
     paths = {path: rows[0] for (path, name), rows in values.items() if name == "LineStrips3D:colors"}
     expected = {r"/world/a\ run/path": colour(1), "/world/b/path": colour(2), r"/world/ground\ truth": "#b0b0b0"}
     assert paths == {path: [int(f"{each[1:]}FF", 16)] for path, each in expected.items()}
-    assert not any("never/body/camera" in path and "Pinhole" in name for path, name in values)
+    assert not any("never/body" in path and "Transform3D" in name for path, name in values)
 
 
-def test_images_are_those_of_the_recording_while_it_is_there(run, tmp_path):
-    sent = measurements(6)
-    frames = [m for m in sent if isinstance(m, Frame)]
-    convert(sent, CALIBRATION, tmp_path / "flight", format="asl")
-    t_ns = np.array([frame.t_ns for frame in frames[:4]])
+def test_images_are_those_of_the_recording_while_it_is_there(tmp_path):
+    """Of both cameras of a rig, each in its place and once for all runs."""
+    sent = pair_measurements()
+    convert(sent, PAIR, tmp_path / "flight", format="asl")
+    frames = [m for m in sent if isinstance(m, FrameSet)][:4]
+    t_ns = np.array([each.t_ns for each in frames])
     for name in ("first", "second"):
         write_run(tmp_path / name, Trajectory(t_ns, np.tile(np.eye(3), (4, 1, 1)), np.zeros((4, 3))), waiting=1)
         (tmp_path / name / "config.yaml").write_text(f"dataset: {{path: {tmp_path / 'flight'}, reader: euroc}}\n")
+        write_calibration(PAIR, tmp_path / name / "calibration")
     view(tmp_path / "first", tmp_path / "second", "--save", tmp_path / "v.rrd")
     values, times = recorded(tmp_path / "v.rrd")
-    # Once for both, and no image that was not flown.
-    assert [path for path, name in values if name == "EncodedImage:blob"] == ["/world/first/body/camera/image"]
-    assert times["/world/first/body/camera/image"] == (t_ns - t_ns[0]).tolist()
-    for (jpeg,), frame in zip(values["/world/first/body/camera/image", "EncodedImage:blob"], frames, strict=False):
-        shown = cv2.imdecode(np.array(jpeg, np.uint8), cv2.IMREAD_GRAYSCALE)
-        assert np.corrcoef(shown.ravel(), frame.image.ravel())[0, 1] > 0.9
+    body = "/world/first/body"
+    shown = {path: rows for (path, name), rows in values.items() if name == "EncodedImage:blob"}
+    assert set(shown) == {f"{body}/{camera.name}/image" for camera in PAIR.cameras}
+    for place, camera in enumerate(PAIR.cameras):
+        path = f"{body}/{camera.name}/image"
+        taken = [each for each in frames if each.images[place] is not None]
+        assert times[path] == [each.t_ns - t_ns[0] for each in taken]
+        for (jpeg,), each in zip(shown[path], taken, strict=True):
+            image = cv2.imdecode(np.array(jpeg, np.uint8), cv2.IMREAD_GRAYSCALE)
+            assert np.corrcoef(image.ravel(), each.images[place].ravel())[0, 1] > 0.9
     for name in ("first", "second"):
-        points = values[f"/world/first/body/camera/tracks/{name}", "Points2D:positions"]
+        points = values[f"{body}/{PAIR.cameras[0].name}/tracks/{name}", "Points2D:positions"]
         assert [len(each) for each in points] == [120] * 4
     (tmp_path / "flight").rename(tmp_path / "gone")
     view(tmp_path / "first", "--save", tmp_path / "v.rrd")
@@ -168,12 +174,12 @@ def test_images_are_those_of_the_recording_while_it_is_there(run, tmp_path):
 def test_the_cameras_are_where_the_calibration_has_them(run, tmp_path):
     view(run, "--save", tmp_path / "v.rrd")
     values, _ = recorded(tmp_path / "v.rrd")
-    calibration, camera = packaged_calibration("euroc"), r"/world/a\ run/body/camera"
-    np.testing.assert_allclose(values[camera, "Transform3D:translation"][0][0], calibration.p_BC, rtol=1e-6)
-    np.testing.assert_allclose(
-        np.reshape(values[camera, "Transform3D:mat3x3"][0][0], (3, 3)).T, calibration.R_BC, atol=1e-6
-    )
-    assert values[camera, "Pinhole:resolution"][0][0] == [752.0, 480.0]
+    for camera in packaged_calibration("euroc").cameras:
+        at = rf"/world/a\ run/body/{camera.name}"
+        np.testing.assert_allclose(values[at, "Transform3D:translation"][0][0], camera.p_BC, rtol=1e-6)
+        R_BC = np.reshape(values[at, "Transform3D:mat3x3"][0][0], (3, 3)).T
+        np.testing.assert_allclose(R_BC, camera.R_BC, atol=1e-6)
+        assert values[at, "Pinhole:resolution"][0][0] == [752.0, 480.0]
 
 
 def test_a_world_is_shown_around_the_flight(run, tmp_path):

@@ -9,7 +9,7 @@ from vioframe.geometry.trajectory import Trajectory
 from vioframe.incidents import Incidents
 from vioframe.io.trajectories import write_tum
 from vioframe.runs.recorder import Recorder, new_run_folder
-from vioframe.types import Estimate, Frame, FrameTracks, NavState, Status, Step
+from vioframe.types import Estimate, FrameSet, FrameTracks, NavState, Status, Step
 
 BEGIN_NS = 1_403_636_579_763_555_584
 PERIOD_NS = 50_000_000
@@ -61,13 +61,14 @@ def write_run(folder: Path, estimate: Trajectory, truth: Trajectory | None = Non
             state = _state(estimate, k) if k >= waiting else None
             status = Status.TRACKING if state else Status.INITIALISING
             ids = np.arange(3 * k, 3 * k + 120)
-            tracks = FrameTracks(t_ns, ids, rng.uniform(0.0, 480.0, (120, 2)), np.zeros((120, 2)))
+            camera, xy = np.zeros(120, np.int64), rng.uniform(0.0, 480.0, (120, 2))
+            tracks = FrameTracks(t_ns, ids, camera, xy, np.zeros((120, 2)))
             seconds = dict(zip(("equalise", "klt", "reject", "detect"), rng.uniform(1e-3, 4e-3, 4), strict=True))
             backend = (
                 {"backend": 5e-3, "backend.propagate": 5e-4, "backend.update": 3.5e-3} if state else {"backend": 1e-3}
             )
-            frame = Frame(t_ns, np.zeros((1, 1), np.uint8))
-            recorder.add(Step(frame, tracks, Estimate(status, state), {**seconds, **backend}))
+            frames = FrameSet(t_ns, (np.zeros((1, 1), np.uint8),))
+            recorder.add(Step(frames, tracks, Estimate(status, state), {**seconds, **backend}))
 
 
 def _state(estimate: Trajectory, k: int) -> NavState:

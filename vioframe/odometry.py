@@ -1,9 +1,10 @@
-"""Visual-inertial odometry, measurement by measurement: push what the sensors bring, get what is known after each frame.
+"""Visual-inertial odometry: push what the sensors bring, get what is known after each frame.
 
     measurements -> packets -> tracks -> estimate -> files -> report
 
-:class:`Odometry` is the main loop. A recording is pushed through it by :mod:`vioframe.pipeline`, a live camera by anybody;
-a recorder, a progress bar and a loop closer are consumers of the :class:`~vioframe.types.Step` objects it gives.
+:class:`Odometry` is the main loop. A recording is pushed through it by :mod:`vioframe.pipeline`, a live camera by
+anybody; a recorder, a progress bar and a loop closer are consumers of the :class:`~vioframe.types.Step` objects it
+gives.
 """
 
 from __future__ import annotations
@@ -85,7 +86,7 @@ class Odometry:
         self._life = LifeCycle(backend, calibration, estimation, initial_state, name)
         self._synchroniser = Synchroniser(self.incidents, time_offset_ns=camera.time_offset_ns, wait_ms=wait_ms)
         self._waiting_tracks: dict[int, FrameTracks] = {}
-        self.calibration = self._given = calibration
+        self.calibration = calibration
         """What is known of the rig by now: as given at first, then as the back-end has learned it."""
 
     def add(self, measurement: Measurement) -> list[Step]:
@@ -130,7 +131,7 @@ class Odometry:
             tracks = self._waiting_tracks.pop(frames.t_ns, None)
             seconds: Mapping[str, float] = {}
             if tracks is None:
-                tracks = self._frontend.track(imu, frames, self._given)
+                tracks = self._frontend.track(imu, frames, self.calibration)
                 seconds = self._frontend.stage_seconds
             begin = perf_counter()
             estimate = self._life.process(imu, tracks)

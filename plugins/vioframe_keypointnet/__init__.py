@@ -8,6 +8,7 @@ from vioframe.interfaces import Detector, DetectorFactory, Trainer, TrainerFacto
 from vioframe.parts.hooks import hookimpl
 from vioframe.parts.options import plugin_factory
 from vioframe.types import TrainingJob
+from vioframe_keypointnet.optional import needs
 from vioframe_keypointnet.options import KeypointNetOptions
 from vioframe_keypointnet.training.options import TrainingOptions
 
@@ -26,7 +27,8 @@ def vioframe_detectors() -> Mapping[str, DetectorFactory]:
 
 def trainer(job: TrainingJob, options: TrainingOptions) -> Trainer:
     """Trains a KeypointNet on pairs of views of images, which need no labels."""
-    from vioframe_keypointnet.training.trainer import KeypointNetTrainer
+    with needs("torch", "keypointnet"):
+        from vioframe_keypointnet.training.trainer import KeypointNetTrainer
 
     return KeypointNetTrainer(job, options)
 

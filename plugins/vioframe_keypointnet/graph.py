@@ -1,42 +1,47 @@
-"""The folded network as an ONNX graph, for onnxruntime and OpenVINO; made by hand, so that it needs no torch.
+"""The network as one ONNX graph to be run: batch norm folded into the convolutions, nothing in it that is not needed.
 
-In int8 the graph stays one of floats with pairs of QuantizeLinear and DequantizeLinear where values have 8 bits, which
-the libraries recognise and turn into integer convolutions: outputs of the layers by one range each, unsigned, weights
-by one each channel, signed. LeakyReLU becomes ReLU there: most of what it lets through below zero is less than a step.
+Made by hand, so that it needs no torch. In int8 it stays a graph of floats with pairs of QuantizeLinear and
+DequantizeLinear where values have 8 bits, which a runtime recognises and turns into integer convolutions: outputs of
+the layers by one range each, unsigned, weights by one each channel, signed. LeakyReLU becomes ReLU there: most of what
+it lets through below zero is less than a step.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from vioframe_keypointnet.folding import LEAK, NEUTRAL_GREY, Convolution, FoldedNetwork
+from vioframe_keypointnet.architecture import HEADS, OUT, RESPONSE, Architecture, Tensors
 from vioframe_keypointnet.optional import needs
 from vioframe_keypointnet.seeing import CONTRAST_STEP, ZERO
-from vioframe_keypointnet.tensors import OUT, RESPONSE
+from vioframe_keypointnet.weights import Weights
 
 _OPSET, _IR = 17, 9
+_LEAK = 0.01
+"""Slope of LeakyReLU below zero."""
+_NEUTRAL_GREY = 127.5
+"""The grey that the network sees as 0; also what lies around the image."""
+_SCALE = 0.225 / 255.0
+_BATCH_NORM_EPSILON = 1e-5
 
 
-def onnx_model(
-    network: FoldedNetwork, shape: tuple[int, int], activation_ranges: Mapping[str, float] | None = None
-) -> bytes:
-    """A serialised ONNX model of ``network`` for images of ``shape`` (H, W), multiples of 8; int8 if given the ranges.
+def onnx_model(weights: Weights, shape: tuple[int, int], *, descriptors: bool = False, int8: bool = False) -> bytes:
+    """A serialised ONNX model for grey images of ``shape`` (H, W), multiples of 8.
 
-    Takes as ``seen`` what an :class:`~vioframe_keypointnet.seeing.Eye` sees, in 8 bits if in int8; gives what
-    :meth:`FoldedNetwork.build` does.
+    It takes as ``seen`` (1, C, h, w) what an :class:`~vioframe_keypointnet.seeing.Eye` sees, and gives what
+    :meth:`vioframe_keypointnet.network.KeypointNet.found` does, which it equals on R = G = B but for rounding.
     """
-    with needs("onnx", "onnxruntime"):
+    with needs("onnx", "openvino"):
         from onnx import TensorProto, helper
 
-    graph = _Graph(activation_ranges or {})
-    peaks, f = network.architecture.peaks, network.architecture.fold
-    outputs = (_seeing_integers(network) if activation_ranges and not peaks else network).build(graph, "seen")
-    kind = TensorProto.FLOAT if peaks and not activation_ranges else TensorProto.UINT8
+    architecture, f = weights.architecture, weights.architecture.fold
+    graph = _Graph(weights.activation_ranges or {} if int8 else {})
+    outputs = _build(graph, weights, descriptors)
+    kind = TensorProto.FLOAT if architecture.peaks and not int8 else TensorProto.UINT8
     seen = helper.make_tensor_value_info("seen", kind, [1, f * f, shape[0] // f, shape[1] // f])
     found = [helper.make_tensor_value_info(name, TensorProto.FLOAT, None) for name in outputs]
     made = helper.make_graph(graph.nodes, "keypointnet", [seen], found, graph.constants)
@@ -44,11 +49,85 @@ def onnx_model(
     return bytes(model.SerializeToString())
 
 
-def _seeing_integers(network: FoldedNetwork) -> FoldedNetwork:
-    """``network`` for grey levels less a whole number; only what it sees beyond the border differs, by half a level."""
-    first, *rest = network.encoder
-    shift = first.weight.sum(axis=(1, 2, 3)) * np.float32(ZERO - NEUTRAL_GREY)
-    return replace(network, encoder=(replace(first, bias=first.bias + shift), *rest))
+def _build(graph: _Graph, weights: Weights, descriptors: bool) -> tuple[str, ...]:
+    """Adds all layers; the names of the outputs."""
+    architecture, tensors = weights.architecture, weights.tensors
+    x = graph.seen("seen", architecture.peaks)
+    after = {}
+    for layer in _encoder(architecture, tensors, descriptors, whole_grey_levels=graph.int8 and not architecture.peaks):
+        x = after[layer.name[0]] = graph.convolve(layer, x)
+        if layer.name in architecture.pooled:
+            x = graph.node("MaxPool", [x], kernel_shape=[2, 2], strides=[2, 2])
+    if architecture.peaks:
+        response = _Convolution(RESPONSE, tensors["convR.weight"], tensors["convR.bias"], activated=False)
+        found = graph.node("Transpose", [graph.convolve(response, after["2"])], perm=[0, 2, 3, 1])
+    else:
+        hidden = _stacked(HEADS, [_normalised(tensors, name) for name in ("Da", "Pa")])
+        found = graph.convolve(_joint_output(tensors), graph.convolve(hidden, x))
+    if not descriptors:
+        return (found,)
+    first, second, third = (_normalised(tensors, name, activated=name != "Fb") for name in ("Fa", "Fb", "Faa"))
+    last = _Convolution("Fbb", tensors["convFbb.weight"], tensors["convFbb.bias"], activated=False)
+    x = graph.convolve(second, graph.convolve(first, x))
+    x = graph.node("DepthToSpace", [x], blocksize=2, mode="CRD")
+    x = graph.node("Concat", [x, after["3"]], axis=1)
+    return found, graph.convolve(last, graph.convolve(third, x))
+
+
+@dataclass(frozen=True, slots=True)
+class _Convolution:
+    """A convolution padded with zeros so that the size is kept, then LeakyReLU if activated."""
+
+    name: str
+    weight: NDArray[np.float32]
+    """(out, in, k, k)."""
+    bias: NDArray[np.float32]
+    """(out,)."""
+    activated: bool = True
+
+
+def _encoder(
+    architecture: Architecture, tensors: Tensors, descriptors: bool, whole_grey_levels: bool
+) -> list[_Convolution]:
+    """The encoder's layers that are needed: of a network of peaks that does not describe, the first two blocks.
+
+    The first layer sees one channel in place of all, of local contrast or of (grey level - 127.5), in place of
+    (x / 255 - 0.5) * 0.225. Only the factor may go into the weights: the shift has to stay before the padding, whose
+    zeros mean neutral grey. For ``whole_grey_levels``, shifted by 128, only what is seen beyond the border differs.
+    """
+    needed = [name for name, *_ in architecture.encoder if descriptors or not architecture.peaks or name < "3"]
+    first, *rest = (_normalised(tensors, name) for name in needed)
+    weight = first.weight.reshape(len(first.weight), architecture.image_channels, -1, 3, 3).sum(axis=1)
+    if not architecture.peaks:
+        weight *= np.float32(_SCALE)
+    first = replace(first, weight=weight)
+    if whole_grey_levels:
+        shift = weight.sum(axis=(1, 2, 3)) * np.float32(ZERO - _NEUTRAL_GREY)
+        first = replace(first, bias=first.bias + shift)
+    return [first, *rest]
+
+
+def _normalised(tensors: Tensors, name: str, activated: bool = True) -> _Convolution:
+    """Convolution ``name`` and the batch norm behind it, in one."""
+    gamma, beta, mean, variance = (
+        tensors[f"conv{name}.1.{s}"].astype(np.float64) for s in ("weight", "bias", "running_mean", "running_var")
+    )
+    gain = gamma / np.sqrt(variance + _BATCH_NORM_EPSILON)
+    weight = tensors[f"conv{name}.0.weight"] * gain[:, None, None, None]
+    return _Convolution(name, weight.astype(np.float32), (beta - mean * gain).astype(np.float32), activated)
+
+
+def _stacked(name: str, layers: Sequence[_Convolution]) -> _Convolution:
+    """Layers that see the same, as one."""
+    return _Convolution(name, np.concatenate([la.weight for la in layers]), np.concatenate([la.bias for la in layers]))
+
+
+def _joint_output(tensors: Tensors) -> _Convolution:
+    """Score and place as one convolution of the stacked hidden layers, each blind to the other's half."""
+    score, place = tensors["convDb.weight"], tensors["convPb.weight"]
+    weight = np.zeros((3, 2 * score.shape[1], 3, 3), np.float32)
+    weight[:1, : score.shape[1]], weight[1:, score.shape[1] :] = score, place
+    return _Convolution(OUT, weight, np.concatenate([tensors["convDb.bias"], tensors["convPb.bias"]]), activated=False)
 
 
 class _Graph:
@@ -59,71 +138,52 @@ class _Graph:
 
         self.nodes: list[NodeProto] = []
         self.constants: list[TensorProto] = []
+        self.int8 = bool(activation_ranges)
         self._ranges = activation_ranges
         self._steps: dict[str, np.float32] = {}
         """Values that have 8 bits, and the step of these."""
 
     def seen(self, x: str, peaks: bool) -> str:
+        """What comes in, as the first layer wants it."""
         from onnx import TensorProto
 
-        if self._ranges:
-            return self.dequantised(x, CONTRAST_STEP if peaks else np.float32(1.0), ZERO)
+        if self.int8:
+            return self._dequantised(x, CONTRAST_STEP if peaks else np.float32(1.0), ZERO)
         if peaks:
             return x
         levels = self.node("Cast", [x], to=TensorProto.FLOAT)
-        return self.node("Sub", [levels, self.constant(np.float32(NEUTRAL_GREY))])
+        return self.node("Sub", [levels, self._constant(np.float32(_NEUTRAL_GREY))])
 
-    def convolve(self, layer: Convolution, x: str) -> str:
+    def convolve(self, layer: _Convolution, x: str) -> str:
         integer = x in self._steps and (layer.name in self._ranges or layer.name in (OUT, RESPONSE))
-        weight, bias = self._integers(layer, self._steps[x]) if integer else self._floats(layer)
-        y = self.node("Conv", [x, weight, bias], pads=[layer.pad] * 4)
+        if integer:
+            weight, bias = self._integers(layer, self._steps[x])
+        else:
+            weight, bias = self._constant(layer.weight), self._constant(layer.bias)
+        y = self.node("Conv", [x, weight, bias], pads=[layer.weight.shape[2] // 2] * 4)
         if layer.name in self._ranges:
-            return self._quantised(self.node("Relu", [y]), np.float32(self._ranges[layer.name] / 255.0), 0)
-        return self.node("LeakyRelu", [y], alpha=LEAK) if layer.activated else y
-
-    def pool(self, x: str) -> str:
-        y = self.node("MaxPool", [x], kernel_shape=[2, 2], strides=[2, 2])
-        if x in self._steps:
-            self._steps[y] = self._steps[x]
-        return y
-
-    def shuffle(self, x: str) -> str:
-        return self.node("DepthToSpace", [x], blocksize=2, mode="CRD")
-
-    def join(self, a: str, b: str) -> str:
-        return self.node("Concat", [a, b], axis=1)
-
-    def channels_last(self, x: str) -> str:
-        return self.node("Transpose", [x], perm=[0, 2, 3, 1])
-
-    def dequantised(self, x: str, step: np.float32, zero: int) -> str:
-        """The values of ``x`` uint8, of which convolutions may make use as they are."""
-        y = self.node("DequantizeLinear", [x, self.constant(step), self.constant(np.uint8(zero))])
-        self._steps[y] = step
-        return y
+            step = np.float32(self._ranges[layer.name] / 255.0)
+            y = self.node("Relu", [y])
+            y = self.node("QuantizeLinear", [y, self._constant(step), self._constant(np.uint8(0))])
+            return self._dequantised(y, step, 0)
+        return self.node("LeakyRelu", [y], alpha=_LEAK) if layer.activated else y
 
     def node(self, kind: str, inputs: list[str], **attributes: Any) -> str:
         from onnx import helper
 
         name = f"{kind}_{len(self.nodes)}"
         self.nodes.append(helper.make_node(kind, inputs, [name], name, **attributes))
+        if kind == "MaxPool" and inputs[0] in self._steps:
+            self._steps[name] = self._steps[inputs[0]]
         return name
 
-    def constant(self, value: NDArray[np.generic] | np.generic) -> str:
-        from onnx import numpy_helper
+    def _dequantised(self, x: str, step: np.float32, zero: int) -> str:
+        """The values of ``x`` uint8, of which convolutions may make use as they are."""
+        y = self.node("DequantizeLinear", [x, self._constant(step), self._constant(np.uint8(zero))])
+        self._steps[y] = step
+        return y
 
-        name = f"constant_{len(self.constants)}"
-        self.constants.append(numpy_helper.from_array(np.asarray(value), name))
-        return name
-
-    def _quantised(self, x: str, step: np.float32, zero: int) -> str:
-        integers = self.node("QuantizeLinear", [x, self.constant(step), self.constant(np.uint8(zero))])
-        return self.dequantised(integers, step, zero)
-
-    def _floats(self, layer: Convolution) -> tuple[str, str]:
-        return self.constant(layer.weight), self.constant(layer.bias)
-
-    def _integers(self, layer: Convolution, input_step: np.float32) -> tuple[str, str]:
+    def _integers(self, layer: _Convolution, input_step: np.float32) -> tuple[str, str]:
         """The weights in 8 bits with a step for each channel, the bias in 32 with that of the products."""
         steps = np.maximum(np.abs(layer.weight).max(axis=(1, 2, 3)), np.finfo(np.float32).tiny) / np.float32(127.0)
         weight = np.round(layer.weight / steps[:, None, None, None]).astype(np.int8)
@@ -132,5 +192,12 @@ class _Graph:
         return self._of_channels(weight, steps), self._of_channels(bias, products)
 
     def _of_channels(self, integers: NDArray[np.generic], steps: NDArray[np.float32]) -> str:
-        zeros = self.constant(np.zeros(len(steps), integers.dtype))
-        return self.node("DequantizeLinear", [self.constant(integers), self.constant(steps), zeros], axis=0)
+        zeros = self._constant(np.zeros(len(steps), integers.dtype))
+        return self.node("DequantizeLinear", [self._constant(integers), self._constant(steps), zeros], axis=0)
+
+    def _constant(self, value: NDArray[np.generic] | np.generic) -> str:
+        from onnx import numpy_helper
+
+        name = f"constant_{len(self.constants)}"
+        self.constants.append(numpy_helper.from_array(np.asarray(value), name))
+        return name

@@ -1,18 +1,18 @@
-"""The network in torch, as it is trained: detector, descriptor and, for training only, the outlier classifier IO-Net.
-
-Layer names are those of the published checkpoints, so that these load as they are.
-"""
+"""The network in torch, as it is trained; its layers are named as in the published checkpoints, which load as such."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.nn.functional import avg_pool2d, grid_sample, interpolate, normalize, pad, pixel_shuffle, pixel_unshuffle
+from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from vioframe_keypointnet.architecture import CELL_PX, FAINT, FULL, Architecture
+from vioframe_keypointnet.weights import Weights
 
 _CROSS_RATIO = 2.0
 """How far a regressed keypoint may lie from its cell's centre, in half cells: neighbours reach into each other."""
@@ -64,29 +64,76 @@ class KeypointNet(nn.Module):
         self.dropout = nn.Dropout2d(dropout)
 
     def forward(self, images: Tensor) -> Detection:
-        """``images`` (B, C, H, W) in [0, 1], H and W multiples of 8."""
+        """Of ``images`` (B, C, H, W) in [0, 1], H and W multiples of 8; for training."""
+        after = self._encode(images, "1234")
+        score, response = self._score(after["4"])[:, 0], None
+        if self.architecture.peaks:
+            response = cells_of(self.convR(after["2"]).float())
+            score = score + torch.logsumexp(response, dim=1)
+            place = peak_places(response)
+        else:
+            place = _CROSS_RATIO * (CELL_PX - 1) / 2 * torch.tanh(self._place(after["4"]))
+        descriptors = self._describe(after)
+        return Detection(_without_ring(torch.sigmoid(score)), keypoint_places(place), descriptors, response)
+
+    def found(self, grey: Tensor, *, descriptors: bool) -> tuple[Tensor, ...]:
+        """What is needed to choose keypoints of ``grey`` (B, 1, H, W) in [0, 1]; the exported graph gives the same.
+
+        (B, 3, H/8, W/8), before sigmoid and tanh, the score, x and y of each cell; of a network of peaks
+        (B, H/2, W/2, 4), the response of 2 x 2 pixels, row by row. Then, if asked for, (B, D, H/4, W/4) descriptors,
+        not normalised.
+        """
+        peaks = self.architecture.peaks
+        images = grey.expand(-1, self.architecture.image_channels, -1, -1)
+        after = self._encode(images, "1234" if descriptors or not peaks else "12")
+        if peaks:
+            first = self.convR(after["2"]).permute(0, 2, 3, 1)
+        else:
+            first = torch.cat([self._score(after["4"]), self._place(after["4"])], dim=1)
+        return (first, self._describe(after)) if descriptors else (first,)
+
+    def _encode(self, images: Tensor, blocks: str) -> dict[str, Tensor]:
+        """What each of ``blocks`` gives, before the resolution is halved."""
         x = self.fold(locally_normalised(images) if self.architecture.peaks else (images - 0.5) * 0.225)
         after: dict[str, Tensor] = {}
         for name, *_ in self.architecture.encoder:
+            if name[0] not in blocks:
+                break
             x = self.act(self.get_submodule(f"conv{name}")(x))
             if name.endswith("b"):
                 x = self.dropout(x)
             after[name[0]] = x
             if name in self.architecture.pooled:
                 x = self.pool(x)
-        # Pixels of a large image do not fit into half precision.
-        response = None
-        score = self.convDb(self.dropout(self.act(self.convDa(x)))).float()[:, 0]
-        if self.architecture.peaks:
-            response = cells_of(self.convR(after["2"]).float())
-            score = score + torch.logsumexp(response, dim=1)
-            place = peak_places(response)
-        else:
-            place = torch.tanh(self.convPb(self.dropout(self.act(self.convPa(x)))).float())
-            place = _CROSS_RATIO * (CELL_PX - 1) / 2 * place
-        x = self.convFb(self.dropout(self.act(self.convFa(x))))
+        return after
+
+    # Pixels of a large image do not fit into half precision.
+    def _score(self, deepest: Tensor) -> Tensor:
+        out: Tensor = self.convDb(self.dropout(self.act(self.convDa(deepest)))).float()
+        return out
+
+    def _place(self, deepest: Tensor) -> Tensor:
+        out: Tensor = self.convPb(self.dropout(self.act(self.convPa(deepest)))).float()
+        return out
+
+    def _describe(self, after: dict[str, Tensor]) -> Tensor:
+        x = self.convFb(self.dropout(self.act(self.convFa(after["4"]))))
         x = self.act(self.convFaa(torch.cat([self.unfold(x), after["3"]], dim=1)))
-        return Detection(_without_ring(torch.sigmoid(score)), keypoint_places(place), self.convFbb(x), response)
+        out: Tensor = self.convFbb(x)
+        return out
+
+
+def of_weights(weights: Weights) -> KeypointNet:
+    """The network with ``weights``, ready to run, each batch norm made part of the convolution before it."""
+    network = KeypointNet(weights.architecture)
+    # Counters of batches are all that may be missing: a weights file has been checked for the rest.
+    state = {name: torch.from_numpy(np.array(values)) for name, values in weights.tensors.items()}
+    network.load_state_dict(state, strict=False)
+    network.eval()
+    for name, layer in list(network.named_children()):
+        if isinstance(layer, nn.Sequential):
+            network.add_module(name, fuse_conv_bn_eval(layer[0], layer[1]))
+    return network.to(memory_format=torch.channels_last)
 
 
 def locally_normalised(images: Tensor) -> Tensor:
@@ -135,41 +182,8 @@ def describe(descriptors: Tensor, xy: Tensor) -> Tensor:
     return normalize(sampled, dim=1).transpose(1, 2)
 
 
-class InlierOutlierNet(nn.Module):
-    """Tells from matched points alone which matches are right: (B, 5, N) to (B, N), positive for an inlier.
-
-    The five are the place in either image, scaled to [-1, 1], and the distance of the descriptors (section 3.3; after
-    Brachmann and Rother, ICCV 2019).
-    """
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.first = nn.Sequential(nn.Conv1d(5, 128, 1, bias=False), nn.BatchNorm1d(128), nn.ReLU(inplace=True))
-        self.blocks = nn.ModuleList(_residual(128) for _ in range(4))
-        self.last = nn.Conv1d(128, 1, 1)
-
-    def forward(self, matches: Tensor) -> Tensor:
-        x = self.first(matches)
-        for block in self.blocks:
-            x = x + block(x)
-        out: Tensor = self.last(x)[:, 0]
-        return out
-
-
 def _conv_bn(before: int, after: int) -> nn.Sequential:
     return nn.Sequential(nn.Conv2d(before, after, 3, padding=1, bias=False), nn.BatchNorm2d(after))
-
-
-def _residual(channels: int) -> nn.Sequential:
-    layers: list[nn.Module] = []
-    for _ in range(2):
-        layers += [
-            nn.Conv1d(channels, channels, 1),
-            nn.InstanceNorm1d(channels),
-            nn.BatchNorm1d(channels),
-            nn.ReLU(inplace=True),
-        ]
-    return nn.Sequential(*layers)
 
 
 def _without_ring(score: Tensor) -> Tensor:

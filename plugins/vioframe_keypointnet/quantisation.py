@@ -9,15 +9,10 @@ from numpy.typing import NDArray
 
 from vioframe.errors import ConfigError
 from vioframe.types import Image
-from vioframe_keypointnet.folding import Convolution, fold
+from vioframe_keypointnet.architecture import HEADS, ranged_layers
 from vioframe_keypointnet.optional import needs
-from vioframe_keypointnet.runtimes.torch import TorchOnCpu, TorchOperations
 from vioframe_keypointnet.selection import padded_to_cells
-from vioframe_keypointnet.tensors import ranged_layers
 from vioframe_keypointnet.weights import Weights
-
-with needs("torch", "keypointnet"):
-    from torch import Tensor
 
 _STEPS = 255
 _VALUES_AN_IMAGE = 20_000
@@ -30,28 +25,28 @@ def measure_ranges(weights: Weights, images: Iterable[Image]) -> dict[str, float
     It is the one that loses least in the mean square, of what it cuts off and of what falls between 255 steps, over
     values drawn evenly from each image.
     """
-    recorder = _Recorder(ranged_layers(weights.architecture))
-    run = TorchOnCpu(fold(weights), threads=0, operations=recorder)
-    for image in images:
-        run(padded_to_cells(image))
-    if not all(recorder.values.values()):
-        raise ConfigError("the range of activations can only be measured on images, and there are none")
-    return {name: _best_range(np.concatenate(values)) for name, values in recorder.values.items()}
+    with needs("torch", "keypointnet"):
+        import torch
 
+        from vioframe_keypointnet.network import of_weights
 
-class _Recorder(TorchOperations):
-    """Keeps a sample of the outputs of the layers ``names``."""
+    network = of_weights(weights)
+    values: dict[str, list[NDArray[np.float32]]] = {name: [] for name in ranged_layers(weights.architecture)}
+    for name, found in values.items():
 
-    def __init__(self, names: Iterable[str]) -> None:
-        super().__init__()
-        self.values: dict[str, list[NDArray[np.float32]]] = {name: [] for name in names}
-
-    def convolve(self, layer: Convolution, x: Tensor) -> Tensor:
-        y = super().convolve(layer, x)
-        if layer.name in self.values:
+        def keep(_: object, __: object, y: torch.Tensor, found: list[NDArray[np.float32]] = found) -> None:
+            # Before LeakyReLU, which leaves what is above zero, as int8 does, as it is.
             flat = y.flatten()
-            self.values[layer.name].append(flat[:: max(1, len(flat) // _VALUES_AN_IMAGE)].numpy().copy())
-        return y
+            found.append(flat[:: max(1, len(flat) // _VALUES_AN_IMAGE)].numpy().copy())
+
+        for layer in ("Da", "Pa") if name == HEADS else (name,):
+            network.get_submodule(f"conv{layer}").register_forward_hook(keep)
+    with torch.inference_mode():
+        for image in images:
+            network.found(torch.from_numpy(padded_to_cells(image).copy())[None, None] / 255.0, descriptors=False)
+    if not all(values.values()):
+        raise ConfigError("the range of activations can only be measured on images, and there are none")
+    return {name: _best_range(np.concatenate(found)) for name, found in values.items()}
 
 
 def _best_range(values: NDArray[np.float32]) -> float:

@@ -1,4 +1,8 @@
-"""From what the network says of every cell to the strongest keypoints that are apart."""
+"""From what a network finds to the strongest keypoints that are apart, and their descriptors.
+
+The published network gives a candidate a cell (:func:`select`), the small ones a response a pixel, whose peaks are the
+keypoints (:func:`peaks`).
+"""
 
 from __future__ import annotations
 
@@ -9,14 +13,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vioframe.jit import kernel
-from vioframe.types import Image
+from vioframe.types import Image, Int
 from vioframe_keypointnet.architecture import CELL_PX
 
 OFFSET_PX = 2.0 * (CELL_PX - 1) / 2
 """How far a keypoint may lie from its cell's centre: the network's cross ratio of 2 times half a cell."""
 
-CONTRAST_REACH_PX = 8
+_CONTRAST_REACH_PX = 8
 """Half the side of the window in which the image must vary for a keypoint to be there."""
+_PIXELS_A_POINT = 12
+"""So many of the highest pixels are looked at for each point that is wanted, before all are."""
+_EVERY = 7
+"""Of rows and of columns, one in so many is looked at to find the bound that these exceed."""
 
 Array = NDArray[np.float32]
 
@@ -29,11 +37,6 @@ class Rules:
     """A candidate goes where a stronger one is nearer than this; the cells reach into each other."""
     min_contrast: int
     """Grey levels by which the image must vary within 8 px of a keypoint."""
-
-    @property
-    def reach_cells(self) -> int:
-        """How many cells away a candidate may be that is nearer than ``nms_px``."""
-        return max(ceil((self.nms_px + 2.0 * OFFSET_PX) / CELL_PX) - 1, 0)
 
 
 def padded_to_cells(image: Image) -> Image:
@@ -49,24 +52,24 @@ def select(heads: Array, image: Image, shape: tuple[int, int], max_points: int, 
     """``xy`` (N, 2) px and ``score`` (N,) in (0, 1), strongest first, of the candidates ``heads`` (3, h, w).
 
     ``heads`` are the score, x and y of each cell as the network gives them before sigmoid and tanh; ``image``
-    (8 h, 8 w) is what it saw. Not taken: the outermost ring of cells, which sees less than it should, and what
-    lies outside the image's first ``shape`` (H, W) pixels, which are not padding.
+    (8 h, 8 w) is what it saw. Not taken: the outermost ring of cells, which sees less than it should, what lies outside
+    the image's first ``shape`` (H, W) pixels, which are not padding, and what is near a stronger candidate.
     """
-    scores = heads[0]
-    xs, ys = candidate_places(heads)
-    order = np.argsort(scores, axis=None)[::-1]
-    cells = np.empty(max(min(max_points, scores.size), 0), np.int64)
-    radius2, reach = np.float32(rules.nms_px**2), rules.reach_cells
-    count = _take(cells, order, scores, xs, ys, image, shape[0], shape[1], radius2, reach, rules.min_contrast)
-    taken = cells[:count]
-    return np.stack([xs.ravel()[taken], ys.ravel()[taken]], axis=1), sigmoid(scores.ravel()[taken])
+    from scipy.spatial import cKDTree
 
-
-def sigmoid(x: Array) -> Array:
-    """In (0, 1), and without a warning however negative ``x`` is."""
-    one = np.float32(1.0)
-    y: Array = one / (one + np.exp(np.minimum(-x, np.float32(80.0))))
-    return y
+    off_border = np.zeros(heads.shape[1:], bool)
+    off_border[1:-1, 1:-1] = True
+    order = np.argsort(heads[0], axis=None)[::-1]
+    order = order[(off_border & np.isfinite(heads[0])).ravel()[order]]
+    score = heads[0].ravel()[order]
+    xy = np.stack([places.ravel()[order] for places in candidate_places(heads)], axis=1)
+    apart = np.ones(len(xy), bool)
+    # Of each pair the one that comes later is the weaker.
+    apart[cKDTree(xy).query_pairs(rules.nms_px, output_type="ndarray").max(axis=1)] = False
+    apart &= (xy <= np.array(shape[::-1]) - 1).all(axis=1)
+    score, xy = score[apart], xy[apart]
+    kept = _first_varied(image, np.rint(xy).astype(np.int64), shape[0], shape[1], rules.min_contrast, max_points)
+    return xy[kept], _sigmoid(score[kept])
 
 
 def candidate_places(heads: Array) -> tuple[Array, Array]:
@@ -78,62 +81,134 @@ def candidate_places(heads: Array) -> tuple[Array, Array]:
     return np.clip(offset[0], 0.0, w * CELL_PX - 1.0), np.clip(offset[1], 0.0, h * CELL_PX - 1.0)
 
 
-@kernel
-def _take(
-    cells: NDArray[np.int64],
-    order: NDArray[np.int64],
-    scores: Array,
-    xs: Array,
-    ys: Array,
-    image: Image,
-    height: int,
-    width: int,
-    radius2: np.float32,
-    reach: int,
-    min_contrast: int,
-) -> int:
-    """Fill ``cells`` with the keypoints' cells, first those that come first in ``order``; the number found."""
-    h, w = scores.shape
-    count = 0
-    for cell in order:
-        if count == len(cells):
+def peaks(found: Array, image: Image, shape: tuple[int, int], max_points: int, rules: Rules) -> tuple[Array, Array]:
+    """``xy`` (N, 2) px and ``score`` (N,) in (0, 1), strongest first, of the peaks of ``found`` (H/2, W/2, 4).
+
+    A peak is the highest of all pixels nearer than ``nms_px`` along both axes, of equals the first row by row; its
+    place is that of the parabolas through it and its neighbours. Not taken: what :func:`select` leaves.
+    """
+    response, reach = by_pixels(found), max(ceil(rules.nms_px) - 1, 1)
+    # The highest pixels nearly always hold enough peaks; to look at and to sort all takes several times as long.
+    for above in (_exceeded_by(response, _PIXELS_A_POINT * max_points), -np.inf):
+        at = _peaks(response, np.float32(above), reach)
+        at = at[np.argsort(-response[at[:, 1], at[:, 0]], kind="stable")]
+        at = at[_first_varied(image, at, shape[0], shape[1], rules.min_contrast, max_points)]
+        if len(at) == max_points:
             break
-        row, column = cell // w, cell % w
-        if row == 0 or column == 0 or row == h - 1 or column == w - 1 or not np.isfinite(scores[row, column]):
-            continue
-        x, y = xs[row, column], ys[row, column]
-        if x > width - 1 or y > height - 1:
-            continue
-        if _suppressed(row, column, scores, xs, ys, radius2, reach):
-            continue
-        if not varies(image, round(x), round(y), height, width, min_contrast):
-            continue
-        cells[count] = cell
-        count += 1
-    return count
+    x, y = at.T
+    here = response[y, x]
+    xy = np.empty((len(at), 2), np.float32)
+    xy[:, 0] = x + _summits(response[y, x - 1], here, response[y, x + 1])
+    xy[:, 1] = y + _summits(response[y - 1, x], here, response[y + 1, x])
+    return xy, _sigmoid(here)
+
+
+def by_pixels(found: Array) -> Array:
+    """(H, W) of (H/2, W/2, 4), the values of 2 x 2 pixels, row by row."""
+    h, w, _ = found.shape
+    out = np.empty((2 * h, 2 * w), np.float32)
+    # Two of a row are moved as one: twice as fast.
+    pairs = np.ascontiguousarray(found).view(np.float64)
+    out.view(np.float64)[0::2], out.view(np.float64)[1::2] = pairs[..., 0], pairs[..., 1]
+    return out
+
+
+def describe(descriptors: Array, xy: Array) -> Array:
+    """(N, D) unit descriptors at ``xy`` (N, 2) px of the image of which ``descriptors`` (D, H/4, W/4) are.
+
+    Bilinear, corners of the map on the centres of the image's corner pixels, as the network was trained with
+    (:func:`vioframe_keypointnet.network.describe` does the same in torch).
+    """
+    h, w = descriptors.shape[1:]
+    x = np.clip(xy[:, 0] * ((w - 1) / (4 * w - 1)), 0.0, w - 1.0)
+    y = np.clip(xy[:, 1] * ((h - 1) / (4 * h - 1)), 0.0, h - 1.0)
+    left, top = x.astype(np.intp), y.astype(np.intp)
+    right, bottom = np.minimum(left + 1, w - 1), np.minimum(top + 1, h - 1)
+    dx, dy = x - left, y - top
+    upper = descriptors[:, top, left] * (1.0 - dx) + descriptors[:, top, right] * dx
+    lower = descriptors[:, bottom, left] * (1.0 - dx) + descriptors[:, bottom, right] * dx
+    sampled = (upper * (1.0 - dy) + lower * dy).T
+    length = np.linalg.norm(sampled, axis=1, keepdims=True)
+    unit: Array = (sampled / np.maximum(length, 1e-12)).astype(np.float32)
+    return unit
+
+
+def _sigmoid(x: Array) -> Array:
+    """In (0, 1), and without a warning however negative ``x`` is."""
+    one = np.float32(1.0)
+    y: Array = one / (one + np.exp(np.minimum(-x, np.float32(80.0))))
+    return y
+
+
+def _exceeded_by(values: Array, count: int) -> float:
+    """A bound that about ``count`` of ``values`` (H, W) exceed, from a sample."""
+    sample = values[::_EVERY, ::_EVERY].ravel()
+    rank = int(len(sample) * (1.0 - count / values.size))
+    return float(np.partition(sample, rank)[rank]) if 0 <= rank < len(sample) else -np.inf
+
+
+def _summits(before: Array, here: Array, after: Array) -> NDArray[np.float64]:
+    """Where the parabolas through three values, a pixel apart, are highest: at most half a pixel from the middle."""
+    bend = 2.0 * here.astype(np.float64) - before - after
+    return np.divide(0.5 * (after - before).astype(np.float64), bend, out=np.zeros(len(bend)), where=bend > 0.0)
 
 
 @kernel
-def _suppressed(row: int, column: int, scores: Array, xs: Array, ys: Array, radius2: np.float32, reach: int) -> bool:
-    """Whether a stronger candidate is too near; of equal ones the first in the image is the stronger."""
-    h, w = scores.shape
-    for r in range(max(row - reach, 1), min(row + reach + 1, h - 1)):
-        for c in range(max(column - reach, 1), min(column + reach + 1, w - 1)):
-            first = r < row or (r == row and c < column)
-            stronger = scores[r, c] > scores[row, column] or (first and scores[r, c] == scores[row, column])
-            if stronger and (xs[r, c] - xs[row, column]) ** 2 + (ys[r, c] - ys[row, column]) ** 2 < radius2:
-                return True
-    return False
+def _peaks(response: Array, above: np.float32, reach: int) -> Int:
+    """(N, 2) columns and rows of the peaks ``above`` a bound that are off the border, two rows after the other."""
+    found = np.empty((response.size // 4, 2), np.int64)
+    highest = np.empty(response.shape[1], np.float32)
+    count = 0
+    # Of 2 x 2 px one at most is a peak, and few hold anything above the bound.
+    for top in range(CELL_PX, response.shape[0] - CELL_PX, 2):
+        for column in range(len(highest)):
+            highest[column] = max(response[top, column], response[top + 1, column])
+        for left in range(CELL_PX, response.shape[1] - CELL_PX, 2):
+            if max(highest[left], highest[left + 1]) <= above:
+                continue
+            for row in range(top, top + 2):
+                for column in range(left, left + 2):
+                    if response[row, column] > above and _is_peak(response, row, column, reach):
+                        found[count] = column, row
+                        count += 1
+    return found[:count]
 
 
 @kernel
-def varies(image: Image, x: int, y: int, height: int, width: int, min_contrast: int) -> bool:
-    """Whether grey levels around (x, y) differ by ``min_contrast``."""
+def _is_peak(response: Array, row: int, column: int, reach: int) -> bool:
+    here = response[row, column]
+    if response[row, column - 1] > here or response[row, column + 1] > here:
+        return False  # as of most pixels, at little cost
+    for r in range(max(row - reach, 0), min(row + reach + 1, response.shape[0])):
+        for c in range(max(column - reach, 0), min(column + reach + 1, response.shape[1])):
+            there = response[r, c]
+            if there > here or (there == here and (r < row or (r == row and c < column))):
+                return False
+    return True
+
+
+@kernel
+def _first_varied(image: Image, at: Int, height: int, width: int, min_contrast: int, most: int) -> Int:
+    """Which of the pixels ``at`` (N, 2) are the first ``most`` in the image around which it varies."""
+    kept = np.empty(len(at), np.int64)
+    count = 0
+    for k in range(len(at)):
+        if count == most:
+            break
+        x, y = at[k]
+        if x < width and y < height and _varies(image, x, y, height, width, min_contrast):
+            kept[count] = k
+            count += 1
+    return kept[:count]
+
+
+@kernel
+def _varies(image: Image, x: int, y: int, height: int, width: int, min_contrast: int) -> bool:
     low = high = int(image[y, x])
     if min_contrast <= 0:
         return True
-    for r in range(max(y - CONTRAST_REACH_PX, 0), min(y + CONTRAST_REACH_PX + 1, height)):
-        for c in range(max(x - CONTRAST_REACH_PX, 0), min(x + CONTRAST_REACH_PX + 1, width)):
+    for r in range(max(y - _CONTRAST_REACH_PX, 0), min(y + _CONTRAST_REACH_PX + 1, height)):
+        for c in range(max(x - _CONTRAST_REACH_PX, 0), min(x + _CONTRAST_REACH_PX + 1, width)):
             low, high = min(low, int(image[r, c])), max(high, int(image[r, c]))
             if high - low >= min_contrast:
                 return True

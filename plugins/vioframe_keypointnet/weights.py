@@ -2,24 +2,38 @@
 
 The metadata holds ``architecture``, a ``card`` (free JSON: data, schedule, figures) and, for int8 inference,
 ``activation_ranges``, so that nobody who only runs the network needs images to calibrate it.
+
+Official checkpoints of KP2D, ``{"state_dict": ..., "config": ...}``, are read too, without running any code they hold:
+torch's own restricted loader admits tensors and plain containers and nothing else; the one class it is told of in
+addition is the yacs ``CfgNode`` of ``config``, a dictionary, in whose place it puts one of Python's own.
 """
 
 from __future__ import annotations
 
 import json
 import logging
+import re
+from collections import OrderedDict
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from pickle import UnpicklingError
 from typing import Any
 
 import numpy as np
 
 from vioframe.errors import ConfigError
 from vioframe.parts.options import did_you_mean
-from vioframe_keypointnet.architecture import ARCHITECTURES, Architecture
+from vioframe_keypointnet.architecture import (
+    ARCHITECTURES,
+    FULL,
+    Architecture,
+    Tensors,
+    ranged_layers,
+    shapes,
+    untrained,
+)
 from vioframe_keypointnet.optional import needs
-from vioframe_keypointnet.tensors import Tensors, ranged_layers, shapes, untrained
 
 _LOG = logging.getLogger(__name__)
 
@@ -85,21 +99,12 @@ def load(source: str | Path) -> Weights:
             f"there are no KeypointNet weights {name!r}{did_you_mean(name, known)}: neither a file nor among those "
             f"that ship ({', '.join(known) or 'none'}); {_REMEDY}"
         )
-    if path.suffix == _SUFFIX:
-        return _read(path)
-    from vioframe_keypointnet import checkpoint  # imports torch
-
-    return checkpoint.read(path)
+    return _read(path) if path.suffix == _SUFFIX else _read_checkpoint(path)
 
 
 def shipped() -> list[str]:
     """Names of the weights that came with the package."""
     return sorted(path.name[len(_PREFIX) : -len(_SUFFIX)] for path in _SHIPPED.glob(f"{_PREFIX}*{_SUFFIX}"))
-
-
-def of_tensors(tensors: Mapping[str, Any], architecture: Architecture, source: Path) -> Weights:
-    """Weights of tensors read from ``source``; raises :class:`ConfigError` where they do not fit ``architecture``."""
-    return Weights(architecture, _checked(tensors, architecture, str(source)), source=str(source))
 
 
 def _read(path: Path) -> Weights:
@@ -119,9 +124,32 @@ def _read(path: Path) -> Weights:
     except (ValueError, TypeError, KeyError, AttributeError) as error:
         raise ConfigError(
             f"{path} does not say which KeypointNet it is of; convert official checkpoints with "
-            f"`python -m vioframe_keypointnet.checkpoint IN.ckpt OUT.safetensors`, or {_REMEDY}"
+            f"`python -m vioframe_keypointnet IN.ckpt OUT.safetensors`, or {_REMEDY}"
         ) from error
     return Weights(architecture, _checked(tensors, architecture, str(path)), card, ranges, str(path))
+
+
+def _read_checkpoint(path: Path) -> Weights:
+    """The full network of an official checkpoint, in either of torch's formats.
+
+    Raises :class:`ConfigError` where the file is none, wants anything but tensors built, or is of another network.
+    """
+    with needs("torch", "keypointnet"):
+        import torch
+    try:
+        with torch.serialization.safe_globals([(OrderedDict, "yacs.config.CfgNode")]):
+            content = torch.load(path, map_location="cpu", weights_only=True)
+    except UnpicklingError as error:
+        forbidden = re.search(r"GLOBAL (\S+)", str(error))
+        what = f"wants {forbidden[1]} loaded, which no checkpoint needs" if forbidden else "is damaged or no checkpoint"
+        raise ConfigError(f"{path} {what}; get the file anew from its authors") from error
+    except (RuntimeError, EOFError, ValueError, KeyError, AttributeError, OSError) as error:
+        raise ConfigError(f"{path} is damaged or no checkpoint of torch; get the file anew from its authors") from error
+    tensors = content.get("state_dict") if isinstance(content, Mapping) else None
+    if not isinstance(tensors, Mapping) or not all(isinstance(t, torch.Tensor) for t in tensors.values()):
+        raise ConfigError(f"{path} is no checkpoint of KP2D: it has no tensors under 'state_dict'")
+    arrays = _checked({name: t.numpy() for name, t in tensors.items()}, FULL, str(path))
+    return Weights(FULL, arrays, {"converted_from": path.name}, source=str(path))
 
 
 def _random(name: str) -> Weights:

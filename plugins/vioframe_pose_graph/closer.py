@@ -5,6 +5,7 @@ Qin, Li, Shen, "VINS-Mono" (T-RO 2018), sections VII and VIII, with other means 
 
 from __future__ import annotations
 
+from array import array
 from collections import deque
 from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -14,7 +15,7 @@ import numpy as np
 
 from vioframe.geometry.so3 import rotation_z, yaw_of
 from vioframe.geometry.trajectory import Trajectory
-from vioframe.types import Calibration, Float, Int, Loop, LoopClosure, NavState, Status, Step
+from vioframe.types import Calibration, Float, Int, Loop, LoopClosure, Status, Step
 from vioframe_pose_graph.consistency import GATE, agreed, measured, within_drift
 from vioframe_pose_graph.correction import carry
 from vioframe_pose_graph.drift import Odometry
@@ -32,18 +33,22 @@ class PoseGraph:
     def __init__(self, calibration: Calibration, options: PoseGraphOptions | None = None) -> None:
         self._options = options or PoseGraphOptions()
         self._selector = KeyframeSelector(calibration, self._options.parallax_px)
-        self._recogniser = Recogniser(calibration, self._options)
+        self._recogniser = Recogniser(calibration.single("the loop closer").model.focal_px, self._options)
         self._worker = ThreadPoolExecutor(1, "loop-closure")
         self._waiting: deque[Future[None]] = deque()
-        self._states: list[NavState] = []
-        self._segments: list[int] = []
+        # Of every tracked frame: an hour of them takes 10 MB like this.
+        self._t_ns, self._segments = array("q"), array("q")
+        self._R_WB, self._p_WB = array("d"), array("d")
 
     def add(self, step: Step) -> None:
         """Take in a frame; raises what recognition of an earlier one raised."""
         self._submit(self._selector.add(step))
         if step.estimate.status is Status.TRACKING and step.estimate.state is not None:
-            self._states.append(step.estimate.state)
+            state = step.estimate.state
+            self._t_ns.append(state.t_ns)
             self._segments.append(self._selector.segment)
+            self._R_WB.extend(state.R_WB.ravel())
+            self._p_WB.extend(state.p_WB)
         while self._waiting and self._waiting[0].done():
             self._waiting.popleft().result()
 
@@ -53,7 +58,7 @@ class PoseGraph:
         while self._waiting:
             self._waiting.popleft().result()
         self._worker.shutdown()
-        if not self._states:
+        if not self._t_ns:
             return LoopClosure(None, np.empty(0, np.int64), (), self._recogniser.seconds)
         return self._close()
 
@@ -79,12 +84,12 @@ class PoseGraph:
         return LoopClosure(trajectory, t_ns, loops, {**self._recogniser.seconds, "solve": perf_counter() - begin})
 
     def _corrected(self, t_ns: Int, segment: Int, key_p: Float, p: Float, yaw: Float) -> Trajectory:
-        stamps = np.array([state.t_ns for state in self._states])
+        stamps = np.array(self._t_ns, np.int64)
         frames = (
             stamps,
-            np.array(self._segments),
-            np.array([state.R_WB for state in self._states]),
-            np.array([state.p_WB for state in self._states]),
+            np.array(self._segments, np.int64),
+            np.array(self._R_WB).reshape(-1, 3, 3),
+            np.array(self._p_WB).reshape(-1, 3),
         )
         return Trajectory(stamps, *carry(frames, (t_ns, segment, key_p), p, yaw))
 

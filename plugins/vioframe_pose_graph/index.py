@@ -21,7 +21,7 @@ _COMMON, _NEVER_COMMON = 4096, 50
 
 
 class DescriptorIndex:
-    """Grows by a keyframe at a time; keyframes are numbered in the order they are added."""
+    """Grows by a keyframe at a time, and holds its descriptors."""
 
     def __init__(self) -> None:
         self._heads = np.full((_TABLES, _VALUES), -1, np.int32)
@@ -30,21 +30,26 @@ class DescriptorIndex:
         self._descriptors = np.empty((1024, 4), np.uint64)
         self._owners = np.empty(1024, np.int32)
         self._size = 0
-        self.keyframes = 0
 
-    def add(self, descriptors: NDArray[np.uint64]) -> None:
-        """Add the descriptors (K, 4) of the next keyframe."""
+    def add(self, descriptors: NDArray[np.uint64], keyframe: int) -> slice:
+        """Add the descriptors (K, 4) of a keyframe, of a higher number than those before; returns their rows."""
         end = self._size + len(descriptors)
-        while end > len(self._descriptors):
-            self._next = np.concatenate([self._next, np.empty_like(self._next)], axis=1)
-            self._descriptors = np.concatenate([self._descriptors, np.empty_like(self._descriptors)])
-            self._owners = np.concatenate([self._owners, np.empty_like(self._owners)])
-        self._descriptors[self._size : end] = descriptors
-        self._owners[self._size : end] = self.keyframes
+        if end > len(self._descriptors):
+            more = max(end - len(self._descriptors), len(self._descriptors) // 4)
+            self._next = np.concatenate([self._next, np.empty((_TABLES, more), np.int32)], axis=1)
+            self._descriptors = np.concatenate([self._descriptors, np.empty((more, 4), np.uint64)])
+            self._owners = np.concatenate([self._owners, np.empty(more, np.int32)])
+        rows = slice(self._size, end)
+        self._descriptors[rows] = descriptors
+        self._owners[rows] = keyframe
         words = np.ascontiguousarray(descriptors).view(np.uint16).reshape(-1, _TABLES)
         _insert(self._heads, self._lengths, self._next, words, self._size)
         self._size = end
-        self.keyframes += 1
+        return rows
+
+    def descriptors(self, rows: slice) -> NDArray[np.uint64]:
+        """(K, 4) those that were added as ``rows``."""
+        return self._descriptors[rows]
 
     def similarity(self, descriptors: NDArray[np.uint64], before: int) -> Float:
         """(before,) for each of the first ``before`` keyframes, the part of ``descriptors`` (K, 4) that is found there.

@@ -7,12 +7,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vioframe.types import NS_PER_S, Calibration, Float, FrameTracks, Image, NavState, Status, Step
+from vioframe.geometry import so3
+from vioframe.types import NS_PER_S, Calibration, CameraOnBody, Float, FrameTracks, Image, NavState, Status, Step
 from vioframe_pose_graph.place import Keyframe
 
 # A feature may get its position later than the frame that sees it: from the frames that follow.
 _WAIT_NS = NS_PER_S
 _MIN_COMMON = 0.5
+# From one frame to the next a body turns steadily, if they are no farther apart.
+_STEADY_S = 0.2
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -21,14 +24,19 @@ class _Pending:
     segment: int
     image: Image
     tracks: FrameTracks
+    camera: CameraOnBody
+    R_WC: Float
+    p_WC: Float
 
 
 class KeyframeSelector:
     """Thins the frames of any back-end by how much the picture has moved, turning left out."""
 
     def __init__(self, calibration: Calibration, parallax_px: float) -> None:
-        self._R_BC = calibration.cameras[0].R_BC
-        self._parallax = parallax_px / calibration.cameras[0].model.focal_px
+        self._camera = calibration.single("the loop closer")
+        self._offset_ns = self._camera.time_offset_ns
+        self._parallax = parallax_px / self._camera.model.focal_px
+        self._previous: NavState | None = None
         self._pending: deque[_Pending] = deque()
         self._last: _Pending | None = None
         self._p_WF: dict[int, Float] = {}
@@ -44,11 +52,17 @@ class KeyframeSelector:
         ready = []
         if not self._tracking:
             ready = self.flush()
-            self._tracking, self._last = True, None
+            self._tracking, self._last, self._previous = True, None, None
             self.segment += 1
         self._p_WF.update(zip(estimate.landmark_ids.tolist(), estimate.p_WF, strict=True))
-        if self._last is None or (estimate.is_keyframe and self._moved_on(self._last, step.tracks, state)):
-            self._last = _Pending(state, self.segment, step.frames.images[0], step.tracks)
+        if estimate.calibration is not None:
+            self._camera = estimate.calibration.calibration.cameras[0]
+        R_WC, p_WC = self._camera_pose(state)
+        self._previous = state
+        image = next(iter(step.frames.images), None)
+        due = self._last is None or (estimate.is_keyframe and self._moved_on(self._last, step.tracks, R_WC))
+        if due and image is not None:
+            self._last = _Pending(state, self.segment, image, step.tracks, self._camera, R_WC, p_WC)
             self._pending.append(self._last)
             self._forget(step.tracks)
         while self._pending and step.frames.t_ns - self._pending[0].state.t_ns >= _WAIT_NS:
@@ -62,11 +76,22 @@ class KeyframeSelector:
         self._p_WF.clear()
         return ready
 
-    def _moved_on(self, last: _Pending, tracks: FrameTracks, state: NavState) -> bool:
+    def _camera_pose(self, state: NavState) -> tuple[Float, Float]:
+        """R_WC (3, 3) and p_WC (3,) when the image was taken, which by what is learned is not when it was stamped."""
+        R_WB, p_WB, before, dt = state.R_WB, state.p_WB, self._previous, 0.0
+        late_s = (self._camera.time_offset_ns - self._offset_ns) * 1e-9
+        if before is not None:
+            dt = (state.t_ns - before.t_ns) * 1e-9
+        if before is not None and 0.0 < dt < _STEADY_S:
+            rate_B = so3.log(before.R_WB.T @ R_WB) / dt
+            R_WB, p_WB = R_WB @ so3.exp(rate_B * late_s), p_WB + state.v_WB * late_s
+        return R_WB @ self._camera.R_BC, p_WB + R_WB @ self._camera.p_BC
+
+    def _moved_on(self, last: _Pending, tracks: FrameTracks, R_WC: Float) -> bool:
         _, i, j = np.intersect1d(last.tracks.ids, tracks.ids, assume_unique=True, return_indices=True)
         if len(i) < _MIN_COMMON * len(last.tracks.ids):
             return True
-        R = (state.R_WB @ self._R_BC).T @ (last.state.R_WB @ self._R_BC)
+        R = R_WC.T @ last.R_WC
         rays = np.column_stack([last.tracks.xy_normalised[i], np.ones(len(i))]) @ R.T
         ahead = rays[:, 2] > 0.0
         moved = tracks.xy_normalised[j][ahead] - rays[ahead, :2] / rays[ahead, 2:]
@@ -81,4 +106,15 @@ class KeyframeSelector:
         unknown = np.full(3, np.nan)
         ids, state = pending.tracks.ids.tolist(), pending.state
         p_WF = np.array([self._p_WF.get(i, unknown) for i in ids]).reshape(-1, 3)
-        return Keyframe(state.t_ns, pending.segment, state.R_WB, state.p_WB, pending.image, pending.tracks.xy, p_WF)
+        return Keyframe(
+            state.t_ns,
+            pending.segment,
+            state.R_WB,
+            state.p_WB,
+            pending.R_WC,
+            pending.p_WC,
+            pending.camera.model,
+            pending.image,
+            pending.tracks.xy,
+            p_WF,
+        )

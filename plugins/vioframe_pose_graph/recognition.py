@@ -7,17 +7,19 @@ from dataclasses import dataclass
 import numpy as np
 
 from vioframe.stopwatch import Stopwatch
-from vioframe.types import NS_PER_S, Calibration, Float
+from vioframe.types import NS_PER_S, Float
 from vioframe_pose_graph.descriptors import Describer
 from vioframe_pose_graph.index import DescriptorIndex
 from vioframe_pose_graph.options import PoseGraphOptions
-from vioframe_pose_graph.place import Keyframe, Place, describe
+from vioframe_pose_graph.place import Float32, Keyframe, Place, View, describe
 from vioframe_pose_graph.verification import Relation, relate
 
 # Keyframes this near to a candidate look the same, and are not compared as well.
 _NEIGHBOURS = 3
 # Enough points to know a place by; the tracked features come first.
 _ASKED = 300
+# Places whose looks are remembered: some 80 kB each.
+_MOST_REMEMBERED = 2000
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -29,13 +31,27 @@ class Sighting:
     relation: Relation
 
 
-class Recogniser:
-    """Remembers every keyframe it is given; what it finds depends on their order and on nothing else."""
+@dataclass(frozen=True, slots=True, eq=False)
+class _Remembered:
+    """How a place looked; its descriptors are rows of the index."""
 
-    def __init__(self, calibration: Calibration, options: PoseGraphOptions) -> None:
-        self._calibration, self._options = calibration, options
+    xy_normalised: Float32
+    p_WF: Float32
+    rows: slice
+
+
+class Recogniser:
+    """Remembers the keyframes it is given; what it finds depends on their order and on nothing else.
+
+    Of a long flight it remembers how every second place looked, then every fourth, the oldest first, so that memory is
+    bounded; where they were it remembers of all.
+    """
+
+    def __init__(self, focal_px: float, options: PoseGraphOptions) -> None:
+        self._focal_px, self._options = focal_px, options
         self._describer = Describer(options.max_corners)
         self._index = DescriptorIndex()
+        self._remembered: dict[int, _Remembered] = {}
         self.places: list[Place] = []
         self.sightings: list[Sighting] = []
         self.seconds: dict[str, float] = {}
@@ -43,32 +59,51 @@ class Recogniser:
     def add(self, keyframe: Keyframe) -> None:
         """Look for the place of ``keyframe`` among the earlier ones, then remember it."""
         watch = Stopwatch()
-        place = describe(keyframe, self._describer, self._calibration, 0.5 * self._options.reprojection_px)
+        place, view = describe(keyframe, self._describer, 0.5 * self._options.reprojection_px)
         watch.lap("describe")
-        candidates = self._retrieve(place)
-        self._index.add(place.descriptors)
+        candidates = self._retrieve(place, view)
+        number = len(self.places)
+        rows = self._index.add(view.descriptors, number)
         watch.lap("retrieve")
         for earlier in candidates:
             relation = relate(
-                self.places[earlier],
-                place,
-                self._calibration.cameras[0].model.focal_px,
+                (self.places[earlier], self._view(earlier)),
+                (place, view),
+                self._focal_px,
                 self._options.reprojection_px,
                 self._options.min_inliers,
             )
             if relation is not None:
-                self.sightings.append(Sighting(earlier, len(self.places), relation))
+                self.sightings.append(Sighting(earlier, number, relation))
         self.places.append(place)
+        self._remembered[number] = _Remembered(view.xy_normalised, view.p_WF, rows)
+        if len(self._remembered) > _MOST_REMEMBERED:
+            self._thin_out()
         watch.lap("verify")
         for stage, seconds in watch.seconds.items():
             self.seconds[stage] = self.seconds.get(stage, 0.0) + seconds
 
-    def _retrieve(self, place: Place) -> list[int]:
+    def _view(self, number: int) -> View:
+        remembered = self._remembered[number]
+        return View(remembered.xy_normalised, remembered.p_WF, self._index.descriptors(remembered.rows))
+
+    def _retrieve(self, place: Place, view: View) -> list[int]:
         """Numbers of the earlier keyframes that look most like ``place``, no two of them neighbours."""
         gap_ns = round(self._options.min_gap_s * NS_PER_S)
         before = sum(earlier.t_ns <= place.t_ns - gap_ns for earlier in self.places)
-        scores = self._index.similarity(place.descriptors[:_ASKED], before)
+        scores = self._index.similarity(view.descriptors[:_ASKED], before)
         return _peaks(scores, self._options.max_candidates)
+
+    def _thin_out(self) -> None:
+        """Forget how every second of the older half of the remembered places looked."""
+        old, index = self._remembered, DescriptorIndex()
+        older = set(list(old)[1 : len(old) // 2 : 2])
+        self._remembered = {}
+        for number, place in old.items():
+            if number not in older:
+                rows = index.add(self._index.descriptors(place.rows), number)
+                self._remembered[number] = _Remembered(place.xy_normalised, place.p_WF, rows)
+        self._index = index
 
 
 def _peaks(scores: Float, count: int) -> list[int]:

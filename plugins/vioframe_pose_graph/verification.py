@@ -10,7 +10,7 @@ from vioframe.geometry import so3
 from vioframe.geometry.so3 import rotation_z, yaw_of
 from vioframe.types import Float, Int
 from vioframe_pose_graph.hamming import match
-from vioframe_pose_graph.place import Place
+from vioframe_pose_graph.place import Place, View
 from vioframe_pose_graph.two_point import ransac
 
 _MAX_DISTANCE, _RATIO = 64, 0.85
@@ -54,7 +54,10 @@ class Relation:
     inliers: int
 
 
-def relate(earlier: Place, later: Place, focal_px: float, reprojection_px: float, min_inliers: int) -> Relation | None:
+Seen = tuple[Place, View]
+
+
+def relate(earlier: Seen, later: Seen, focal_px: float, reprojection_px: float, min_inliers: int) -> Relation | None:
     """The relation of two keyframes by the points they share, or None where those do not agree on one."""
     tolerance = reprojection_px / focal_px
     seen = correspondences(earlier, later, _APART_PX / focal_px)
@@ -65,24 +68,25 @@ def relate(earlier: Place, later: Place, focal_px: float, reprojection_px: float
     )
     if support < min_inliers:
         return None
-    return _refined(seen, model, earlier.p_WB_seen, later.p_WB_seen, tolerance, min_inliers)
+    return _refined(seen, model, earlier[0].p_WB_seen, later[0].p_WB_seen, tolerance, min_inliers)
 
 
-def correspondences(earlier: Place, later: Place, apart: float) -> Correspondences:
+def correspondences(earlier: Seen, later: Seen, apart: float) -> Correspondences:
     """Match what has a position in one keyframe with all that the other saw, both ways."""
     sides = []
-    for source, target in ((later, earlier), (earlier, later)):
+    for source, target in ((later[1], earlier[1]), (earlier[1], later[1])):
         known = np.flatnonzero(np.isfinite(source.p_WF[:, 0]))
-        found = match(source.descriptors[known], target.descriptors, target.xy_normalised, _MAX_DISTANCE, _RATIO, apart)
+        xy = target.xy_normalised.astype(np.float64)
+        found = match(source.descriptors[known], target.descriptors, xy, _MAX_DISTANCE, _RATIO, apart)
         known, found = known[found >= 0], found[found >= 0]
         sides.append((source.p_WF[known], target.xy_normalised[found], known, found))
     (p_0, xy_0, later_0, earlier_0), (p_1, xy_1, earlier_1, later_1) = sides
     return Correspondences(
-        points=np.concatenate([p_0, p_1]),
-        xy=np.concatenate([xy_0, xy_1]),
+        points=np.concatenate([p_0, p_1]).astype(np.float64),
+        xy=np.concatenate([xy_0, xy_1]).astype(np.float64),
         side=np.repeat([0, 1], [len(p_0), len(p_1)]),
-        R_WC=np.stack([earlier.R_WC, later.R_WC]),
-        p_WC=np.stack([earlier.p_WC, later.p_WC]),
+        R_WC=np.stack([earlier[0].R_WC, later[0].R_WC]),
+        p_WC=np.stack([earlier[0].p_WC, later[0].p_WC]),
         pairs=np.concatenate([np.column_stack([earlier_0, later_0]), np.column_stack([earlier_1, later_1])]),
     )
 

@@ -13,7 +13,7 @@ def warm_up() -> None:
     """Call every kernel once with the types that it will be called with."""
     descriptors = np.zeros((2, 4), np.uint64)
     index = DescriptorIndex()
-    index.add(descriptors)
+    index.add(descriptors, 0)
     index.similarity(descriptors, 1)
     match(descriptors, descriptors, np.zeros((2, 2)), 1, 1.0, 1.0)
     side, cameras = np.zeros(2, np.int64), np.repeat(np.eye(3)[None], 2, axis=0)

@@ -12,19 +12,18 @@ from itertools import product
 
 import numpy as np
 
-from vioframe.bench.contenders import Contender
 from vioframe.bench.processes import installed, map_in_processes
-from vioframe.bench.results import backend_row
-from vioframe.bench.run import BackendRun, run_backend
+from vioframe.bench.run import BackendRun, backend_row, run_backend
 from vioframe.errors import ConfigError, TrajectoryError
 from vioframe.estimation.lifecycle import warm_up
 from vioframe.estimation.options import EstimationOptions
 from vioframe.evaluation.alignment import align_first
-from vioframe.evaluation.consistency import PARTS, Outcome, Trial
+from vioframe.evaluation.consistency import PARTS, Trial, Trials
 from vioframe.evaluation.nees import nees
 from vioframe.geometry.trajectory import Trajectory
 from vioframe.io.calibration import packaged_calibration
 from vioframe.parts import registry
+from vioframe.parts.config import PartConfig
 from vioframe.simulation import TrackSequence, simulated_sequence
 from vioframe.simulation.flights import flight as named_flight
 from vioframe.types import Float, Int
@@ -73,64 +72,60 @@ class Setup:
         )
 
 
-@dataclass(frozen=True, slots=True)
-class _Job:
-    setup: Setup
-    contender: Contender
-    seed: int
-
-
 def run_montecarlo(
     setups: Sequence[Setup],
-    contenders: Sequence[Contender],
+    backends: Mapping[str, PartConfig],
     seeds: int,
     *,
     workers: int = 1,
     on_trial: Callable[[Trial], None] = lambda trial: None,
-) -> list[Outcome]:
-    """Every contender on every setup with seeds 0 to ``seeds`` - 1; the results do not depend on ``workers``.
+) -> list[Trials]:
+    """Every back-end, by what it is called, on every setup with seeds 0 to ``seeds`` - 1.
 
-    ``on_trial`` is called with each trial as it comes. Raises what :func:`check_montecarlo` does.
+    The results do not depend on ``workers``. ``on_trial`` is called with each trial as it comes. Raises what
+    :func:`check_montecarlo` does.
     """
-    check_montecarlo(setups, contenders, seeds, workers)
-    cases = list(product(setups, contenders))
-    jobs = [_Job(setup, contender, seed) for setup, contender in cases for seed in range(seeds)]
-    trials = map_in_processes(_fly_job, jobs, workers, on_trial)
+    check_montecarlo(setups, backends, seeds, workers)
+    cases = list(product(setups, backends))
+    jobs = [(setup, backends[name], seed, name) for setup, name in cases for seed in range(seeds)]
+    flown = map_in_processes(_fly_job, jobs, workers, on_trial)
     return [
-        Outcome(
-            contender.name,
-            contender.backend,
-            dict(contender.options),
+        Trials(
+            name,
+            backends[name].name,
+            dict(backends[name].options),
             asdict(setup),
-            tuple(trials[k * seeds : (k + 1) * seeds]),
+            tuple(flown[k * seeds : (k + 1) * seeds]),
         )
-        for k, (setup, contender) in enumerate(cases)
+        for k, (setup, name) in enumerate(cases)
     ]
 
 
-def check_montecarlo(setups: Sequence[Setup], contenders: Sequence[Contender], seeds: int, workers: int) -> None:
+def check_montecarlo(setups: Sequence[Setup], backends: Mapping[str, PartConfig], seeds: int, workers: int) -> None:
     """Raise :class:`ConfigError` or :class:`PluginError` for what can be told before the first trial."""
     if seeds < 1 or workers < 1:
         raise ConfigError(f"needs at least one seed and one worker, got {seeds} and {workers}")
     calibration = packaged_calibration("euroc")
     for setup in setups:
         named_flight(setup.flight, setup.duration_s, calibration.cameras[0].R_BC)
-    for contender in contenders:
+    for part in backends.values():
         # Creating one also compiles its kernels, which the workers would do all at once.
-        backend = installed().create_backend(contender.backend, contender.options)
-        warm_up(backend, calibration)
+        warm_up(installed().create_backend(part.name, part.options), calibration)
 
 
 # The simulated IMU has the noise that its calibration states: there is no vibration.
 EXACT = EstimationOptions(imu_noise_factor=1.0)
 
 
-def fly(setup: Setup, contender: Contender, seed: int) -> Trial:
-    """One trial, on one core. What the back-end raises is a failure of the trial, not of the campaign."""
+def fly(setup: Setup, part: PartConfig, seed: int, name: str = "") -> Trial:
+    """One trial of the back-end ``part``, called ``name``, on one core.
+
+    What the back-end raises is a failure of the trial, not of the campaign.
+    """
     from threadpoolctl import threadpool_limits
 
     sequence = setup.sequence(seed)
-    backend = installed().create_backend(contender.backend, contender.options)
+    backend = installed().create_backend(part.name, part.options)
     # Small matrices; and sums in another order would be other results.
     with threadpool_limits(1):
         try:
@@ -138,8 +133,8 @@ def fly(setup: Setup, contender: Contender, seed: int) -> Trial:
         except Exception as error:
             if isinstance(error.__cause__, KeyboardInterrupt):
                 raise KeyboardInterrupt from error  # Ctrl-C within compiled code
-            return Trial(seed, setup.flight, contender.name, "crashed", registry.describe(error))
-        return judge(sequence, run, seed, contender.name)
+            return Trial(seed, setup.flight, name, "crashed", registry.describe(error))
+        return judge(sequence, run, seed, name)
 
 
 def judge(sequence: TrackSequence, run: BackendRun, seed: int, backend: str) -> Trial:
@@ -168,7 +163,8 @@ def nees_by_stretch(run: BackendRun, truth: Trajectory) -> tuple[Int, Mapping[st
 
     A filter counts its uncertainty of position and yaw from where it began, and begins anew where it was lost.
     """
-    found = [nees(align_first(piece, true).apply(piece), true) for piece, true in _against(run, truth)]
+    against = [(piece, truth.at(piece.t_ns)) for piece in run.stretches]
+    found = [nees(align_first(piece, true).apply(piece), true) for piece, true in against]
     pieces = [each for each in found if each]
     t_ns = np.concatenate([[], *(each[0].t_ns for each in pieces)]).astype(np.int64)
     return t_ns, {
@@ -176,9 +172,5 @@ def nees_by_stretch(run: BackendRun, truth: Trajectory) -> tuple[Int, Mapping[st
     }
 
 
-def _against(run: BackendRun, truth: Trajectory) -> list[tuple[Trajectory, Trajectory]]:
-    return [(piece, truth.at(piece.t_ns)) for piece in run.stretches]
-
-
-def _fly_job(job: _Job) -> Trial:
-    return fly(job.setup, job.contender, job.seed)
+def _fly_job(job: tuple[Setup, PartConfig, int, str]) -> Trial:
+    return fly(*job)

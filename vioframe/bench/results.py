@@ -8,44 +8,12 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from vioframe.bench.run import BackendRun
-from vioframe.evaluation import evaluate
 from vioframe.runs import machine
-from vioframe.simulation import TrackSequence
 
 if TYPE_CHECKING:
     from rich.table import Table
 
 Row = Mapping[str, Any]
-
-
-def backend_row(sequence: TrackSequence, run: BackendRun) -> Row:
-    """What a back-end's run on ``sequence`` amounts to; without a single state, only that it failed.
-
-    Errors are after alignment in position and yaw. ``percent`` is the root mean square error over the path flown from
-    the first state on.
-    """
-    row: dict[str, Any] = {
-        "sequence": sequence.name,
-        "frames": len(run.estimates),
-        "initialised_s": run.initialised_after_s,
-        "completion": run.completion,
-        "resets": run.resets,
-    }
-    if run.initialised_after_s is not None:
-        errors = evaluate(run.trajectory, sequence.ground_truth)
-        path_m = errors.truth.path_length_m
-        row |= {
-            "path_m": path_m,
-            "ate_m": errors.ate_m.rmse,
-            "percent": 100.0 * errors.ate_m.rmse / path_m if path_m > 0.0 else None,
-            "ate_se3_m": errors.ate_se3_m,
-            "scale": errors.scale,
-            "yaw_deg": errors.yaw_deg.rmse,
-            "orientation_deg": errors.orientation_deg.rmse,
-            "nees": {nees.part: nees.mean for nees in errors.nees},
-        }
-    return row | {"cpu_ms": 1e3 * float(run.cpu_seconds.mean()), "stage_ms": run.stage_ms}
 
 
 def table(title: str, rows: Sequence[Row], columns: Mapping[str, str]) -> Table:

@@ -1,4 +1,4 @@
-"""Running a back-end on tracks alone: no images, no front-end."""
+"""Running a back-end on tracks alone, no images and no front-end, and what that amounts to."""
 
 from __future__ import annotations
 
@@ -7,12 +7,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import groupby, pairwise
 from time import perf_counter, thread_time
+from typing import Any
 
 import numpy as np
 
 from vioframe.errors import TrajectoryError
 from vioframe.estimation.lifecycle import LifeCycle
 from vioframe.estimation.options import EstimationOptions
+from vioframe.evaluation import evaluate
 from vioframe.geometry.trajectory import Trajectory
 from vioframe.interfaces import Backend
 from vioframe.simulation import TrackSequence
@@ -111,3 +113,32 @@ def run_backend(
         cpu_seconds.append(thread_time() - cpu_begin)
     stamps = tuple(tracks.t_ns for _, tracks in sequence.packets)
     return BackendRun(stamps, tuple(estimates), np.array(seconds), np.array(cpu_seconds))
+
+
+def backend_row(sequence: TrackSequence, run: BackendRun) -> dict[str, Any]:
+    """What a back-end's run on ``sequence`` amounts to; without a single state, only that it failed.
+
+    Errors are after alignment in position and yaw. ``percent`` is the root mean square error over the path flown from
+    the first state on.
+    """
+    row: dict[str, Any] = {
+        "sequence": sequence.name,
+        "frames": len(run.estimates),
+        "initialised_s": run.initialised_after_s,
+        "completion": run.completion,
+        "resets": run.resets,
+    }
+    if run.initialised_after_s is not None:
+        errors = evaluate(run.trajectory, sequence.ground_truth)
+        path_m = errors.truth.path_length_m
+        row |= {
+            "path_m": path_m,
+            "ate_m": errors.ate_m.rmse,
+            "percent": 100.0 * errors.ate_m.rmse / path_m if path_m > 0.0 else None,
+            "ate_se3_m": errors.ate_se3_m,
+            "scale": errors.scale,
+            "yaw_deg": errors.yaw_deg.rmse,
+            "orientation_deg": errors.orientation_deg.rmse,
+            "nees": {nees.part: nees.mean for nees in errors.nees},
+        }
+    return row | {"cpu_ms": 1e3 * float(run.cpu_seconds.mean()), "stage_ms": run.stage_ms}

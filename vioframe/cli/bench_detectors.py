@@ -10,26 +10,22 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from vioframe.errors import ConfigError, DatasetError
+from vioframe.errors import ConfigError, DatasetError, PluginError
 
 if TYPE_CHECKING:
-    from rich.console import Group
+    import pandas as pd
 
     from vioframe.bench.detectors.entrants import Entrant, LineUp
-    from vioframe.bench.results import Row
     from vioframe.parts.registry import Registry
 
 _FILE = click.Path(path_type=Path)
-_WIDE = 1000
 _SPEED_IMAGES, _SPEED_ROUNDS, _FLIGHT_S = 8, 10, 10.0
-
 _USES = {
     "speed": ("images", "limit", "rounds"),
-    "quality": ("images", "hpatches", "limit", "degradations", "baseline", "workers"),
-    "frontend": ("dataset", "degradations", "baseline", "start", "duration", "ground_truth", "workers"),
+    "quality": ("images", "hpatches", "limit", "degradation", "baseline", "workers"),
+    "frontend": ("dataset", "degradation", "baseline", "start", "duration", "ground_truth", "workers"),
 }
 """Of the arguments that not every question has a use for, those that each has."""
-_ARGUMENTS = {"dataset": "DATASET", "degradations": "--degradation"}
 
 
 @dataclass(frozen=True)
@@ -38,13 +34,51 @@ class _Request:
     installed: Registry
     seed: int
     quiet: bool
+    given: dict[str, Any]
+    """Arguments of the one question by name."""
+
+    def __getitem__(self, name: str) -> Any:
+        return self.given[name]
+
+    @property
+    def workers(self) -> int:
+        from vioframe.bench.processes import usable_cores
+
+        return self["workers"] or usable_cores()
+
+    def line_up(self, *, describing: bool = False) -> LineUp:
+        """Those that can take part; asked for descriptors where these are of use."""
+        from vioframe.bench.detectors.entrants import line_up
+
+        entrants = [each.describing(self.installed) for each in self.entrants] if describing else self.entrants
+        return line_up(entrants, self.installed)
+
+    def baseline(self) -> str:
+        """The detector to lead over; raises :class:`ConfigError` where the one asked for does not take part."""
+        from vioframe.bench.detectors.tables import BASELINE
+
+        given, labels = self["baseline"], [entrant.label for entrant in self.entrants]
+        if given is not None and given not in labels:
+            raise ConfigError(f"--baseline {given} does not take part; one of {', '.join(labels)} can be led over")
+        return given or BASELINE
+
+    @contextmanager
+    def watch(self, what: str, total: int) -> Iterator[Callable[[int], None]]:
+        """A progress bar, to be told how many more are done."""
+        from rich.console import Console
+        from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+        columns = (BarColumn(bar_width=12), MofNCompleteColumn(), TextColumn(what), TimeRemainingColumn(compact=True))
+        with Progress(*columns, console=Console(stderr=True), disable=self.quiet) as progress:
+            task = progress.add_task("", total=total)
+            yield lambda count: progress.advance(task, count)
 
 
 @dataclass(frozen=True)
 class _Answer:
-    rows: Sequence[Row]
+    result: pd.DataFrame
     settings: dict[str, Any]
-    tables: Sequence[Group]
+    tables: Sequence[str]
     line_up: LineUp
 
 
@@ -61,9 +95,7 @@ class _Answer:
 @click.option(
     "--limit", type=click.IntRange(1), metavar="N", help=f"Images.  [default: {_SPEED_IMAGES} for speed, or all]"
 )
-@click.option(
-    "--degradation", "degradations", metavar="NAME", multiple=True, help="Degrade by this alone.  [default: each]"
-)
+@click.option("--degradation", metavar="NAME", multiple=True, help="Degrade by this alone.  [default: each]")
 @click.option("--baseline", metavar="NAME[:...]", help="State leads over this detector.  [default: shi_tomasi]")
 @click.option("--rounds", type=click.IntRange(1), metavar="N", help=f"Rounds to time.  [default: {_SPEED_ROUNDS}]")
 @click.option("--start", type=click.FloatRange(0.0), metavar="S", help="Skip the first S seconds of DATASET.")
@@ -83,7 +115,7 @@ def command(
     quiet: bool,
     **specific: Any,
 ) -> None:
-    """Compare detectors: by default their speed at 640 x 480 with 300 keypoints, as in the thesis' Table 3.2.
+    """Compare detectors: by default their speed at 640 x 480 with 300 keypoints.
 
     \b
     --quality   the HPatches protocol at 320 x 240 with 300 keypoints, on
@@ -94,26 +126,35 @@ def command(
 
     docs/bench_detectors.md says what the figures mean.
     """
-    from vioframe.bench.detectors.entrants import everyone, parse_entrants
-    from vioframe.bench.results import record
-    from vioframe.parts import registry
-
     if quality and frontend:
         raise ConfigError("--quality and --frontend are two questions; ask one at a time")
     question = "quality" if quality else "frontend" if frontend else "speed"
     given = _given(question, specific)
+    try:
+        import pandas as pd
+
+        from vioframe.bench.detectors.entrants import everyone, parse_entrants
+    except ModuleNotFoundError as error:
+        if error.name != "pandas":
+            raise
+        raise PluginError("comparing detectors needs pandas: pip install 'vioframe[bench]'") from error
+    from vioframe.bench.results import record
+    from vioframe.parts import registry
+
     installed = registry.load()
-    specs = detectors or everyone(installed, question)
-    request = _Request(parse_entrants(specs, options, installed), installed, seed, quiet)
-    questions: dict[str, Callable[..., _Answer]] = {"speed": _speed, "quality": _quality, "frontend": _frontend}
-    answer = questions[question](request, **given)
-    for table in answer.tables:
-        _print(table)
+    entrants = parse_entrants(detectors or everyone(installed, question), options, installed)
+    ask = {"speed": _speed, "quality": _quality, "frontend": _frontend}
+    answer = ask[question](_Request(entrants, installed, seed, quiet, given))
+    click.echo("\n\n".join(answer.tables))
     absent = answer.line_up.absent
     for label, reason in absent.items():
         click.echo(f"note: {label} does not take part: {reason}", err=True)
     if keep is not None:
-        rows = [*answer.rows, *({"detector": label, "absent": reason} for label, reason in absent.items())]
+        known = answer.result.astype(object).where(pd.notna(answer.result), None)
+        rows: list[Any] = [
+            *known.to_dict("records"),
+            *({"detector": label, "absent": reason} for label, reason in absent.items()),
+        ]
         taking_part = {entrant.label: dict(entrant.options) for entrant, _ in answer.line_up.ready}
         record(keep, rows, {"question": question, "seed": seed, **answer.settings, "detectors": taking_part})
         click.echo(f"written to {keep}")
@@ -125,106 +166,82 @@ def _given(question: str, specific: dict[str, Any]) -> dict[str, Any]:
         if value not in (None, ()) and name not in _USES[question]:
             use = " or ".join(f"--{other}" for other, uses in _USES.items() if name in uses and other != "speed")
             remedy = f"it goes with {use}" if use else "it is about speed alone"
-            argument = _ARGUMENTS.get(name, "--" + name.replace("_", "-"))
+            argument = "DATASET" if name == "dataset" else "--" + name.replace("_", "-")
             raise ConfigError(f"{argument} would do nothing here: {remedy}")
     return {name: specific[name] for name in _USES[question]}
 
 
-def _speed(request: _Request, images: Path | None, limit: int | None, rounds: int | None) -> _Answer:
+def _speed(asked: _Request) -> _Answer:
+    import pandas as pd
+
     from vioframe.bench.detectors import speed, tables
-    from vioframe.bench.detectors.entrants import line_up
     from vioframe.bench.detectors.images import evenly, find_images, fit, procedural_images, read_grey
 
-    limit, rounds = limit or _SPEED_IMAGES, rounds or _SPEED_ROUNDS
+    images, limit, rounds = asked["images"], asked["limit"] or _SPEED_IMAGES, asked["rounds"] or _SPEED_ROUNDS
     if images is None:
-        pictures, source = procedural_images(limit, speed.RESOLUTION, request.seed), "drawn surfaces"
+        pictures, source = procedural_images(limit, speed.RESOLUTION, asked.seed), "drawn surfaces"
     else:
         pictures = [fit(read_grey(path), speed.RESOLUTION) for path in evenly(find_images(images), limit)]
         source = images.name
-    lined_up = line_up(request.entrants, request.installed)
-    with _watch("rounds", rounds + 1, request.quiet) as on_done:
-        rows = speed.time_detectors(lined_up.ready, pictures, rounds, on_round=on_done)
+    lined_up = asked.line_up()
+    with asked.watch("rounds", rounds + 1) as on_done:
+        result = pd.DataFrame(speed.time_detectors(lined_up.ready, pictures, rounds, on_round=on_done))
     settings = speed.speed_settings(source, len(pictures), rounds)
-    return _Answer(rows, settings, [tables.speed_table(rows, lined_up.absent, settings)], lined_up)
+    heading = (
+        f"Frames a second at 640 x 480, {speed.MAX_POINTS} keypoints, one at a time, decoding excluded: "
+        f"{'; '.join(settings['devices'])}; {len(pictures)} images ({source}) in {rounds} rounds; median and quartiles"
+    )
+    return _Answer(result, settings, [f"{heading}\n{tables.overview(result, tables.SPEED)}"], lined_up)
 
 
-def _quality(
-    request: _Request,
-    images: Path | None,
-    hpatches: Path | None,
-    limit: int | None,
-    degradations: tuple[str, ...],
-    baseline: str | None,
-    workers: int | None,
-) -> _Answer:
+def _quality(asked: _Request) -> _Answer:
     from vioframe.bench.detectors import quality, tables
     from vioframe.bench.detectors.degradations import choose
-    from vioframe.bench.detectors.entrants import line_up
-    from vioframe.bench.detectors.images import evenly
-    from vioframe.bench.detectors.pairs import hpatches_pairs, synthetic_pairs
-    from vioframe.bench.processes import usable_cores
+    from vioframe.bench.detectors.images import evenly, hpatches_pairs, synthetic_pairs
 
+    images, hpatches = asked["images"], asked["hpatches"]
     if images is not None and hpatches is not None:
         raise ConfigError("--images and --hpatches are two sets of pairs; measure one at a time")
-    chosen, over = choose(degradations), _baseline(request, baseline)
+    chosen, over = choose(asked["degradation"]), asked.baseline()
     if images is not None:
-        pairs, source = synthetic_pairs(images, request.seed), f"{images.name}, synthetic homographies"
+        pairs, source = synthetic_pairs(images, asked.seed), f"{images.name}, synthetic homographies"
     elif hpatches is not None:
         pairs, source = hpatches_pairs(hpatches), "HPatches"
     else:
         raise DatasetError("no images given: --images DIR for any photographs, or --hpatches DIR")
-    pairs = evenly(pairs, limit)
-    lined_up = line_up([entrant.describing(request.installed) for entrant in request.entrants], request.installed)
+    pairs = evenly(pairs, asked["limit"])
+    lined_up = asked.line_up(describing=True)
     entrants = [entrant for entrant, _ in lined_up.ready]
-    with _watch("pairs", len(pairs), request.quiet) as on_done:
+    with asked.watch("pairs", len(pairs)) as on_done:
         scores = quality.score_detectors(
-            entrants, pairs, chosen, seed=request.seed, workers=workers or usable_cores(), on_pairs=on_done
+            entrants, pairs, chosen, seed=asked.seed, workers=asked.workers, on_pairs=on_done
         )
-    rows = quality.quality_rows(scores, over)
-    settings = {
-        "pairs": source,
-        "pair_count": len(pairs),
-        "resolution": quality.RESOLUTION,
-        "top_k": quality.TOP_K,
-        "baseline": over,
-    }
-    shown = [tables.quality_table(rows, settings), *tables.sweep_tables(rows, chosen, "quality", over)]
-    return _Answer(rows, settings, shown, lined_up)
+    settings = {"pairs": source, "pair_count": len(pairs), "resolution": quality.RESOLUTION, "top_k": quality.TOP_K}
+    heading = (
+        f"Found again: {len(pairs)} pairs ({source}), 320 x 240, the {quality.TOP_K} strongest in both views, within "
+        "3 px; mean and standard deviation over pairs"
+    )
+    result = quality.summary(scores, over)
+    return _Answer(result, {**settings, "baseline": over}, tables.swept("quality", heading, result, over), lined_up)
 
 
-def _frontend(
-    request: _Request,
-    dataset: Path | None,
-    degradations: tuple[str, ...],
-    baseline: str | None,
-    start: float | None,
-    duration: float | None,
-    ground_truth: Path | None,
-    workers: int | None,
-) -> _Answer:
+def _frontend(asked: _Request) -> _Answer:
     from vioframe.bench.detectors import flight, tables
     from vioframe.bench.detectors.degradations import choose
-    from vioframe.bench.detectors.entrants import line_up
-    from vioframe.bench.processes import usable_cores
 
-    if dataset is None:
+    if asked["dataset"] is None:
         raise DatasetError(
             "no recording given: `vioframe bench detectors --frontend DATASET`; `vioframe simulate` makes some"
         )
-    chosen, over = choose(degradations), _baseline(request, baseline)
-    stretch = flight.Stretch(dataset, start or 0.0, _FLIGHT_S if duration is None else duration, ground_truth)
-    name = flight.check(stretch, request.installed)
-    lined_up = line_up(request.entrants, request.installed)
+    chosen, over = choose(asked["degradation"]), asked.baseline()
+    duration_s = _FLIGHT_S if asked["duration"] is None else asked["duration"]
+    stretch = flight.Stretch(asked["dataset"], asked["start"] or 0.0, duration_s, asked["ground_truth"])
+    name = flight.check(stretch, asked.installed)
+    lined_up = asked.line_up()
     entrants = [entrant for entrant, _ in lined_up.ready]
-    with _watch("flights", len(chosen), request.quiet) as on_done:
-        rows = flight.fly_detectors(
-            entrants,
-            stretch,
-            chosen,
-            seed=request.seed,
-            workers=workers or usable_cores(),
-            baseline=over,
-            on_flight=on_done,
+    with asked.watch("flights", len(chosen)) as on_done:
+        result = flight.fly_detectors(
+            entrants, stretch, chosen, seed=asked.seed, workers=asked.workers, baseline=over, on_flight=on_done
         )
     settings = {
         "dataset": name,
@@ -234,38 +251,8 @@ def _frontend(
         "epipolar_baseline_frames": flight.BASELINE_FRAMES,
         "epipolar_inlier_px": flight.INLIER_PX,
     }
-    shown = [tables.frontend_table(rows, settings), *tables.sweep_tables(rows, chosen, "frontend", over)]
-    return _Answer(rows, settings, shown, lined_up)
-
-
-def _baseline(request: _Request, given: str | None) -> str:
-    """The detector to lead over; raises :class:`ConfigError` where the one asked for does not take part."""
-    from vioframe.bench.detectors.leads import BASELINE
-
-    labels = [entrant.label for entrant in request.entrants]
-    if given is not None and given not in labels:
-        raise ConfigError(f"--baseline {given} does not take part; one of {', '.join(labels)} can be led over")
-    return given or BASELINE
-
-
-@contextmanager
-def _watch(what: str, total: int, quiet: bool) -> Iterator[Callable[[int], None]]:
-    """A progress bar, to be told how many more are done."""
-    if quiet:
-        yield lambda count: None
-        return
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
-    columns = (BarColumn(bar_width=12), MofNCompleteColumn(), TextColumn(what), TimeRemainingColumn(compact=True))
-    with Progress(*columns, console=Console(stderr=True)) as progress:
-        task = progress.add_task("", total=total)
-        yield lambda count: progress.advance(task, count)
-
-
-def _print(table: Group) -> None:
-    from rich.console import Console
-
-    console = Console()
-    # Into a file or a pipe the table goes whole: rich would fold it at 80 columns.
-    (console if console.is_terminal else Console(width=_WIDE)).print(table)
+    heading = (
+        f"Followed by the front-end: {name}, {stretch.duration_s:g} s after the first {stretch.start_s:g} s; inliers "
+        f"within {flight.INLIER_PX:g} px of the true epipolar line over {flight.BASELINE_FRAMES} frames"
+    )
+    return _Answer(result, settings, tables.swept("frontend", heading, result, over), lined_up)

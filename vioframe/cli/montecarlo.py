@@ -2,18 +2,13 @@
 
 from __future__ import annotations
 
-from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from vioframe.evaluation.consistency import Trial
-
-_WIDE = 1000
 
 
 @click.command("montecarlo")
@@ -22,7 +17,7 @@ _WIDE = 1000
     "backends",
     metavar="NAME[:KEY=VALUE,...]",
     multiple=True,
-    default=("msckf:imu_noise_factor=1",),
+    default=("msckf",),
     show_default=True,
     help="Estimator, with options of its own; repeat to compare.",
 )
@@ -44,7 +39,6 @@ _WIDE = 1000
     "--outliers", type=float, metavar="PART", default=0.0, show_default=True, help="Observations that are 5-30 px off."
 )
 @click.option("--max-points", type=int, default=150, show_default=True, help="Landmarks in view.")
-@click.option("-o", "--option", "options", metavar="KEY=VALUE", multiple=True, help="Set an option of all back-ends.")
 @click.option("--workers", type=int, help="Processes.  [default: one a core]")
 @click.option("--out", type=click.Path(path_type=Path), help="Folder.  [default: runs/montecarlo]")
 @click.option("--overwrite", is_flag=True, help="Replace the results that are in --out.")
@@ -52,7 +46,6 @@ _WIDE = 1000
 def command(
     backends: tuple[str, ...],
     flights: tuple[str, ...],
-    options: tuple[str, ...],
     seeds: int,
     workers: int | None,
     out: Path | None,
@@ -65,12 +58,15 @@ def command(
     Landmarks instead of images, EuRoC's camera and IMU noise, true calibration, the back-end's own initialisation. A
     trial that fails counts and is shown. docs/montecarlo.md says how to read the table and the plots.
     """
-    from vioframe.bench.contenders import parse_contenders
     from vioframe.bench.montecarlo import Setup, check_montecarlo, run_montecarlo
     from vioframe.bench.processes import usable_cores
     from vioframe.bench.results import record
+    from vioframe.cli.progress import print_table, progress_bar
     from vioframe.parts import registry
-    from vioframe.report.montecarlo import MARKER, to_rich, write_files
+    from vioframe.parts.config import PartConfig, parse_part
+    from vioframe.parts.registry import BACKEND
+    from vioframe.report.montecarlo import MARKER, figures, write_files
+    from vioframe.report.tables import to_rich
     from vioframe.runs.recorder import check_run_folder, free_run_folder, new_run_folder
 
     if out is not None:
@@ -79,35 +75,33 @@ def command(
         Setup(flight, sensors["duration"], sensors["pixel_sigma"], sensors["outliers"], sensors["max_points"])
         for flight in dict.fromkeys(flights)
     ]
-    contenders = parse_contenders(backends, options, registry.load())
+    installed = registry.load()
+    parts = {spec: parse_part(spec, BACKEND, installed) for spec in backends}
+    complete = {
+        spec: PartConfig(name=part.name, options=installed.find(BACKEND, part.name).validate(part.options))
+        for spec, part in parts.items()
+    }
     workers = usable_cores() if workers is None else workers
-    check_montecarlo(setups, contenders, seeds, workers)  # before there is a bar: an error is one line and nothing else
-    with _watch(len(setups) * len(contenders) * seeds, quiet) as on_trial:
-        outcomes = run_montecarlo(setups, contenders, seeds, workers=workers, on_trial=on_trial)
-    _print(to_rich(outcomes))
-    for outcome in outcomes:
-        for note in outcome.notes():
+    check_montecarlo(setups, complete, seeds, workers)  # before there is a bar: an error is one line and nothing else
+    with progress_bar(quiet=quiet) as progress:
+        task = progress.add_task("", total=len(setups) * len(complete) * seeds, figures="first trials under way")
+        failed = 0
+
+        def on_trial(trial: Trial) -> None:
+            nonlocal failed
+            failed += trial.failure is not None
+            went = trial.failure or f"{trial.figures['ate_m']:.3f} m, {trial.figures['orientation_deg']:.2f} deg"
+            progress.update(task, advance=1, figures=f"{failed} failed, seed {trial.seed}: {went}")
+
+        cases = run_montecarlo(setups, complete, seeds, workers=workers, on_trial=on_trial)
+    print_table(to_rich(figures(cases)))
+    for case in cases:
+        for note in case.notes():
             click.echo(f"note: {note}", err=True)
     # Last: what was found is shown even where the disk is full.
     folder = out or free_run_folder(Path("runs"), "montecarlo")
     new_run_folder(folder, overwrite=overwrite, marker=MARKER)
-    settings = {"backends": backends, "options": options, "flights": flights, "seeds": seeds, **sensors}
-    write_files(outcomes, folder)
-    record(folder / MARKER, [outcome.to_dict() for outcome in outcomes], settings)
+    write_files(cases, folder)
+    settings = {"backends": backends, "flights": flights, "seeds": seeds, **sensors}
+    record(folder / MARKER, [case.to_dict() for case in cases], settings)
     click.echo(f"written to {folder}: {', '.join(sorted(path.name for path in folder.iterdir()))}")
-
-
-def _watch(trials: int, quiet: bool) -> AbstractContextManager[Callable[[Trial], None]]:
-    if quiet:
-        return nullcontext(lambda trial: None)
-    from vioframe.cli.trial_progress import TrialProgress
-
-    return TrialProgress(trials)
-
-
-def _print(table: Any) -> None:
-    from rich.console import Console
-
-    console = Console()
-    # Into a file or a pipe the table goes whole: rich would fold it at 80 columns.
-    (console if console.is_terminal else Console(width=_WIDE)).print(table)

@@ -91,7 +91,7 @@ class AverageNees:
 
 
 @dataclass(frozen=True, eq=False)
-class Outcome:
+class Trials:
     """All trials of one back-end, ``name`` with its ``options``, on one ``setup``, in the order of their seeds."""
 
     name: str

@@ -27,9 +27,9 @@ class FrontendOptions:
     klt_levels: int = 4
     """Pyramid levels above the full image."""
     rejection: Rejection = "magsac"
-    """Epipolar outlier rejection: magsac (essential matrix by MAGSAC++), fundamental (fundamental matrix by RANSAC, asks
-    less of the calibration), two_point (rotation from the gyroscope; magsac where nobody knows how the camera is
-    turned) or none."""
+    """Epipolar outlier rejection: magsac (essential matrix by MAGSAC++), fundamental (fundamental matrix by RANSAC, it
+    asks less of the calibration), two_point (rotation from the gyroscope; magsac where nobody knows how the camera
+    is turned) or none."""
     rejection_px: float = 0.7
     """Largest distance of an inlier from the epipolar geometry, scaled by the focal length."""
     refill_below: float = 0.9

@@ -12,13 +12,11 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from heapq import merge
 from pathlib import Path
 
 from vioframe.errors import DatasetError
 from vioframe.geometry.trajectory import Trajectory
 from vioframe.io.calibration import sidecar_folder, write_calibration
-from vioframe.io.trajectories import true_values
 from vioframe.io.writers import AslWriter, McapWriter, RecordingWriter, Ros1Writer, Ros2Writer
 from vioframe.types import Calibration, FrameSet, ImuSample, Measurement, Unreadable
 
@@ -89,7 +87,8 @@ def convert(
         raise DatasetError(f"{format} offers no compression {compression!r}; it has: {', '.join(offered) or 'none'}")
     with appearing(destination) as unfinished:
         camera_names = [camera.name for camera in calibration.cameras]
-        counts = _write(measurements, truth, FORMATS[format].open(unfinished, compression, camera_names))
+        with FORMATS[format].open(unfinished, compression, camera_names) as writer:
+            counts = write_recording(measurements, truth, [writer])
         if not counts.frames or not counts.imu_samples:
             raise DatasetError(f"nothing to write to {destination}: the source has no readable frame or no IMU sample")
         if format == "asl":
@@ -99,26 +98,22 @@ def convert(
     return counts
 
 
-@dataclass(frozen=True, slots=True)
-class _TrueRow:
-    t_ns: int
-    values: list[float]
-
-
-def _write(measurements: Iterable[Measurement], truth: Trajectory | None, writer: RecordingWriter) -> Conversion:
-    rows = () if truth is None else map(_TrueRow, truth.t_ns.tolist(), true_values(truth).tolist())
+def write_recording(
+    measurements: Iterable[Measurement], truth: Trajectory | None, writers: Sequence[RecordingWriter]
+) -> Conversion:
+    """Hand everything to each of ``writers``."""
     counts: Counter[type] = Counter()
-    items: Iterator[Measurement | _TrueRow] = merge(measurements, rows, key=lambda item: item.t_ns)
-    with writer:
-        for item in items:
-            if isinstance(item, FrameSet):
-                writer.write_frame(item)
-            elif isinstance(item, ImuSample):
-                writer.write_imu(item)
-            elif isinstance(item, _TrueRow):
-                writer.write_true_values(item.t_ns, item.values)
-            counts[type(item)] += 1
-    return Conversion(*(counts[kind] for kind in (FrameSet, ImuSample, _TrueRow, Unreadable)))
+    for writer in writers:
+        if truth is not None:
+            writer.write_truth(truth)
+    for measurement in measurements:
+        for writer in writers:
+            if isinstance(measurement, FrameSet):
+                writer.write_frame(measurement)
+            elif isinstance(measurement, ImuSample):
+                writer.write_imu(measurement)
+        counts[type(measurement)] += 1
+    return Conversion(counts[FrameSet], counts[ImuSample], 0 if truth is None else len(truth), counts[Unreadable])
 
 
 @contextmanager

@@ -1,6 +1,6 @@
 """Images of any kind a recording may hold -> the (H, W) uint8 that a :class:`~vioframe.types.FrameSet` carries.
 
-A reader makes a set of each image as it comes (:func:`single`); :func:`gathered` joins those of one stamp.
+A reader makes a set of each image as it comes (:func:`frame_set`); :func:`gathered` joins those of one stamp.
 """
 
 from __future__ import annotations
@@ -12,8 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vioframe.errors import DatasetError
-from vioframe.geometry.cameras import Camera
-from vioframe.types import FrameSet, Image, Measurement
+from vioframe.types import Calibration, FrameSet, Image, Measurement
 
 # How many measurements may follow an image before those of the other cameras at its instant are no longer waited for:
 # half a second of two cameras at 20 Hz and an IMU at 200 Hz.
@@ -58,9 +57,23 @@ def check_bit_depth(bit_depth: int | None) -> None:
         raise DatasetError(f"bit_depth must lie between 8 and 16, not {bit_depth}")
 
 
-def single(t_ns: int, image: Image, place: int, cameras: int) -> FrameSet:
-    """What the camera at ``place`` in a rig of so many ``cameras`` took, as a set without the others."""
-    return FrameSet(t_ns, tuple(image if i == place else None for i in range(cameras)))
+def frame_set(
+    t_ns: int, image: NDArray[Any], place: int, calibration: Calibration, bit_depth: int | None, where: str
+) -> FrameSet:
+    """What the camera at ``place`` in a rig took, as a set without the others; for the image see :func:`to_gray8`.
+
+    Raises :class:`~vioframe.errors.DatasetError` where it is not of the size that the camera was calibrated for.
+    """
+    gray = to_gray8(image, bit_depth, where)
+    height, width = gray.shape
+    resolution = calibration.cameras[place].model.resolution
+    if (width, height) != resolution:
+        calibrated = "x".join(map(str, resolution))
+        raise DatasetError(
+            f"{where} has images of {width}x{height}, but the calibration is for {calibrated}; "
+            "name the right one with the reader's option calibration"
+        )
+    return FrameSet(t_ns, tuple(gray if i == place else None for i in range(len(calibration.cameras))))
 
 
 def gathered(measurements: Iterable[Measurement]) -> Iterator[Measurement]:
@@ -93,14 +106,3 @@ def _joined(frames: FrameSet, held: list[Measurement]) -> bool:
                 held[i] = FrameSet(frames.t_ns, tuple(another if one is None else one for one, another in pairs))
                 return True
     return False
-
-
-def check_size(image: Image, camera: Camera, where: str) -> None:
-    """Raise :class:`~vioframe.errors.DatasetError` where ``image`` is not of the size ``camera`` was calibrated for."""
-    height, width = image.shape
-    if (width, height) != camera.resolution:
-        calibrated = "x".join(map(str, camera.resolution))
-        raise DatasetError(
-            f"{where} has images of {width}x{height}, but the calibration is for {calibrated}; "
-            "name the right one with the reader's option calibration"
-        )

@@ -17,7 +17,6 @@ from numpy.typing import ArrayLike
 
 from vioframe.errors import DatasetError
 from vioframe.geometry.trajectory import Trajectory
-from vioframe.io.images import check_size
 from vioframe.types import Calibration, Float, FrameSet, Image, ImuSample, Int, Measurement
 
 
@@ -79,7 +78,9 @@ class ArrayDataset:
                 image = np.asarray(image).view()
                 if image.ndim != 2 or image.dtype != np.uint8:
                     raise DatasetError(f"{where} must be (H, W) uint8, got {image.shape} {image.dtype}")
-                check_size(image, camera.model, where)
+                if image.shape[::-1] != camera.model.resolution:
+                    size, calibrated = ("x".join(map(str, of)) for of in (image.shape[::-1], camera.model.resolution))
+                    raise DatasetError(f"{where} must be of the calibrated size {calibrated}, got {size}")
                 image.flags.writeable = False
             checked.append(image)
         return checked

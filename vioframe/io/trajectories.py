@@ -11,14 +11,12 @@ from __future__ import annotations
 import gzip
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from decimal import Decimal, InvalidOperation
-from itertools import compress
 from pathlib import Path
 from typing import Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from vioframe.errors import TrajectoryError
 from vioframe.geometry import so3
@@ -28,13 +26,21 @@ from vioframe.types import NS_PER_S, Float, Int
 _GZIP_MAGIC = b"\x1f\x8b"
 _MOTION_CAPTURE = re.compile(r"vicon|leica", re.IGNORECASE)
 _EUROC_COLUMNS = (8, 11, 17)
+_EUROC_HEADING = (
+    "#timestamp",
+    *(f" p_RS_R_{axis} [m]" for axis in "xyz"),
+    *(f" q_RS_{part} []" for part in "wxyz"),
+    *(f" v_RS_R_{axis} [m s^-1]" for axis in "xyz"),
+    *(f" b_w_RS_S_{axis} [rad s^-1]" for axis in "xyz"),
+    *(f" b_a_RS_S_{axis} [m s^-2]" for axis in "xyz"),
+)
 _QUAT_NORM_TOLERANCE = 0.01
 _INT64_MAX = 2**63 - 1
 
 
 @dataclass(frozen=True, eq=False)
 class TrueTrajectory(Trajectory):
-    """A trajectory that keeps what EuRoC's ground truth knows beside poses, and its numbers as they were given.
+    """A trajectory that knows velocity and biases too, as EuRoC's ground truth does, and keeps numbers as given.
 
     ``values`` (N, 7, 10 or 16) are ``p_WB`` and the quaternion wxyz (of any norm), then ``v_WB`` m/s, then
     ``bias_gyro_B`` rad/s and ``bias_accel_B`` m/s^2: the columns of EuRoC's file behind the stamp.
@@ -69,10 +75,6 @@ class _Table:
     def error(self, row: int, problem: str) -> TrajectoryError:
         return TrajectoryError(f"{self.name}, line {self.lines[row]}: {problem}")
 
-    def keep(self, mask: NDArray[np.bool_]) -> _Table:
-        lines = list(compress(self.lines, mask))
-        return replace(self, lines=lines, rows=list(compress(self.rows, mask)))
-
 
 def load_trajectory(
     path: str | Path, *, complete_lines_only: bool = False, keep_first_of_repeats: bool = False
@@ -88,7 +90,7 @@ def load_trajectory(
     text = _read_text(path)
     if complete_lines_only:
         text = text[: text.rfind("\n") + 1]
-    table = _split(path.name, text)
+    table = _split(path.name, text, keep_first_of_repeats)
     _refuse_motion_capture(path, table)
     columns = len(table.rows[0])
     if table.comma_separated and columns in _EUROC_COLUMNS:
@@ -99,9 +101,6 @@ def load_trajectory(
         raise table.error(0, f"{columns} columns are neither TUM (8, blanks) nor EuRoC (8, 11 or 17, commas)")
     t_ns = _stamps(table, unit)
     values = _values(table)
-    if keep_first_of_repeats:
-        keep = np.diff(t_ns, prepend=t_ns[0] - 1) != 0
-        t_ns, values, table = t_ns[keep], values[keep], table.keep(keep)
     _check_order(table, t_ns)
     quat = values[:, quat_columns]
     off = np.abs(np.linalg.norm(quat, axis=1) - 1.0) > _QUAT_NORM_TOLERANCE
@@ -127,6 +126,18 @@ def write_tum(trajectory: Trajectory, path: str | Path) -> None:
     path.write_bytes(data)
 
 
+def write_euroc(trajectory: Trajectory, path: str | Path) -> None:
+    """Write ``trajectory`` as a EuRoC csv of 17, 11 or 8 columns, as many as it knows; numbers read back equal."""
+    values = true_values(trajectory)
+    heading = ",".join(_EUROC_HEADING[: 1 + values.shape[1]])
+    if values.shape[1] == 7:
+        # Poses alone under EuRoC's names are its raw motion capture, which is refused as a truth.
+        heading = heading.replace("RS_R", "WB")
+    rows = zip(trajectory.t_ns.tolist(), values.tolist(), strict=True)
+    lines = (",".join([str(t_ns), *map(repr, row)]) + "\n" for t_ns, row in rows)
+    Path(path).write_text(heading + "\n" + "".join(lines), encoding="utf-8")
+
+
 def _tum_line(t_ns: int, p_WB: Float, quat_xyzw: Float) -> str:
     seconds, nanoseconds = divmod(abs(t_ns), NS_PER_S)
     stamp = f"{'-' if t_ns < 0 else ''}{seconds}.{nanoseconds:09d}"
@@ -148,7 +159,7 @@ def _read_text(path: Path) -> str:
         raise TrajectoryError(f"{path}: cannot be read ({error}); give a TUM or EuRoC trajectory") from None
 
 
-def _split(name: str, text: str) -> _Table:
+def _split(name: str, text: str, keep_first_of_repeats: bool) -> _Table:
     header = ""
     comma_separated = False
     lines: list[int] = []
@@ -163,12 +174,14 @@ def _split(name: str, text: str) -> _Table:
         if not rows:
             comma_separated = "," in line
         # VINS-Mono ends each line of its csv with a comma.
-        rows.append(line.rstrip(",").split(",") if comma_separated else line.split())
-        lines.append(number)
-        if len(rows[-1]) != len(rows[0]):
+        fields = line.rstrip(",").split(",") if comma_separated else line.split()
+        if rows and len(fields) != len(rows[0]):
             raise TrajectoryError(
-                f"{name}, line {number}: {len(rows[-1])} columns where line {lines[0]} has {len(rows[0])}"
+                f"{name}, line {number}: {len(fields)} columns where line {lines[0]} has {len(rows[0])}"
             )
+        if not (keep_first_of_repeats and rows and fields[0] == rows[-1][0]):
+            rows.append(fields)
+            lines.append(number)
     if not rows:
         raise TrajectoryError(f"{name}: holds no poses; give a TUM or EuRoC trajectory")
     return _Table(name, header, comma_separated, lines, rows)

@@ -6,14 +6,14 @@ import shutil
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Protocol, Self, TextIO
+from typing import Any, Self, TextIO
 
 import numpy as np
 
 from vioframe.errors import DatasetError
-from vioframe.geometry import so3
-from vioframe.types import NS_PER_S, Float, FrameSet, Image, ImuSample, NavState
+from vioframe.geometry.trajectory import Trajectory
+from vioframe.io.trajectories import true_values, write_euroc
+from vioframe.types import NS_PER_S, Float, FrameSet, Image, ImuSample
 
 IMU_TOPIC = "/imu0"
 GROUND_TRUTH_TOPIC = "/vioframe/ground_truth"
@@ -33,72 +33,30 @@ _IMU_HEADING = (
     "#timestamp [ns],w_RS_S_x [rad s^-1],w_RS_S_y [rad s^-1],w_RS_S_z [rad s^-1],"
     "a_RS_S_x [m s^-2],a_RS_S_y [m s^-2],a_RS_S_z [m s^-2]\n"
 )
-_TRUTH_HEADING = (
-    "#timestamp",
-    *(f" p_RS_R_{axis} [m]" for axis in "xyz"),
-    *(f" q_RS_{part} []" for part in "wxyz"),
-    *(f" v_RS_R_{axis} [m s^-1]" for axis in "xyz"),
-    *(f" b_w_RS_S_{axis} [rad s^-1]" for axis in "xyz"),
-    *(f" b_a_RS_S_{axis} [m s^-2]" for axis in "xyz"),
-)
 
 
-class RecordingWriter(Protocol):
+class RecordingWriter(ABC):
     """A recording being written; leaving its context completes it."""
 
-    def __enter__(self) -> Self: ...
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None: ...
-
-    def write_frame(self, frames: FrameSet) -> None:
-        """The images there are, of the cameras in the order that the writer was told."""
-        ...
-
-    def write_imu(self, sample: ImuSample) -> None: ...
-
-    def write_truth(self, state: NavState) -> None:
-        """A true state: velocity and biases as far as it knows them (they are not NaN)."""
-        ...
-
-    def write_true_values(self, t_ns: int, values: Sequence[float]) -> None:
-        """The same as a row of :attr:`vioframe.io.trajectories.TrueTrajectory.values`."""
-        ...
-
-
-class _TruthWriter(ABC):
-    """True states to rows."""
-
-    def write_truth(self, state: NavState) -> None:
-        x, y, z, w = so3.to_quat_xyzw(state.R_WB).tolist()
-        known = np.concatenate([state.v_WB, state.bias_gyro_B, state.bias_accel_B])
-        self.write_true_values(state.t_ns, [*state.p_WB.tolist(), w, x, y, z, *known[np.isfinite(known)].tolist()])
+    def __enter__(self) -> Self:
+        return self
 
     @abstractmethod
-    def write_true_values(self, t_ns: int, values: Sequence[float]) -> None: ...
+    def __exit__(self, *error: object) -> None: ...
+
+    @abstractmethod
+    def write_truth(self, truth: Trajectory) -> None:
+        """All of the ground truth, with velocity and biases where it is a ``TrueTrajectory``."""
+
+    @abstractmethod
+    def write_frame(self, frames: FrameSet) -> None:
+        """The images there are, of the cameras in the order that the writer was told."""
+
+    @abstractmethod
+    def write_imu(self, sample: ImuSample) -> None: ...
 
 
-class TruthFile(_TruthWriter):
-    """A ground-truth file of EuRoC's, with as many columns as its first row has."""
-
-    def __init__(self, path: Path) -> None:
-        self._file = path.open("w", encoding="utf-8")
-        self._columns = 0
-
-    def write_true_values(self, t_ns: int, values: Sequence[float]) -> None:
-        if not self._columns:
-            self._columns = 1 + len(values)
-            heading = ",".join(_TRUTH_HEADING[: self._columns])
-            # Poses alone under EuRoC's names are its raw motion capture, which no reader takes for the truth.
-            self._file.write((heading.replace("RS_R", "WB") if self._columns == 8 else heading) + "\n")
-        self._file.write(_row(t_ns, values[: self._columns - 1]))
-
-    def close(self) -> None:
-        self._file.close()
-
-
-class AslWriter(_TruthWriter):
+class AslWriter(RecordingWriter):
     """An ASL folder: in ``mav0`` a folder of lossless images for each camera, ``imu0``, and
     ``state_groundtruth_estimate0`` where the truth is known; numbers are written so as to read back equal."""
 
@@ -110,24 +68,16 @@ class AslWriter(_TruthWriter):
             self._cameras.append((self._mav0 / name / "data", self._begin(name, _FRAME_HEADING)))
         (self._mav0 / "imu0").mkdir()
         self._imu = self._begin("imu0", _IMU_HEADING)
-        self._truth: TruthFile | None = None
 
     def _begin(self, sensor: str, heading: str) -> TextIO:
         file = (self._mav0 / sensor / "data.csv").open("w", encoding="utf-8")
         file.write(heading)
         return file
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         for _, file in self._cameras:
             file.close()
         self._imu.close()
-        if self._truth is not None:
-            self._truth.close()
 
     def write_frame(self, frames: FrameSet) -> None:
         import cv2
@@ -140,17 +90,16 @@ class AslWriter(_TruthWriter):
                 file.write(f"{frames.t_ns},{frames.t_ns}.png\n")
 
     def write_imu(self, sample: ImuSample) -> None:
-        self._imu.write(_row(sample.t_ns, [*sample.gyro_B.tolist(), *sample.accel_B.tolist()]))
+        readings = [*sample.gyro_B.tolist(), *sample.accel_B.tolist()]
+        self._imu.write(",".join([str(sample.t_ns), *map(repr, readings)]) + "\n")
 
-    def write_true_values(self, t_ns: int, values: Sequence[float]) -> None:
-        if self._truth is None:
-            folder = self._mav0 / "state_groundtruth_estimate0"
-            folder.mkdir()
-            self._truth = TruthFile(folder / "data.csv")
-        self._truth.write_true_values(t_ns, values)
+    def write_truth(self, truth: Trajectory) -> None:
+        folder = self._mav0 / "state_groundtruth_estimate0"
+        folder.mkdir()
+        write_euroc(truth, folder / "data.csv")
 
 
-class _RosWriter(_TruthWriter):
+class _RosWriter(RecordingWriter):
     """What ROS 1 and ROS 2 have in common: messages, and a time of recording that keeps them in the order they came."""
 
     def __init__(
@@ -170,13 +119,8 @@ class _RosWriter(_TruthWriter):
         for name in camera_names:
             self._connect(_image_topic(name), _IMAGE)
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._bag.__exit__(kind, error, trace)
+    def __exit__(self, *error: object) -> None:
+        self._bag.__exit__(*error)
 
     def write_frame(self, frames: FrameSet) -> None:
         for name, image in zip(self._camera_names, frames.images, strict=True):
@@ -194,7 +138,7 @@ class _RosWriter(_TruthWriter):
             step=width,
             data=np.ascontiguousarray(image).ravel(),
         )
-        self._write(_image_topic(camera_name), t_ns, message)
+        self._write_in_order(_image_topic(camera_name), t_ns, message)
 
     def write_imu(self, sample: ImuSample) -> None:
         # A first covariance of -1 says that there is no orientation; zeros say that a covariance is not known.
@@ -209,25 +153,30 @@ class _RosWriter(_TruthWriter):
             linear_acceleration=self._vector(sample.accel_B),
             linear_acceleration_covariance=np.zeros(9),
         )
-        self._write(IMU_TOPIC, sample.t_ns, message)
+        self._write_in_order(IMU_TOPIC, sample.t_ns, message)
 
-    def write_true_values(self, t_ns: int, values: Sequence[float]) -> None:
-        x, y, z, qw, qx, qy, qz = map(float, values[:7])
-        pose = self._types["geometry_msgs/msg/Pose"](
-            position=self._types["geometry_msgs/msg/Point"](x=x, y=y, z=z),
-            orientation=self._types["geometry_msgs/msg/Quaternion"](x=qx, y=qy, z=qz, w=qw),
-        )
-        message = self._types[_POSE](header=self._header(t_ns, "world"), pose=pose)
-        self._write(GROUND_TRUTH_TOPIC, t_ns, message)
-        vectors = np.reshape(values[7:], ((len(values) - 7) // 3, 3))
-        for topic, frame_id, vector in zip(TRUE_VECTOR_TOPICS, ("world", "imu0", "imu0"), vectors, strict=False):
-            message = self._types[_VECTOR](header=self._header(t_ns, frame_id), vector=self._vector(vector))
-            self._write(topic, t_ns, message)
+    def write_truth(self, truth: Trajectory) -> None:
+        point, quaternion = self._types["geometry_msgs/msg/Point"], self._types["geometry_msgs/msg/Quaternion"]
+        for t_ns, values in zip(truth.t_ns.tolist(), true_values(truth), strict=True):
+            x, y, z, qw, qx, qy, qz = values[:7].tolist()
+            pose = self._types["geometry_msgs/msg/Pose"](
+                position=point(x=x, y=y, z=z), orientation=quaternion(x=qx, y=qy, z=qz, w=qw)
+            )
+            message = self._types[_POSE](header=self._header(t_ns, "world"), pose=pose)
+            self._write(GROUND_TRUTH_TOPIC, t_ns, message)
+            vectors = values[7:].reshape(-1, 3) if len(values) > 7 else ()
+            for topic, frame_id, vector in zip(TRUE_VECTOR_TOPICS, ("world", "imu0", "imu0"), vectors, strict=False):
+                message = self._types[_VECTOR](header=self._header(t_ns, frame_id), vector=self._vector(vector))
+                self._write(topic, t_ns, message)
 
-    def _write(self, topic: str, t_ns: int, message: Any) -> None:
+    def _write_in_order(self, topic: str, t_ns: int, message: Any) -> None:
+        """As recorded no sooner than what was written before."""
         self._recorded_ns = max(self._recorded_ns, t_ns)
+        self._write(topic, self._recorded_ns, message)
+
+    def _write(self, topic: str, recorded_ns: int, message: Any) -> None:
         self._connect(topic, message.__msgtype__)
-        self._bag.write(self._connections[topic], self._recorded_ns, self._serialize(message, message.__msgtype__))
+        self._bag.write(self._connections[topic], recorded_ns, self._serialize(message, message.__msgtype__))
 
     def _connect(self, topic: str, message_type: str) -> None:
         if topic not in self._connections:
@@ -284,11 +233,9 @@ class McapWriter(_RosWriter):
             bag.set_compression(CompressionMode.STORAGE, CompressionFormat[compression.upper()])
         super().__init__(bag, camera_names, *_ros2_types())
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        super().__exit__(kind, error, trace)
-        if kind is None:
+    def __exit__(self, *error: object) -> None:
+        super().__exit__(*error)
+        if error[0] is None:
             next(self._folder.glob("*.mcap")).rename(self._path)
         shutil.rmtree(self._folder)
 
@@ -302,8 +249,3 @@ def _ros2_types() -> tuple[Any, Any, dict[str, int]]:
 
 def _image_topic(camera_name: str) -> str:
     return f"/{camera_name}/image_raw"
-
-
-def _row(t_ns: int, values: Sequence[float]) -> str:
-    """A line of comma-separated values; ``repr`` is the shortest text that reads back equal."""
-    return ",".join([str(t_ns), *(repr(float(value)) for value in values)]) + "\n"

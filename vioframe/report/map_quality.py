@@ -22,12 +22,12 @@ _NO_MAP = "no landmarks were recorded (map.ply)"
 def simulated_world(folder: RunFolder) -> Path | None:
     """The mesh beside the simulated recording that a run was made on; None where that is not simulated, or gone."""
     # Here, because the simulator comes along: evaluating a recorded flight has no need of it.
-    from vioframe.simulation.files import WORLD, simulation_folder
+    from vioframe.simulation.config import MESH, simulation_folder
 
     path = folder.dataset_config().path
     if path is None:
         return None
-    world = simulation_folder(path.parent if path.name == "mav0" else path) / WORLD
+    world = simulation_folder(path.parent if path.name == "mav0" else path) / MESH
     return world if world.is_file() else None
 
 

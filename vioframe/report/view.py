@@ -90,14 +90,14 @@ def view_runs(
 class _Shown:
     """A run on its way into ``stream``: its ``number`` in the palette and the stamp at which its time begins.
 
-    ``camera`` is the place of the images of its recording: that of the first run that was made on it.
+    ``images_at`` is the body that the images of its recording are shown on: that of the first run that was made on it.
     """
 
     stream: rr.RecordingStream
     run: Evaluated
     number: int
     begin_ns: int
-    camera: str
+    images_at: str
 
     @property
     def colour(self) -> int:
@@ -127,7 +127,7 @@ class _Shown:
         self._path_and_covariance()
         self._errors()
         if self.run.folder is not None:
-            self._camera_and_tracks(self.run.folder)
+            self._cameras_and_tracks(self.run.folder)
             self._landmarks(self.run.folder)
             self._states(self.run.folder)
             self._times(self.run.folder)
@@ -232,28 +232,28 @@ class _Shown:
         for path, values in series.items():
             self.send(path, timings.t_ns, rr.Scalars.columns(scalars=values.astype(np.float64)))
 
-    def _camera_and_tracks(self, folder: RunFolder) -> None:
+    def _cameras_and_tracks(self, folder: RunFolder) -> None:
         import rerun as rr
 
-        calibration, tracks = folder.calibration(), folder.tracks()
-        if calibration is not None:
-            path, on_body = self.in_world("body", "camera"), calibration.cameras[0]
-            camera = on_body.model
-            self.log(path, rr.Transform3D(translation=on_body.p_BC, mat3x3=on_body.R_BC))
-            # The lens bends the outermost rays a little away from the frustum that is drawn.
-            pinhole = rr.Pinhole(
-                image_from_camera=camera.K,
-                resolution=camera.resolution,
-                image_plane_distance=_FRUSTUM_M,
-                color=self.colour,
-            )
-            self.log(path, pinhole)
-        if tracks is not None:
-            order = np.argsort(tracks.t_ns, kind="stable")
-            rgba = np.where(tracks.is_new[order], 0xFFFFFFFF, self.colour).astype(np.uint32)
-            points = rr.Points2D.columns(positions=tracks.xy[order], colors=rgba, radii=np.full(len(order), _TRACK))
-            path = _path(self.camera, "tracks", self.run.name)
-            self.send(path, tracks.frames_ns, points.partition(tracks.tracked))
+        calibration, tracks = folder.learned_calibration() or folder.calibration(), folder.tracks()
+        for place, name in enumerate(_camera_names(folder)):
+            if calibration is not None and calibration.cameras[place].rotation_known:
+                path, camera = self.in_world("body", name), calibration.cameras[place]
+                self.log(path, rr.Transform3D(translation=camera.p_BC, mat3x3=camera.R_BC))
+                # The lens bends the outermost rays a little away from the frustum that is drawn.
+                pinhole = rr.Pinhole(
+                    image_from_camera=camera.model.K,
+                    resolution=camera.model.resolution,
+                    image_plane_distance=_FRUSTUM_M,
+                    color=self.colour,
+                )
+                self.log(path, pinhole)
+            if tracks is not None:
+                own = tracks.seen_by(place)
+                rgba = np.where(own.is_new, 0xFFFFFFFF, self.colour).astype(np.uint32)
+                points = rr.Points2D.columns(positions=own.xy, colors=rgba, radii=np.full(len(rgba), _TRACK))
+                path = _path(self.images_at, name, "tracks", self.run.name)
+                self.send(path, own.frames_ns, points.partition(own.tracked))
 
     def _landmarks(self, folder: RunFolder) -> None:
         """The map without the landmarks that stand alone and, larger, those of them that a frame tracks."""
@@ -268,7 +268,6 @@ class _Shown:
             return
         row = np.searchsorted(landmarks.ids, tracks.ids).clip(max=len(landmarks) - 1)
         known = np.flatnonzero(landmarks.ids[row] == tracks.ids)
-        known = known[np.argsort(tracks.t_ns[known], kind="stable")]
         counts = np.array([np.count_nonzero(tracks.t_ns[known] == t) for t in tracks.frames_ns])
         large = self.in_world("landmarks in view")
         self.log(large, rr.Points3D.from_fields(colors=self.colour, radii=_IN_VIEW))
@@ -286,7 +285,7 @@ def _shown(runs: Sequence[Evaluated], stream: rr.RecordingStream) -> list[_Shown
         first = run if flown is None else first_on.setdefault(flown, run)
         begin_ns = begins.setdefault(first.name, _first_stamp_ns(run))
         begin_ns = begin_ns if run.ground_truth is None else int(run.ground_truth.t_ns[0])
-        out.append(_Shown(stream, run, number, begin_ns, _path("world", first.name, "body", "camera")))
+        out.append(_Shown(stream, run, number, begin_ns, _path("world", first.name, "body")))
     return out
 
 
@@ -318,19 +317,33 @@ def _log_images(shown: Iterable[_Shown], installed: Registry) -> None:
     import cv2
     import rerun as rr
 
-    done: set[str] = set()
-    for each in shown:
+    for each in _first_on_each_recording(shown):
         tracks = each.run.folder.tracks() if each.run.folder else None
-        if each.camera in done or each.run.folder is None or tracks is None:
+        if each.run.folder is None or tracks is None:
             continue
-        done.add(each.camera)
-        wanted = set(tracks.frames_ns.tolist())
+        names, wanted = _camera_names(each.run.folder), set(tracks.frames_ns.tolist())
         for frames in _frames(each.run.folder, installed, int(tracks.frames_ns[-1])):
-            if frames.t_ns in wanted and (pixels := frames.images[0]) is not None:
-                jpeg = cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])[1]
-                each.stream.set_time(_TIME, duration=(frames.t_ns - each.begin_ns) / NS_PER_S)
-                image = rr.EncodedImage(contents=jpeg.tobytes(), media_type="image/jpeg", draw_order=-1.0)
-                each.stream.log(_path(each.camera, "image"), image)
+            each.stream.set_time(_TIME, duration=(frames.t_ns - each.begin_ns) / NS_PER_S)
+            for name, image in zip(names, frames.images if frames.t_ns in wanted else (), strict=False):
+                if image is not None:
+                    jpeg = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])[1]
+                    encoded = rr.EncodedImage(contents=jpeg.tobytes(), media_type="image/jpeg", draw_order=-1.0)
+                    each.stream.log(_path(each.images_at, name, "image"), encoded)
+
+
+def _first_on_each_recording(shown: Iterable[_Shown]) -> Iterable[_Shown]:
+    """The runs at whose cameras the images are."""
+    firsts: dict[str, _Shown] = {}
+    for each in shown:
+        if each.run.folder is not None:
+            firsts.setdefault(each.images_at, each)
+    return firsts.values()
+
+
+def _camera_names(folder: RunFolder) -> list[str]:
+    """Of the rig that was flown, in its order."""
+    calibration = folder.calibration()
+    return ["camera"] if calibration is None else [camera.name for camera in calibration.cameras]
 
 
 def _frames(folder: RunFolder, installed: Registry, last_t_ns: int) -> Iterator[FrameSet]:
@@ -352,7 +365,12 @@ def _blueprint(shown: Sequence[_Shown]) -> rrb.Blueprint:
     """The world at the left; at the right the images and, in tabs, what goes with the time."""
     import rerun.blueprint as rrb
 
-    cameras = dict.fromkeys(each.camera for each in shown if each.run.folder is not None)
+    cameras = [
+        _path(each.images_at, name)
+        for each in _first_on_each_recording(shown)
+        if each.run.folder is not None
+        for name in _camera_names(each.run.folder)
+    ]
     images = [rrb.Spatial2DView(origin=path, contents=["$origin/image", "$origin/tracks/**"]) for path in cameras]
     legend = rrb.PlotLegend(
         visible=False

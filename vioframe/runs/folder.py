@@ -62,17 +62,26 @@ class States:
 
 @dataclass(frozen=True)
 class Tracks:
-    """Every feature observation of the frames ``frames_ns`` (N,): ``ids`` (M,) and ``xy`` (M, 2) px at ``t_ns`` (M,)."""
+    """Every feature observation of the frames ``frames_ns`` (N,), each in order of time.
+
+    ``ids`` (M,) and ``xy`` (M, 2) px at ``t_ns`` (M,), seen by the camera (M,) of that place in the rig.
+    """
 
     frames_ns: Int
     t_ns: Int
     ids: Int
+    camera: Int
     xy: Float
 
     @property
     def tracked(self) -> Int:
-        """(N,) how many features each frame holds; a frame without any has no row, but it has its timings."""
+        """(N,) how many observations each frame holds; a frame without any has no row, but it has its timings."""
         return _count(self.t_ns, self.frames_ns)
+
+    def seen_by(self, camera: int) -> Tracks:
+        """Those of one camera."""
+        own = self.camera == camera
+        return Tracks(self.frames_ns, self.t_ns[own], self.ids[own], self.camera[own], self.xy[own])
 
     @property
     def is_new(self) -> NDArray[np.bool_]:
@@ -143,9 +152,16 @@ class RunFolder:
 
     def calibration(self) -> Calibration | None:
         """The calibration that the run was given; None in run folders that were written without it."""
+        return self._calibration_in("calibration")
+
+    def learned_calibration(self) -> Calibration | None:
+        """What the back-end believed of the rig in the end; None where it learns nothing of it."""
+        return self._calibration_in("calibration_learned")
+
+    def _calibration_in(self, name: str) -> Calibration | None:
         from vioframe.io.calibration import load_calibration
 
-        path = self.path / "calibration"
+        path = self.path / name
         return load_calibration(path) if path.is_dir() else None
 
     def landmarks(self) -> Landmarks | None:
@@ -166,7 +182,8 @@ class RunFolder:
         if table is None or timings is None:
             return None
         table = table[np.isin(table["t_ns"], timings.t_ns)]  # the last frame of an interrupted run may lack its times
-        return Tracks(timings.t_ns, table["t_ns"], table["id"], np.column_stack([table["x_px"], table["y_px"]]))
+        xy = np.column_stack([table["x_px"], table["y_px"]])
+        return Tracks(timings.t_ns, table["t_ns"], table["id"], table["camera"], xy)
 
     def states(self) -> States | None:
         """None where no pose was recorded."""

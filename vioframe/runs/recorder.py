@@ -47,8 +47,8 @@ CALIBRATION_COLUMNS = (
     *(f"sigma_{name}" for name in ("rx", "ry", "rz", "px", "py", "pz", "time_offset_s")),
     *(f"sigma_{name}" for name in ("fx", "fy", "cx", "cy", "d1", "d2", "d3", "d4")),
 )
-"""Of ``calibration.csv``: the camera by its place in the rig, its pose on the body (R_BC as a quaternion, p_BC m), time offset, intrinsics, and
-their standard deviations (rad, m, s, px); zero is what is not estimated."""
+"""Of ``calibration.csv``: the camera by its place in the rig, its pose on the body (R_BC as a quaternion, p_BC m), time
+offset, intrinsics, and their standard deviations (rad, m, s, px); zero is what is not estimated."""
 LOOP_COLUMNS = ("earlier_t_ns", "later_t_ns", "x_m", "y_m", "z_m", "yaw_rad", "inliers", "accepted")
 _UPPER = np.triu_indices(6)
 _EVENTS_KEPT_PER_KIND = 20

@@ -60,12 +60,8 @@ class ImuErrors:
     """bias of the gyroscope at the first reading, rad/s"""
     bias_accel_B: Vector = _ZERO
     """bias of the accelerometer at the first reading, m/s^2"""
-    vibration: float = 0.0
-    """rotors felt by the IMU and not by the camera, 0 to 1: 1 is 3 m/s^2 and 0.15 rad/s rms on each axis"""
 
     def __post_init__(self) -> None:
-        if not 0.0 <= self.vibration <= 1.0:
-            raise ConfigError(f"vibration must lie between 0 (none) and 1, not {self.vibration:g}")
         sensors: tuple[Literal["gyro", "accel"], ...] = ("gyro", "accel")
         for sensor in sensors:
             misalignment = np.asarray(getattr(self, f"{sensor}_misalignment"))
@@ -110,10 +106,6 @@ def read_imu(
     accel_B = np.einsum("nji,nj->ni", motion.R_WB, motion.a_WB - g_W)
     bias_gyro = np.tile(np.asarray(errors.bias_gyro_B), (count, 1))
     bias_accel = np.tile(np.asarray(errors.bias_accel_B), (count, 1))
-    if errors.vibration:
-        # From a generator of its own: the noise is the same with and without it.
-        d_gyro, d_accel = vibration(errors.vibration, np.arange(count) / rate_hz, rng.spawn(1)[0])
-        gyro_B, accel_B = gyro_B + d_gyro, accel_B + d_accel
     gyro_B, accel_B = gyro_B @ errors.mixing("gyro").T, accel_B @ errors.mixing("accel").T
     if noise is not None:
         root_rate = np.sqrt(rate_hz)

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack
-from heapq import merge
 from importlib.metadata import version
 from pathlib import Path
 
@@ -12,14 +11,14 @@ from pydantic_core import to_jsonable_python
 
 from vioframe.errors import DatasetError
 from vioframe.io.calibration import write_calibration
-from vioframe.io.convert import FORMATS, appearing, format_of, write_sidecar
-from vioframe.io.writers import RecordingWriter, TruthFile
+from vioframe.io.convert import FORMATS, appearing, format_of, write_recording, write_sidecar
+from vioframe.io.trajectories import write_euroc
 from vioframe.parts.config import to_yaml
 from vioframe.runs import machine
 from vioframe.simulation.config import MANIFEST, MESH, TRUTH, simulation_folder
 from vioframe.simulation.recording import SimulatedRecording
 from vioframe.simulation.world import write_mesh
-from vioframe.types import FrameSet, ImuSample, Measurement
+from vioframe.types import FrameSet, Measurement
 
 
 def record(
@@ -45,7 +44,7 @@ def record(
                 opened.enter_context(FORMATS[format_of(path)].open(unfinished, compression, names))
                 for path, unfinished in begun
             ]
-            _write(recording, writers, on_frame)
+            write_recording(_watched(recording.measurements(), on_frame), recording.ground_truth, writers)
         for path, unfinished in begun:
             if format_of(path) == "asl":
                 write_calibration(recording.calibration, unfinished / "mav0")
@@ -72,23 +71,11 @@ def check_destinations(destinations: Sequence[Path], compression: str | None, *,
         raise DatasetError("a destination is named twice")
 
 
-def _write(
-    recording: SimulatedRecording, writers: Sequence[RecordingWriter], on_frame: Callable[[FrameSet], None]
-) -> None:
-    truth = zip(recording.ground_truth.t_ns.tolist(), recording.ground_truth.values.tolist(), strict=True)
-    items: Iterator[Measurement | tuple[int, list[float]]] = merge(
-        recording.measurements(), truth, key=lambda item: item[0] if isinstance(item, tuple) else item.t_ns
-    )
-    for item in items:
-        for writer in writers:
-            if isinstance(item, tuple):
-                writer.write_true_values(*item)
-            elif isinstance(item, FrameSet):
-                writer.write_frame(item)
-            elif isinstance(item, ImuSample):
-                writer.write_imu(item)
-        if isinstance(item, FrameSet):
-            on_frame(item)
+def _watched(measurements: Iterable[Measurement], on_frame: Callable[[FrameSet], None]) -> Iterator[Measurement]:
+    for measurement in measurements:
+        yield measurement
+        if isinstance(measurement, FrameSet):
+            on_frame(measurement)
 
 
 def _describe(recording: SimulatedRecording, folder: Path) -> None:
@@ -109,7 +96,4 @@ def _describe(recording: SimulatedRecording, folder: Path) -> None:
     manifest = heading + to_yaml(recording.config.model_copy(update={"made": plain}))
     (folder / MANIFEST).write_text(manifest, encoding="utf-8")
     write_mesh(recording.world.mesh, folder / MESH)
-    truth = TruthFile(folder / TRUTH)
-    for t_ns, values in zip(recording.ground_truth.t_ns.tolist(), recording.ground_truth.values.tolist(), strict=True):
-        truth.write_true_values(t_ns, values)
-    truth.close()
+    write_euroc(recording.ground_truth, folder / TRUTH)

@@ -26,7 +26,8 @@ def check_backend(factory: BackendFactory, *, max_ate_percent: float = 2.0, **op
 
     Shapes, stamps and finiteness of every estimate; rotations that are rotations; covariances that are symmetric and
     positive semi-definite; inputs left alone; the same result for the same input; frames without a single point
-    survived; a begin that forgets what was before; and a trajectory within ``max_ate_percent`` of the path length (position and yaw aligned).
+    survived; a begin that forgets what was before; and a trajectory within ``max_ate_percent`` of the path length
+    (position and yaw aligned).
     """
     sequence = _frozen(simulated_sequence("stop_and_go", duration_s=_DURATION_S, max_points=100))
     backend = factory(**options)

@@ -78,10 +78,9 @@ def _check_measurements(dataset: Dataset, max_frames: int) -> None:
 
 def _check_frames(frames: FrameSet, calibration: Calibration) -> None:
     cameras, images = calibration.cameras, frames.images
-    require(
-        isinstance(images, tuple) and len(images) == len(cameras),
-        f"a frame set has {len(images)} places, the calibration {len(cameras)} cameras",
-    )
+    require(isinstance(images, tuple), f"the images of a frame set are a {type(images).__name__}, not a tuple")
+    counts = f"{len(images)} places, the calibration {len(cameras)} cameras"
+    require(len(images) == len(cameras), f"a frame set has {counts}")
     require(any(image is not None for image in images), "a frame set holds no image")
     for image, camera in zip(images, cameras, strict=True):
         if image is None:

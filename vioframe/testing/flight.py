@@ -6,10 +6,11 @@ from typing import Any
 
 import numpy as np
 
+from vioframe.arrays import Float
 from vioframe.geometry import so3
 from vioframe.interfaces import FlightFactory
 from vioframe.testing.require import require
-from vioframe.types import Float, Motion
+from vioframe.types import Motion
 
 _DURATION_S = 12.0
 _STEP_S = 1e-4

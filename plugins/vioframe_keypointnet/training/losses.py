@@ -1,7 +1,11 @@
-"""The four losses of KeypointNet: location, descriptor, score, and that of the inlier-outlier network.
+"""What a network is trained by: the four published losses, and the lessons that come before them.
 
-Equations of Tang et al., ICLR 2020, section 3.2-3.3. N candidates of the source image and N of the target, a homography
-between the two: the network is its own teacher.
+The four are location, descriptor, score, and that of the inlier-outlier network; equations of Tang et al., ICLR 2020,
+section 3.2-3.3. N candidates of the source image and N of the target, a homography between the two: the network is its
+own teacher. They only compare two views, and from random weights take days to find what makes a point worth finding.
+
+A corner found once, in the image that both views are of, is the same point in both, however they turn, blur or darken
+it: after an hour of such lessons the network is where the published losses can begin to improve it.
 """
 
 from __future__ import annotations
@@ -9,14 +13,30 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+import numpy as np
 import torch
-from torch import Tensor
-from torch.nn.functional import relu
+from numpy.typing import NDArray
+from torch import Tensor, nn
+from torch.nn.functional import binary_cross_entropy, cross_entropy, pixel_unshuffle, relu
 
-from vioframe_keypointnet.network import Detection, InlierOutlierNet, describe
+from vioframe.bench.detectors.metrics import warp as warped_by
+from vioframe.types import Float
+from vioframe_keypointnet.architecture import CELL_PX
+from vioframe_keypointnet.network import Detection, describe
 
 NEAR_PX = 4.0
 """Candidates this close are taken for the same point."""
+_TOP = 300
+"""Strongest points of the source that the inlier-outlier network judges, as published."""
+_MARGIN = 0.2
+"""Of descriptors: Eq. 4."""
+
+_MOST, _QUALITY, _APART_PX, _BLOCK_PX = 600, 0.005, 5.0, 3
+_SCORE_WEIGHT = 4.0
+_SPOT_PX = 0.7
+_TEMPERATURE = 0.1
+_WEAKEST = 0.2
+"""Score to be given to the weakest corner; the strongest has one, cells without any zero."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,15 +58,46 @@ class Candidates:
         return Candidates(detection.xy.flatten(2).transpose(1, 2), score.flatten(1), inner.flatten())
 
 
+class InlierOutlierNet(nn.Module):
+    """Tells from matched points alone which matches are right: (B, 5, N) to (B, N), positive for an inlier.
+
+    The five are the place in either image, scaled to [-1, 1], and the distance of the descriptors (section 3.3; after
+    Brachmann and Rother, ICCV 2019).
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.first = nn.Sequential(nn.Conv1d(5, 128, 1, bias=False), nn.BatchNorm1d(128), nn.ReLU(inplace=True))
+        self.blocks = nn.ModuleList(_residual(128) for _ in range(4))
+        self.last = nn.Conv1d(128, 1, 1)
+
+    def forward(self, matches: Tensor) -> Tensor:
+        x = self.first(matches)
+        for block in self.blocks:
+            x = x + block(x)
+        out: Tensor = self.last(x)[:, 0]
+        return out
+
+
+def _residual(channels: int) -> nn.Sequential:
+    layers: list[nn.Module] = []
+    for _ in range(2):
+        layers += [
+            nn.Conv1d(channels, channels, 1),
+            nn.InstanceNorm1d(channels),
+            nn.BatchNorm1d(channels),
+            nn.ReLU(inplace=True),
+        ]
+    return nn.Sequential(*layers)
+
+
 def warp(homography: Tensor, xy: Tensor) -> Tensor:
     """(B, N, 2) px of the target where ``xy`` (B, N, 2) px of the source come by ``homography`` (B, 3, 3)."""
     homogeneous = torch.cat([xy, torch.ones_like(xy[..., :1])], dim=-1) @ homography.transpose(1, 2)
     return homogeneous[..., :2] / homogeneous[..., 2:].clamp(min=1e-6)
 
 
-def losses(
-    source: Detection, target: Detection, homography: Tensor, judge: InlierOutlierNet, top: int = 300
-) -> Mapping[str, Tensor]:
+def losses(source: Detection, target: Detection, homography: Tensor, judge: InlierOutlierNet) -> Mapping[str, Tensor]:
     """The four, unweighted: ``location``, ``descriptor``, ``score`` and ``inlier``.
 
     ``homography`` (B, 3, 3) takes pixels of the source to pixels of the target; both are of the same size.
@@ -66,11 +117,9 @@ def losses(
     positives = describe(target.descriptors, warped.detach())
     return {
         "location": location_loss(distance[near]),
-        "descriptor": descriptor_loss(
-            descriptors_a, positives, descriptors_b, warped.detach(), b.xy.detach(), seen, margin=0.2
-        ),
+        "descriptor": descriptor_loss(descriptors_a, positives, descriptors_b, warped.detach(), b.xy.detach(), seen),
         "score": score_loss(*scores, distance[near]),
-        "inlier": inlier_loss(judge, a, b, warped, descriptors_a, descriptors_b, size, top),
+        "inlier": inlier_loss(judge, a, b, warped, descriptors_a, descriptors_b, size),
     }
 
 
@@ -103,7 +152,6 @@ def descriptor_loss(
     warped: Tensor,
     xy: Tensor,
     seen: Tensor,
-    margin: float,
 ) -> Tensor:
     """Eq. 3-4: triplets of unit descriptors with the hardest negative of the other image.
 
@@ -115,7 +163,7 @@ def descriptor_loss(
         near = torch.cdist(warped, xy, p=torch.inf) <= NEAR_PX
         hardest = likeness.masked_fill(near, -torch.inf).argmax(dim=-1)
     negatives = candidates.gather(1, hardest[..., None].expand_as(anchors))
-    return _mean(relu(_apart(anchors, positives) - _apart(anchors, negatives) + margin)[seen])
+    return _mean(relu(_apart(anchors, positives) - _apart(anchors, negatives) + _MARGIN)[seen])
 
 
 def inlier_loss(
@@ -126,13 +174,12 @@ def inlier_loss(
     descriptors_a: Tensor,
     descriptors_b: Tensor,
     size: Tensor,
-    top: int,
 ) -> Tensor:
-    """Eq. 6: half the squared difference of ``judge`` from +1 (inlier) or -1, over the ``top`` of the source.
+    """Eq. 6: half the squared difference of ``judge`` from +1 (inlier) or -1, over the 300 strongest of the source.
 
     Each is matched to the target's candidate of the most alike descriptor; matches within 4 px are right.
     """
-    best = a.score.detach().topk(min(top, a.score.shape[1]), dim=1).indices[..., None]
+    best = a.score.detach().topk(min(_TOP, a.score.shape[1]), dim=1).indices[..., None]
     chosen = descriptors_a.gather(1, best.expand(-1, -1, descriptors_a.shape[-1]))
     with torch.no_grad():
         match = (chosen @ descriptors_b.transpose(1, 2)).argmax(dim=-1)[..., None]
@@ -153,3 +200,81 @@ def _apart(a: Tensor, b: Tensor) -> Tensor:
 def _mean(x: Tensor) -> Tensor:
     """Mean, and zero of nothing."""
     return x.sum() / max(1, x.numel())
+
+
+def corners(grey: NDArray[np.uint8]) -> Float:
+    """(N, 3) Shi-Tomasi corners of an image: x and y, px, and the score to learn by rank; strongest first."""
+    import cv2
+
+    found = cv2.goodFeaturesToTrack(grey, _MOST, _QUALITY, _APART_PX, None, blockSize=_BLOCK_PX)
+    if found is None:
+        return np.empty((0, 3))
+    criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 20, 0.01)
+    xy = cv2.cornerSubPix(grey, found, (2, 2), (-1, -1), criteria).reshape(-1, 2)
+    return np.column_stack([xy, np.linspace(1.0, _WEAKEST, len(xy))]).astype(np.float64)
+
+
+def lesson(points: Float, H: Float, size: tuple[int, int]) -> NDArray[np.float32]:
+    """(3, h, w) for each cell of a view: x and y, px, and score of the strongest of ``points`` in it; score 0 for none.
+
+    ``H`` (3, 3) takes the image that ``points`` are of to the view of ``size`` (width, height).
+    """
+    w, h = size[0] // CELL_PX, size[1] // CELL_PX
+    out = np.zeros((3, h, w), np.float32)
+    xy = warped_by(H, points[:, :2])
+    inside = ((xy > -0.5) & (xy < np.array([w, h]) * CELL_PX - 0.5)).all(axis=1)
+    xy, score = xy[inside][::-1], points[inside, 2][::-1]
+    column, row = ((xy + 0.5) // CELL_PX).astype(int).T
+    # Of several in one cell the last written, which is the strongest, stays.
+    out[:, row, column] = np.column_stack([xy, score]).T
+    return out
+
+
+def lesson_loss(seen: Detection, wanted: Tensor) -> tuple[Tensor, Tensor]:
+    """How far places are from the corners in ``wanted`` (B, 3, h, w), by score, and scores from theirs; off the border.
+
+    Places: the mean distance, px; for a network of peaks the cross entropy from a spot of 0.7 px about the corner, as a
+    distance says nothing of which of two peaks is the higher. Scores: cross entropy.
+    """
+    inner = wanted[:, 2, 1:-1, 1:-1]
+    if seen.response is None:
+        off = ((seen.xy - wanted[:, :2]).square().sum(dim=1) + 1e-6).sqrt()
+    else:
+        off = -(_spots(wanted[:, :2]) * torch.log_softmax(seen.response, dim=1)).sum(dim=1)
+    place = (off[:, 1:-1, 1:-1] * inner).sum() / inner.sum().clamp(min=1.0)
+    score = binary_cross_entropy(seen.score[:, 1:-1, 1:-1].clamp(1e-6, 1.0 - 1e-6), inner)
+    return place, score
+
+
+def matching_loss(a: Detection, b: Detection, homography: Tensor) -> Tensor:
+    """Cross entropy of telling each candidate's own place in the target from all others', by descriptors.
+
+    Every other place is a negative, not the hardest alone: that one pulls descriptors that know nothing yet to one
+    point, where the published loss leaves them.
+    """
+    source = Candidates.of(a)
+    h, w = a.score.shape[1:]
+    warped = warp(homography, source.xy.detach())
+    limit = warped.new_tensor([CELL_PX * w - 1.0, CELL_PX * h - 1.0])
+    seen = ((warped >= 0.0) & (warped <= limit)).all(dim=-1) & source.off_border
+    likeness = describe(a.descriptors, source.xy.detach()) @ describe(b.descriptors, warped).transpose(1, 2)
+    itself = torch.eye(h * w, dtype=torch.bool, device=warped.device)
+    beside = (torch.cdist(warped, warped) < NEAR_PX) & ~itself
+    logits = (likeness / _TEMPERATURE).masked_fill(beside | ~seen[:, None, :], -torch.inf)[seen]
+    own = torch.arange(h * w, device=warped.device).expand_as(seen)[seen]
+    return cross_entropy(logits, own) if len(own) else likeness.sum() * 0.0
+
+
+def teach(a: Detection, b: Detection, lesson_a: Tensor, lesson_b: Tensor) -> dict[str, Tensor]:
+    """The losses of a step of lessons, mean of both views: ``place`` and, weighted, ``corner``."""
+    place, score = (0.5 * (x + y) for x, y in zip(lesson_loss(a, lesson_a), lesson_loss(b, lesson_b), strict=True))
+    return {"place": place, "corner": _SCORE_WEIGHT * score}
+
+
+def _spots(xy: Tensor) -> Tensor:
+    """(B, 64, h, w) summing to one over the pixels of each cell, about ``xy`` (B, 2, h, w) px."""
+    h, w = xy.shape[-2:]
+    rows, columns = torch.meshgrid(torch.arange(CELL_PX * h), torch.arange(CELL_PX * w), indexing="ij")
+    pixels = pixel_unshuffle(torch.stack([columns, rows])[:, None].to(xy), CELL_PX)
+    squared = (pixels[None, 0] - xy[:, :1]).square() + (pixels[None, 1] - xy[:, 1:]).square()
+    return torch.softmax(-squared / (2.0 * _SPOT_PX**2), dim=1)

@@ -1,9 +1,15 @@
-"""Pairs of views of one image with the homography between them; each drawn from its own number alone."""
+"""What is trained on: images of folders and recordings, and pairs of views of one image with their homography.
+
+Each pair is drawn from its own number alone. How far views differ is as published for KP2D (Tang et al., ICLR 2020,
+section 4), but for light and blur, which are those of a camera in flight.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields
+from fnmatch import fnmatch
+from pathlib import Path
 from typing import Self
 
 import numpy as np
@@ -11,43 +17,145 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from vioframe.bench.detectors.degradations import line_kernel
+from vioframe.bench.detectors.images import find_images, frames_of
+from vioframe.errors import ConfigError, DatasetError
+from vioframe.io.images import decode_image, to_gray8
+from vioframe.parts import registry
 from vioframe.types import Float
-from vioframe_keypointnet.training.homography import random_affine, random_homography
-from vioframe_keypointnet.training.images import Picture
-from vioframe_keypointnet.training.lessons import corners, lesson
+from vioframe_keypointnet.training.losses import corners, lesson
 from vioframe_keypointnet.training.options import TrainingOptions
-from vioframe_keypointnet.training.photometric import disturbed
 
-# The first view is taken of the image anywhere between shrunk to fit and this much of its own scale.
+_SMALLEST_PX = 64
 _LARGEST_SCALE = 1.2
+"""The first view is taken of the image anywhere between shrunk to fit and this much of its own scale."""
+_AFFINE_DEG = 15.0
+"""Largest turn of the first view."""
+
+_PATCH_RATIO = 0.7
+"""Side of the part of the first view that fills the second."""
+_PERSPECTIVE = 0.2
+"""Largest shift of its corners as a share of the view, two standard deviations; never beyond the view's edge."""
+_ROTATION_DEG = 45.0
+_SCALE = (0.9, 1.1)
+
+_DISTURBED = 0.5
+"""Probability of each of the effects that follow."""
+_EXPOSURE = (0.3, 2.0)
+"""Factor, after which the image saturates."""
+_GAMMA = (0.5, 2.0)
+_CONTRAST = (0.4, 1.4)
+_BRIGHTNESS = 0.2
+"""Largest shift, of a range of one."""
+_BLUR_SIGMA_PX = 1.5
+_MOTION_BLUR_PX = 9.0
+"""Longest path during the exposure."""
+_NOISE_SIGMA = 0.05
+"""Largest standard deviation, of a range of one."""
+
+View = NDArray[np.float32]
+"""(H, W) or (H, W, 3) in [0, 1]."""
+
+
+@dataclass(frozen=True, slots=True)
+class Picture:
+    """One image, (H, W) or (H, W, 3) RGB uint8, and the file or recording that it is from."""
+
+    name: str
+    pixels: NDArray[np.uint8]
+
+
+@dataclass(frozen=True, slots=True)
+class Pair:
+    """Two views, the homography (3, 3) from pixels of the source to those of the target, and the lessons (3, h, w)."""
+
+    source: View
+    target: View
+    homography: Float
+    source_lesson: NDArray[np.float32]
+    target_lesson: NDArray[np.float32]
 
 
 @dataclass(frozen=True, slots=True)
 class Batch:
-    """Pairs of views; each field has a row a pair."""
+    """Pairs of views; each field has a row a pair, and views are (B, C, H, W)."""
 
     source: Tensor
-    """(B, C, H, W) in [0, 1]."""
     target: Tensor
     homography: Tensor
-    """(B, 3, 3) from pixels of the source to pixels of the target."""
     source_lesson: Tensor
-    """(B, 3, h, w), see :func:`vioframe_keypointnet.training.lessons.lesson`."""
     target_lesson: Tensor
 
     def to(self, device: torch.device) -> Self:
         return type(self)(*(getattr(self, field.name).to(device) for field in fields(self)))
 
 
-@dataclass(frozen=True, slots=True)
-class Pair:
-    """Two views, (H, W) or (H, W, 3) in [0, 1], the homography (3, 3) between them, and their lessons (3, h, w)."""
+def gather(sources: Sequence[Path], channels: int, frames_per_recording: int) -> list[Picture]:
+    """All images of ``sources`` in a settled order, with ``channels`` 1 (grey) or 3 (RGB).
 
-    source: NDArray[np.float32]
-    target: NDArray[np.float32]
-    homography: Float
-    source_lesson: NDArray[np.float32]
-    target_lesson: NDArray[np.float32]
+    A source is a folder of photographs (searched to its depths) or a recording that a reader opens. Raises
+    :class:`ConfigError` for one that holds no image of use.
+    """
+    pictures: list[Picture] = []
+    for source in sources:
+        if not source.exists():
+            raise ConfigError(f"{source} does not exist; --images takes folders of photographs and recordings")
+        try:
+            dataset = registry.load().open_dataset(source)
+        except DatasetError as error:
+            found = _photographs(source, channels) if source.is_dir() else []
+            if not found:
+                raise ConfigError(f"{source} holds neither photographs nor a recording: {error}") from error
+            pictures += found
+        else:
+            for number, frames in frames_of(dataset, frames_per_recording):
+                image = next(image for image in frames.images if image is not None)
+                pictures.append(Picture(f"{source}#{number}", _with_channels(image, channels, str(source))))
+    return pictures
+
+
+def split(pictures: Iterable[Picture], hold_out: Sequence[str]) -> tuple[list[Picture], list[Picture]]:
+    """Those to train on and those held out: the ones whose name matches a pattern such as ``*/V1_*`` or contains it."""
+    train: list[Picture] = []
+    held: list[Picture] = []
+    for picture in pictures:
+        out = any(pattern in picture.name or fnmatch(picture.name, pattern) for pattern in hold_out)
+        (held if out else train).append(picture)
+    if not train:
+        raise ConfigError("every image is held out; narrow --hold-out or name more --images")
+    if hold_out and not held:
+        raise ConfigError(f"no image is named like --hold-out {' '.join(hold_out)}; nothing would be held out")
+    return train, held
+
+
+def _photographs(folder: Path, channels: int) -> list[Picture]:
+    try:
+        files = find_images(folder)
+    except DatasetError:
+        return []
+    out = []
+    for path in files:
+        pixels = decode_image(path.read_bytes())
+        if pixels is None:
+            raise ConfigError(f"{path} is damaged or no image; repair or remove it")
+        if min(pixels.shape[:2]) >= _SMALLEST_PX:
+            out.append(Picture(str(path), _with_channels(pixels, channels, str(path))))
+    return out
+
+
+def _with_channels(pixels: NDArray[np.generic], channels: int, where: str) -> NDArray[np.uint8]:
+    """OpenCV's (H, W), BGR or BGRA -> grey or RGB."""
+    if channels == 3 and pixels.ndim == 3 and pixels.dtype == np.uint8:
+        return np.ascontiguousarray(pixels[..., 2::-1], np.uint8)
+    grey = to_gray8(pixels, 16, where)
+    return grey if channels == 1 else np.repeat(grey[..., None], 3, axis=2)
+
+
+def grey_of(pixels: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """(H, W) of the pixels of a :class:`Picture`."""
+    import cv2
+
+    return pixels if pixels.ndim == 2 else np.asarray(cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY), np.uint8)
 
 
 def batch(pictures: Sequence[Picture], options: TrainingOptions, step: int, *, corners_taught: bool = True) -> Batch:
@@ -56,10 +164,9 @@ def batch(pictures: Sequence[Picture], options: TrainingOptions, step: int, *, c
     Unless ``corners_taught``, none are looked for, and the lessons name none.
     """
     first = step * options.batch
-    numbers = range(first, first + options.batch)
     pairs = [
         pair(pictures[_order(k, len(pictures), options.seed)], options, k, corners_taught=corners_taught)
-        for k in numbers
+        for k in range(first, first + options.batch)
     ]
     return Batch(
         _images([p.source for p in pairs]),
@@ -82,22 +189,82 @@ def pair(picture: Picture, options: TrainingOptions, number: int, *, corners_tau
     room = np.maximum(0, [shrunk.shape[1] - width, shrunk.shape[0] - height])
     crop = np.eye(3)
     crop[:2, 2] = -rng.uniform(0.0, 1.0, 2) * room
-    first = random_affine(rng, options.affine_deg, True, options.size) @ crop
-    second = random_homography(rng, options.size, options.homography) @ first
+    first = _random_turn(rng, options.size) @ crop
+    second = random_homography(rng, options.size) @ first
     if rng.random() < 0.5:
         first, second = second, first
     between = second @ np.linalg.inv(first)
-    points = corners(shrunk) if corners_taught else np.empty((0, 3))
+    points = corners(grey_of(shrunk)) if corners_taught else np.empty((0, 3))
     return Pair(
-        disturbed(_view(shrunk, first, options.size), rng, options.photometric),
-        disturbed(_view(shrunk, second, options.size), rng, options.photometric),
+        disturbed(_view(shrunk, first, options.size), rng),
+        disturbed(_view(shrunk, second, options.size), rng),
         between / between[2, 2],
         lesson(points, first, options.size),
         lesson(points, second, options.size),
     )
 
 
-def _view(pixels: NDArray[np.uint8], H: Float, size: tuple[int, int]) -> NDArray[np.float32]:
+def random_homography(rng: np.random.Generator, size: tuple[int, int]) -> Float:
+    """(3, 3) from pixels of an image of ``size`` (width, height) to pixels of a view of the same size, as published."""
+    import cv2
+
+    patch = np.array([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]]) * _PATCH_RATIO
+    # Symmetric along x, free along y: what a camera does that is turned away about its axes.
+    most = min(_PERSPECTIVE, 0.5 * (1.0 - _PATCH_RATIO))
+    lean = np.clip(rng.normal(0.0, most / 2.0, 3), -most, most)
+    patch += np.array([[lean[1], lean[0]], [lean[2], -lean[0]], [lean[2], lean[0]], [lean[1], -lean[0]]])
+    patch *= rng.uniform(*_SCALE)
+    aspect = np.array([size[0] / size[1], 1.0])
+    patch = patch * aspect @ _rotation(rng, _ROTATION_DEG).T / aspect
+    room = np.maximum(0.0, 0.5 - np.abs(patch).max(axis=0))
+    patch += rng.uniform(-room, room)
+    scale = np.asarray(size) - 1.0
+    view = np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) * scale
+    return np.asarray(cv2.getPerspectiveTransform(((patch + 0.5) * scale).astype(np.float32), view.astype(np.float32)))
+
+
+def _random_turn(rng: np.random.Generator, size: tuple[int, int]) -> Float:
+    """(3, 3) a turn about the middle of an image of ``size`` (width, height) and, every other time, its mirror."""
+    A = _rotation(rng, _AFFINE_DEG) @ np.diag([-1.0 if rng.random() < 0.5 else 1.0, 1.0])
+    middle = 0.5 * (np.asarray(size) - 1.0)
+    out = np.eye(3)
+    out[:2, :2], out[:2, 2] = A, middle - A @ middle
+    return out
+
+
+def _rotation(rng: np.random.Generator, most_deg: float) -> Float:
+    angle = np.deg2rad(rng.uniform(-most_deg, most_deg))
+    return np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+
+
+def disturbed(view: View, rng: np.random.Generator) -> View:
+    """A copy of ``view`` in other light: exposure, gamma, contrast, brightness, blur and noise, at random."""
+    import cv2
+
+    def happens() -> bool:
+        return bool(rng.random() < _DISTURBED)
+
+    out = view.astype(np.float32)
+    if happens():
+        out = np.minimum(out * np.float32(np.exp(rng.uniform(*np.log(_EXPOSURE)))), 1.0)
+    if happens():
+        out = out ** np.float32(np.exp(rng.uniform(*np.log(_GAMMA))))
+    if happens():
+        mean = out.mean()
+        out = (out - mean) * np.float32(rng.uniform(*_CONTRAST)) + mean
+    if happens():
+        out = out + np.float32(rng.uniform(-_BRIGHTNESS, _BRIGHTNESS))
+    if happens():
+        out = cv2.GaussianBlur(out, (0, 0), rng.uniform(0.1, _BLUR_SIGMA_PX))
+    if happens():
+        out = cv2.filter2D(out, -1, line_kernel(rng.uniform(1.0, _MOTION_BLUR_PX), rng.uniform(0.0, np.pi)))
+    if happens():
+        out = out + rng.normal(0.0, rng.uniform(0.0, _NOISE_SIGMA), out.shape).astype(np.float32)
+    clipped: View = np.clip(out, 0.0, 1.0, dtype=np.float32)
+    return clipped
+
+
+def _view(pixels: NDArray[np.uint8], H: Float, size: tuple[int, int]) -> View:
     import cv2
 
     # Reflected beyond its edges, the image is the same plane in every view.
@@ -111,6 +278,6 @@ def _order(k: int, count: int, seed: int) -> int:
     return int(np.random.default_rng([seed, 0, epoch]).permutation(count)[place])
 
 
-def _images(images: Sequence[NDArray[np.float32]]) -> Tensor:
-    stacked = np.stack(images)
+def _images(views: Sequence[View]) -> Tensor:
+    stacked = np.stack(views)
     return torch.from_numpy(stacked[:, None] if stacked.ndim == 3 else stacked.transpose(0, 3, 1, 2)).contiguous()

@@ -1,36 +1,58 @@
-"""The trainer behind ``vioframe train keypointnet``: images in, a folder with checkpoint, log and weights out."""
+"""The trainer behind ``vioframe train keypointnet``: images in, a folder with checkpoint, log and weights out.
+
+A step depends on nothing but its number, and the checkpoint holds all that the next one needs.
+"""
 
 from __future__ import annotations
 
 import csv
 import os
-from collections.abc import Iterator, Mapping
-from dataclasses import asdict
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
+from torch import Tensor
+from torch.nn import Module
+from torch.optim import Adam
 
+from vioframe.bench.detectors.images import random_homography
+from vioframe.bench.detectors.metrics import score_pair
 from vioframe.errors import ConfigError
-from vioframe.types import Image, TrainingJob, TrainingStep
+from vioframe.types import TrainingJob, TrainingStep
 from vioframe_keypointnet import weights
+from vioframe_keypointnet.detector import KeypointNet as Detector
+from vioframe_keypointnet.detector import chooser
+from vioframe_keypointnet.network import KeypointNet
 from vioframe_keypointnet.quantisation import measure_ranges
-from vioframe_keypointnet.training.images import gather, split
-from vioframe_keypointnet.training.loop import Training
+from vioframe_keypointnet.runtimes import Torch
+from vioframe_keypointnet.selection import Rules
+from vioframe_keypointnet.training.losses import InlierOutlierNet, losses, matching_loss, teach
 from vioframe_keypointnet.training.options import TrainingOptions
-from vioframe_keypointnet.training.validation import validate
+from vioframe_keypointnet.training.samples import Batch, Picture, batch, gather, grey_of, split
+
+CHECKPOINT, LOG, WEIGHTS = "checkpoint.pt", "log.csv", "keypointnet.safetensors"
 
 _CALIBRATION_IMAGES = 64
 """Images on which the reach of each layer is measured for int8."""
+_VALIDATION_IMAGES = 50
+"""At most so many of the images held out are looked at after each epoch."""
+_VALIDATION_SIZE, _VALIDATION_TOP = (320, 240), 300
+_DESCRIPTOR_WEIGHT = 2.0
+"""As published; the other losses have weight one."""
 
-CHECKPOINT, LOG, WEIGHTS = "checkpoint.pt", "log.csv", "keypointnet.safetensors"
+_FREE = frozenset({"epochs", "device", "threads"})
+"""What may be chosen anew when a training goes on."""
+_OTHER_NETWORK = "the weights to start from are of another network than {!r}; choose it with -o network="
 
 
 class KeypointNetTrainer:
     """Trains a KeypointNet, or goes on training one."""
 
-    def __init__(self, job: TrainingJob, options: TrainingOptions | None = None) -> None:
-        options = options or TrainingOptions()
+    def __init__(self, job: TrainingJob, options: TrainingOptions) -> None:
         self._job = job
         self._options = options
         checkpoint = job.out / CHECKPOINT
@@ -40,11 +62,11 @@ class KeypointNetTrainer:
             raise ConfigError(f"{checkpoint} does not exist, so there is nothing to resume; leave out --resume")
         pictures = gather(job.images, options.architecture.image_channels, options.frames_per_recording)
         train, held_out = split(pictures, job.hold_out)
-        self._held_out = held_out[: options.validation_images]
+        self._held_out = held_out[:_VALIDATION_IMAGES]
         self._training = Training(options, train)
         self._counts = len(train), len(held_out)
         every = max(1, len(train) // _CALIBRATION_IMAGES)
-        self._sample = [_grey(picture.pixels) for picture in train[::every][:_CALIBRATION_IMAGES]]
+        self._sample = [grey_of(picture.pixels) for picture in train[::every][:_CALIBRATION_IMAGES]]
         self._history: list[Mapping[str, float]] = []
         if job.resume:
             self._history = self._training.resume(checkpoint)
@@ -54,49 +76,217 @@ class KeypointNetTrainer:
     def train(self) -> Iterator[TrainingStep]:
         """Train to the end; however it ends, what is done stays in the checkpoint."""
         self._job.out.mkdir(parents=True, exist_ok=True)
-        training, losses = self._training, []
+        training, of_epoch = self._training, []
         try:
             for values in training.steps():
-                losses.append(values)
+                of_epoch.append(values)
                 summary: Mapping[str, float] | None = None
                 if training.step % training.epoch_steps == 0:
-                    summary = self._end_epoch(losses)
-                    losses = []
+                    summary = self._end_epoch(of_epoch)
+                    of_epoch = []
                 yield TrainingStep(training.step, training.total_steps, values, summary)
         finally:
             training.save(self._job.out / CHECKPOINT, self._history)
         self._write_weights()
 
-    def _end_epoch(self, losses: list[Mapping[str, float]]) -> Mapping[str, float]:
+    def _end_epoch(self, of_epoch: list[Mapping[str, float]]) -> Mapping[str, float]:
         training = self._training
         row = {"epoch": training.step // training.epoch_steps}
-        row |= {name: float(np.mean([values[name] for values in losses])) for name in losses[0]}
+        row |= {name: float(np.mean([values[name] for values in of_epoch])) for name in of_epoch[0]}
         if self._held_out:
-            row |= asdict(validate(training.network, self._held_out, self._options.seed))
+            row |= asdict(validate(training.weights(), self._held_out, self._options.seed))
         self._history.append(row)
         training.save(self._job.out / CHECKPOINT, self._history)
         _write_csv(self._job.out / LOG, self._history)
         return row
 
     def _write_weights(self) -> None:
-        options = self._options
         card = {
             "images": [path.name for path in self._job.images],
             "trained_on": self._counts[0],
             "held_out": self._counts[1],
             "started_from": None if self._job.start_from is None else Path(self._job.start_from).name,
-            "options": asdict(options),
+            "options": asdict(self._options),
             "result": dict(self._history[-1]) if self._history else {},
         }
-        tensors, architecture = self._training.tensors(), options.architecture
-        ranges = measure_ranges(weights.Weights(architecture, tensors), self._sample)
-        weights.save(self._job.out / WEIGHTS, tensors, architecture, card, ranges)
+        made = self._training.weights()
+        ranges = measure_ranges(made, self._sample)
+        weights.save(self._job.out / WEIGHTS, made.tensors, made.architecture, card, ranges)
 
 
-def _grey(pixels: NDArray[np.uint8]) -> Image:
+class Training:
+    """A network in training on ``pictures``; ``step`` counts what is done of it."""
+
+    def __init__(self, options: TrainingOptions, pictures: Sequence[Picture]) -> None:
+        self.options = options
+        self._pictures = pictures
+        self._device = _device(options.device)
+        if options.threads:
+            torch.set_num_threads(options.threads)
+        torch.manual_seed(options.seed)
+        network = KeypointNet(options.architecture, options.dropout)
+        self.network = network.to(self._device, memory_format=torch.channels_last)
+        self.judge = InlierOutlierNet().to(self._device)
+        self._frozen = _detecting(self.network) if options.descriptors_only else []
+        for part in self._frozen:
+            part.requires_grad_(False)
+        trained = [p for p in (*self.network.parameters(), *self.judge.parameters()) if p.requires_grad]
+        self._optimiser = Adam(trained, lr=options.learning_rate)
+        self.step = 0
+
+    @property
+    def epoch_steps(self) -> int:
+        """Steps an epoch."""
+        return max(1, (self.options.epoch_samples or len(self._pictures)) // self.options.batch)
+
+    @property
+    def total_steps(self) -> int:
+        return self.epoch_steps * self.options.epochs
+
+    def start_from(self, tensors: Mapping[str, NDArray[Any]]) -> None:
+        """Fine-tune: begin with the weights of a network of the same architecture."""
+        state = {name: torch.from_numpy(np.array(values)) for name, values in tensors.items()}
+        try:
+            missing, unexpected = self.network.load_state_dict(state, strict=False)
+        except RuntimeError as error:
+            raise ConfigError(_OTHER_NETWORK.format(self.options.network)) from error
+        if unexpected or any(not name.endswith("num_batches_tracked") for name in missing):
+            raise ConfigError(_OTHER_NETWORK.format(self.options.network))
+
+    def steps(self) -> Iterator[Mapping[str, float]]:
+        """Train to the end; yields each step's losses by name."""
+        self.network.train()
+        self.judge.train()
+        for part in self._frozen:
+            part.eval()
+        while self.step < self.total_steps:
+            epoch = self.step // self.epoch_steps
+            rate = self.options.learning_rate * 0.5 ** sum(epoch >= e for e in self.options.halve_at)
+            for group in self._optimiser.param_groups:
+                group["lr"] = rate
+            taught = epoch < self.options.lesson_epochs
+            corners_taught = taught and not self.options.descriptors_only
+            pairs = batch(self._pictures, self.options, self.step, corners_taught=corners_taught).to(self._device)
+            # Dropout, too, depends on the number of the step alone.
+            torch.manual_seed(int(np.random.default_rng([self.options.seed, 3, self.step]).integers(2**62)))
+            values = step_losses(self.network, self.judge, self.options, pairs, taught=taught)
+            self._optimiser.zero_grad(set_to_none=True)
+            values["total"].backward()  # type: ignore[no-untyped-call]
+            self._optimiser.step()
+            self.step += 1
+            yield {name: float(value.detach()) for name, value in values.items()}
+
+    def save(self, path: Path, history: Sequence[Mapping[str, float]]) -> None:
+        """Write all that the training depends on, whole or not at all; ``history`` goes along."""
+        part = path.with_name(f"{path.name}.part")
+        torch.save(
+            {
+                "options": asdict(self.options),
+                "step": self.step,
+                "network": self.network.state_dict(),
+                "judge": self.judge.state_dict(),
+                "optimiser": self._optimiser.state_dict(),
+                "history": [dict(row) for row in history],
+            },
+            part,
+        )
+        os.replace(part, path)
+
+    def resume(self, path: Path) -> list[Mapping[str, float]]:
+        """Go on from what :meth:`save` wrote, and return the history that went along.
+
+        Raises :class:`ConfigError` where it is damaged, or of a training that other options determined.
+        """
+        try:
+            kept = torch.load(path, map_location=self._device, weights_only=True)
+            before = {name: value for name, value in kept["options"].items() if name not in _FREE}
+        except Exception as error:  # torch raises many kinds
+            raise ConfigError(f"{path} is damaged or no checkpoint of a training; train anew") from error
+        now = {name: value for name, value in asdict(self.options).items() if name not in _FREE}
+        if before != now:
+            changed = ", ".join(sorted(name for name in now if before.get(name) != now[name]))
+            raise ConfigError(f"{path} is of a training with other options ({changed}); resume with the same")
+        self.network.load_state_dict(kept["network"])
+        self.judge.load_state_dict(kept["judge"])
+        self._optimiser.load_state_dict(kept["optimiser"])
+        self.step = kept["step"]
+        return list(kept["history"])
+
+    def weights(self) -> weights.Weights:
+        """The network's weights as they are now."""
+        state = self.network.state_dict()
+        tensors = {n: x.cpu().numpy().copy() for n, x in state.items() if not n.endswith("num_batches_tracked")}
+        return weights.Weights(self.options.architecture, tensors)
+
+
+def step_losses(
+    network: KeypointNet,
+    judge: InlierOutlierNet,
+    options: TrainingOptions,
+    pairs: Batch,
+    *,
+    taught: bool = False,
+) -> dict[str, Tensor]:
+    """The losses of a batch of pairs, of the lessons where it is ``taught``; ``total`` is what is minimised."""
+    with torch.autocast(pairs.source.device.type, torch.bfloat16, enabled=options.precision == "bfloat16"):
+        seen = [network(x.contiguous(memory_format=torch.channels_last)) for x in (pairs.source, pairs.target)]
+    a, b = (replace(d, descriptors=d.descriptors.float()) for d in seen)
+    if taught:
+        values = {"matching": matching_loss(a, b, pairs.homography)}
+        if not options.descriptors_only:
+            values |= teach(a, b, pairs.source_lesson, pairs.target_lesson)
+        return values | {"total": sum(values.values(), torch.zeros(()))}
+    values = dict(losses(a, b, pairs.homography, judge))
+    if options.descriptors_only:
+        return {"descriptor": values["descriptor"], "total": values["descriptor"]}
+    values["total"] = (
+        values["location"] + _DESCRIPTOR_WEIGHT * values["descriptor"] + values["score"] + values["inlier"]
+    )
+    return values
+
+
+@dataclass(frozen=True, slots=True)
+class Validation:
+    """Means over the held-out images."""
+
+    repeatability: float
+    """Share of the 300 strongest points of one view that have one of the other's within 3 px, either way."""
+    localisation_px: float
+    """Mean distance of those."""
+
+
+def validate(made: weights.Weights, pictures: Sequence[Picture], seed: int) -> Validation:
+    """How repeatable points are on images not trained on: under one synthetic homography each, at 320 x 240."""
     import cv2
 
-    return pixels if pixels.ndim == 2 else cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY)
+    run = Torch(made, descriptors=False, device="cpu", precision="float32", threads=0)
+    detector = Detector(run, chooser(made.architecture, Rules(nms_px=4.0, min_contrast=0)), "torch", "float32")
+    scores = []
+    for k, picture in enumerate(pictures):
+        image = cv2.resize(grey_of(picture.pixels), _VALIDATION_SIZE, interpolation=cv2.INTER_AREA)
+        H_21 = random_homography(np.random.default_rng([seed, 2, k]), _VALIDATION_SIZE)
+        moved = cv2.warpPerspective(image, H_21, _VALIDATION_SIZE, flags=cv2.INTER_LINEAR)
+        # Some of the points of one view the other does not show.
+        found = [detector.detect(view.astype(np.uint8, copy=False), 4 * _VALIDATION_TOP) for view in (image, moved)]
+        scores.append(score_pair(*found, H_21, _VALIDATION_SIZE, _VALIDATION_TOP))
+    # Where nothing was found again there is no distance.
+    distances = np.array([score.localisation_px for score in scores], np.float64)
+    return Validation(float(np.mean([score.repeatability for score in scores])), float(np.nanmean(distances)))
+
+
+def _detecting(network: KeypointNet) -> list[Module]:
+    """The layers that keypoints depend on; the rest only serves descriptors and, of a network of peaks, training."""
+    if network.architecture.peaks:
+        names = [*(f"conv{name}" for name, *_ in network.architecture.encoder if name < "3"), "convR"]
+    else:
+        names = [*(f"conv{name}" for name, *_ in network.architecture.encoder), "convDa", "convDb", "convPa", "convPb"]
+    return [network.get_submodule(name) for name in names]
+
+
+def _device(wanted: str) -> torch.device:
+    if wanted == "cuda" and not torch.cuda.is_available():
+        raise ConfigError("device is cuda, but torch sees no CUDA device; choose auto or cpu")
+    return torch.device("cuda" if wanted != "cpu" and torch.cuda.is_available() else "cpu")
 
 
 def _write_csv(path: Path, rows: list[Mapping[str, float]]) -> None:

@@ -8,13 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from vioframe.errors import ConfigError
 from vioframe.parts.options import did_you_mean
-from vioframe.simulation.sensor import digitise
+from vioframe.simulation.camera import digitise
 from vioframe.types import Float, Image
 
 _WHITE = 255.0
@@ -54,6 +55,11 @@ class Degradation:
     @property
     def label(self) -> str:
         return self.name if self.name == "none" else f"{self.name} {KINDS[self.name].unit.format(self.level)}"
+
+    @property
+    def columns(self) -> dict[str, Any]:
+        """What says in a table which it is."""
+        return {"degradation": self.name, "level": self.level}
 
     def __call__(self, image: Image, circumstances: Circumstances) -> Image:
         """``image`` (H, W) made worse; it is left as it is."""

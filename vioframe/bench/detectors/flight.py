@@ -8,15 +8,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
 from vioframe.bench.detectors.degradations import Circumstances, Degradation
 from vioframe.bench.detectors.entrants import Entrant
-from vioframe.bench.detectors.leads import BASELINE, lead_of_shares
-from vioframe.bench.detectors.tracks import coverage, lives
-from vioframe.bench.epipolar import epipolar_errors_px
+from vioframe.bench.detectors.tables import BASELINE, CONFIDENCE
 from vioframe.bench.processes import map_in_processes, single_threaded
-from vioframe.bench.results import Row
 from vioframe.errors import ConfigError, DatasetError
+from vioframe.evaluation.epipolar import epipolar_errors_px
 from vioframe.frontend import Frontend, FrontendOptions
 from vioframe.frontend.refill import GRID
 from vioframe.geometry.trajectory import Trajectory
@@ -26,7 +25,7 @@ from vioframe.io.synchronise import synchronise
 from vioframe.io.trajectories import load_trajectory
 from vioframe.parts import registry
 from vioframe.parts.registry import Registry
-from vioframe.types import NS_PER_S, Float, FrameSet, FrameTracks, ImuSegment
+from vioframe.types import NS_PER_S, Float, FrameSet, FrameTracks, ImuSegment, Int
 
 SURVIVAL_FRAMES = (5, 10, 20)
 BASELINE_FRAMES = 5
@@ -52,7 +51,6 @@ class _Job:
     entrants: tuple[Entrant, ...]
     degradation: Degradation
     seed: int
-    baseline: str
 
 
 def fly_detectors(
@@ -64,14 +62,16 @@ def fly_detectors(
     workers: int,
     baseline: str = BASELINE,
     on_flight: Callable[[int], None] = lambda count: None,
-) -> list[Row]:
+) -> pd.DataFrame:
     """A row an entrant and degradation, the same whatever the number of ``workers``.
 
-    Leads are over the entrant of the label ``baseline``; ``on_flight`` counts flights.
+    ``lead_survival_N`` are leads over the entrant of the label ``baseline``, with half the width of their 95 %
+    interval, every track counting as one that goes its own way; ``on_flight`` counts flights.
     """
-    jobs = [_Job(stretch, tuple(entrants), degradation, seed, baseline) for degradation in degradations]
+    jobs = [_Job(stretch, tuple(entrants), degradation, seed) for degradation in degradations]
     parts = map_in_processes(_fly, jobs, workers, lambda part: on_flight(1))
-    return [row for part in parts for row in part]
+    rows = pd.DataFrame([row for part in parts for row in part])
+    return _with_leads(rows, baseline) if (rows["detector"] == baseline).any() else rows
 
 
 def check(stretch: Stretch, installed: Registry) -> str:
@@ -84,7 +84,7 @@ def check(stretch: Stretch, installed: Registry) -> str:
     return dataset.name
 
 
-def _fly(job: _Job) -> list[Row]:
+def _fly(job: _Job) -> list[dict[str, Any]]:
     installed = registry.load()
     dataset = installed.open_dataset(job.stretch.path)
     options = FrontendOptions()
@@ -103,30 +103,32 @@ def _fly(job: _Job) -> list[Row]:
         for imu, frames in degraded(dataset, job.stretch, job.degradation, job.seed):
             for label, frontend in frontends.items():
                 steps[label].append(frontend.track(imu, frames, dataset.calibration))
-    rows: list[Row] = [
+    truth = truth_of(dataset, job.stretch)
+    return [
         {
             "detector": label,
-            "degradation": job.degradation.name,
-            "level": job.degradation.level,
-            **track_figures(tracks, dataset, truth_of(dataset, job.stretch)),
-            "incidents": dict(incidents[label].counts),
+            **job.degradation.columns,
+            **track_figures(tracks, dataset, truth),
+            "incidents": ", ".join(f"{count} {kind}" for kind, count in incidents[label].counts.items()),
         }
         for label, tracks in steps.items()
     ]
-    baseline = next((row for row in rows if row["detector"] == job.baseline), None)
-    return rows if baseline is None else [_with_leads(row, baseline) for row in rows]
 
 
-def _with_leads(row: Row, baseline: Row) -> Row:
-    """``row`` with its leads in survival over ``baseline``, of as many frames as both can tell."""
-    if row is baseline:
-        return row
-    leads = {
-        n: lead_of_shares(row["survival"][n], row["tracks"][n], baseline["survival"][n], baseline["tracks"][n])
-        for n in row["survival"]
-        if row["tracks"][n] and baseline["tracks"][n]
-    }
-    return {**row, "lead": {"survival": leads}}
+def _with_leads(rows: pd.DataFrame, baseline: str) -> pd.DataFrame:
+    """``rows`` with their leads in survival over ``baseline``; missing where either cannot tell."""
+    of_baseline = rows[["degradation", "level"]].merge(rows[rows["detector"] == baseline], how="left")
+    leads = {}
+    for n in SURVIVAL_FRAMES:
+        variance = pd.Series(0.0, rows.index)
+        for each in (rows, of_baseline):
+            share = each[f"survival_{n}"].astype(float)
+            variance += share * (1.0 - share) / each[f"tracks_{n}"]
+        lead = rows[f"survival_{n}"].astype(float) - of_baseline[f"survival_{n}"].astype(float)
+        known = (rows["detector"] != baseline) & lead.notna()
+        leads[f"lead_survival_{n}"] = lead.where(known)
+        leads[f"lead_survival_{n}_half_width"] = (CONFIDENCE * variance**0.5).where(known)
+    return rows.assign(**leads)
 
 
 def degraded(
@@ -169,8 +171,8 @@ def track_figures(steps: Sequence[FrameTracks], dataset: Dataset, truth: Traject
     return {
         "frames": len(steps),
         "alive": float(np.mean([len(step.ids) for step in steps])),
-        "survival": {str(n): life.share(n) for n in SURVIVAL_FRAMES},
-        "tracks": {str(n): int(life.known[n]) if n < len(steps) else 0 for n in SURVIVAL_FRAMES},
+        **{f"survival_{n}": life.share(n) for n in SURVIVAL_FRAMES},
+        **{f"tracks_{n}": int(life.known[n]) if n < len(steps) else 0 for n in SURVIVAL_FRAMES},
         "median_life": life.median,
         "epipolar_inliers": float(np.mean(errors_px <= INLIER_PX)) if len(errors_px) else None,
         "epipolar_median_px": float(np.median(errors_px)) if len(errors_px) else None,
@@ -186,3 +188,51 @@ def truth_of(dataset: Dataset, stretch: Stretch) -> Trajectory:
             f"{dataset.name} brings no ground truth to judge tracks by; name a file of it with --ground-truth"
         )
     return truth
+
+
+@dataclass(frozen=True, slots=True)
+class Lives:
+    """``alive`` (N,) tracks were still there n = 0 .. N - 1 frames after they were born, of ``known`` (N,) tracks that
+    were born early enough to be seen for so long."""
+
+    alive: Int
+    known: Int
+
+    def share(self, frames: int) -> float | None:
+        """Part of the tracks that live for so long; None where nobody can know."""
+        if frames >= len(self.known) or not self.known[frames]:
+            return None
+        return float(self.alive[frames] / self.known[frames])
+
+    @property
+    def median(self) -> int | None:
+        """Frames after which fewer than half are alive; None where that is never seen."""
+        below = np.flatnonzero(2 * self.alive < self.known)
+        return int(below[0]) if len(below) else None
+
+
+def lives(steps: Sequence[FrameTracks]) -> Lives:
+    """How long the tracks of successive frames live, one at least.
+
+    An id that is gone does not come back, as :class:`vioframe.frontend.Frontend` promises.
+    """
+    count = len(steps)
+    ids = np.concatenate([step.ids for step in steps])
+    frame = np.repeat(np.arange(count), [len(step.ids) for step in steps])
+    _, first, lived = np.unique(ids, return_index=True, return_counts=True)
+    born = frame[first]  # unique() gives the first place of each id, and frames ascend
+    known = np.cumsum(np.bincount(born, minlength=count))[::-1]  # n frames before the end, or earlier
+    # Of those that lived n + 1 frames or longer, all were born early enough.
+    alive = np.cumsum(np.bincount(lived - 1, minlength=count)[::-1])[::-1]
+    return Lives(alive, known)
+
+
+def coverage(steps: Sequence[FrameTracks], resolution: tuple[int, int], grid: tuple[int, int]) -> float:
+    """Share of the cells of a ``grid`` (rows, columns) over the image that hold a point, mean over the frames."""
+    rows, columns = grid
+    shares = []
+    for step in steps:
+        cell = np.floor((step.xy + 0.5) / np.array(resolution) * (columns, rows)).astype(np.int64)
+        cell = np.clip(cell, 0, (columns - 1, rows - 1))
+        shares.append(len(np.unique(cell[:, 1] * columns + cell[:, 0])) / (rows * columns))
+    return float(np.mean(shares))

@@ -1,8 +1,10 @@
-"""Images to try detectors on, and views of them at the size wanted."""
+"""Images to try detectors on: from folders, recordings or drawn, and pairs of views whose homography is known."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
 from itertools import islice
 from pathlib import Path
 from typing import TypeVar
@@ -17,6 +19,25 @@ from vioframe.types import Float, FrameSet, Image
 ItemT = TypeVar("ItemT")
 
 _SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm")
+
+_ROTATION_DEG = 30.0
+_SCALE = 1.25
+_PERSPECTIVE = 0.08
+_SHIFT = 0.1
+_HPATCHES_VIEWS = range(2, 7)
+
+
+@dataclass(frozen=True, slots=True)
+class Views:
+    """Two images of one size; ``H_21`` (3, 3) takes px of the first to px of the second."""
+
+    first: Image
+    second: Image
+    H_21: Float
+
+
+Pair = Callable[[tuple[int, int]], Views]
+"""Two views yet to be loaded, at a resolution (width, height); raises :class:`DatasetError` where that fails."""
 
 
 def find_images(folder: Path) -> list[Path]:
@@ -88,3 +109,72 @@ def procedural_images(count: int, resolution: tuple[int, int], seed: int) -> lis
     from vioframe.simulation.textures import procedural_textures
 
     return [fit(texture, resolution) for texture in procedural_textures(np.random.default_rng(seed), count)]
+
+
+def synthetic_pair(path: Path, seed: tuple[int, ...], resolution: tuple[int, int]) -> Views:
+    """A photograph, and the same through a homography drawn by ``seed``."""
+    image = read_grey(path)
+    A = fitting(image.shape, resolution)
+    H_21 = random_homography(np.random.default_rng(seed), resolution)
+    # Both straight from the photograph: the second is no blurrier for having been warped.
+    first, second = (view(image, H @ A, resolution, A[0, 0]) for H in (np.eye(3), H_21))
+    return Views(first, second, H_21)
+
+
+def hpatches_pair(folder: Path, k: int, resolution: tuple[int, int]) -> Views:
+    """Images 1 and ``k`` of a sequence of HPatches (Balntas et al., CVPR 2017)."""
+    images = [read_grey(folder / f"{n}.ppm") for n in (1, k)]
+    A_1, A_2 = (fitting(image.shape, resolution) for image in images)
+    H_21 = A_2 @ _read_homography(folder / f"H_1_{k}") @ np.linalg.inv(A_1)
+    first, second = (view(i, A, resolution, A[0, 0]) for i, A in zip(images, (A_1, A_2), strict=True))
+    return Views(first, second, H_21 / H_21[2, 2])
+
+
+def synthetic_pairs(folder: Path, seed: int) -> list[Pair]:
+    """A pair for every image in ``folder``; raises :class:`DatasetError` where there is none."""
+    return [partial(synthetic_pair, path, (seed, k)) for k, path in enumerate(find_images(folder))]
+
+
+def hpatches_pairs(folder: Path) -> list[Pair]:
+    """The five pairs of each sequence in ``folder``; raises :class:`DatasetError` where that is not HPatches."""
+    sequences = sorted(path for kind in "iv" for path in folder.glob(f"{kind}_*") if path.is_dir())
+    if not sequences:
+        raise DatasetError(f"{folder} has no folders i_* and v_*; name that of HPatches (hpatches-sequences-release)")
+    for sequence in sequences:
+        for name in ("1.ppm", *(f"{k}.ppm" for k in _HPATCHES_VIEWS), *(f"H_1_{k}" for k in _HPATCHES_VIEWS)):
+            if not (sequence / name).is_file():
+                raise DatasetError(
+                    f"{sequence / name} is missing; a sequence of HPatches has 1.ppm to 6.ppm and H_1_2 to H_1_6"
+                )
+    return [partial(hpatches_pair, sequence, k) for sequence in sequences for k in _HPATCHES_VIEWS]
+
+
+def random_homography(rng: np.random.Generator, resolution: tuple[int, int]) -> Float:
+    """(3, 3), from px to px: rotation to 30 deg, scale 0.8 to 1.25, shift to 10 %, each corner by 8 % of the size."""
+    import cv2
+
+    size = np.array(resolution, np.float64)
+    corners = corners_of(resolution)
+    centre = 0.5 * (size - 1.0)
+    angle = np.deg2rad(rng.uniform(-_ROTATION_DEG, _ROTATION_DEG))
+    scale = np.exp(rng.uniform(-np.log(_SCALE), np.log(_SCALE)))
+    R = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    bent = corners + size * rng.uniform(-_PERSPECTIVE, _PERSPECTIVE, (4, 2))
+    moved = scale * (bent - centre) @ R.T + centre + size * rng.uniform(-_SHIFT, _SHIFT, 2)
+    return np.asarray(cv2.getPerspectiveTransform(corners.astype(np.float32), moved.astype(np.float32)))
+
+
+def corners_of(resolution: tuple[int, int]) -> Float:
+    """(4, 2) px of the outermost pixel centres."""
+    width, height = resolution
+    return np.array([[0.0, 0.0], [width - 1.0, 0.0], [width - 1.0, height - 1.0], [0.0, height - 1.0]])
+
+
+def _read_homography(path: Path) -> Float:
+    try:
+        H = np.loadtxt(path)
+    except ValueError as error:
+        raise DatasetError(f"{path} is no homography: {error}") from error
+    if H.shape != (3, 3) or not np.isfinite(H).all() or abs(np.linalg.det(H)) < 1e-12:
+        raise DatasetError(f"{path} is no homography: it must hold three rows of three numbers, of full rank")
+    return H

@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
 from vioframe.bench.detectors.degradations import Circumstances, Degradation
 from vioframe.bench.detectors.entrants import Entrant, detect
-from vioframe.bench.detectors.leads import BASELINE, lead_of_pairs
-from vioframe.bench.detectors.metrics import CORNERS_WITHIN_PX, PairScore, score_pair
-from vioframe.bench.detectors.pairs import Pair, Views
+from vioframe.bench.detectors.images import Pair, Views
+from vioframe.bench.detectors.metrics import CORNERS_WITHIN_PX, score_pair
+from vioframe.bench.detectors.tables import BASELINE, CASE, CONFIDENCE
 from vioframe.bench.processes import map_in_processes, single_threaded
-from vioframe.bench.results import Row
 from vioframe.parts import registry
 from vioframe.types import Image
 
@@ -23,12 +23,10 @@ TOP_K = 300
 LEADS = ("repeatability", "distinct")
 """The figures that leads are stated for."""
 
+_SPREAD = (*LEADS, "localisation_px", "matching_score")
 # Asked of a detector before those that only one view shows are left out.
 _CANDIDATES = 4 * TOP_K
 _LARGEST_JOB = 8
-
-Scores = Mapping[tuple[str, Degradation], Sequence[PairScore]]
-"""By detector's label and degradation, in the order of the pairs."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,11 +47,12 @@ def score_detectors(
     seed: int,
     workers: int,
     on_pairs: Callable[[int], None] = lambda count: None,
-) -> Scores:
-    """Every entrant on every pair under every degradation, the same whatever the number of ``workers``.
+) -> pd.DataFrame:
+    """Every entrant on every pair under every degradation, a row each, the same whatever the number of ``workers``.
 
-    Both views are degraded, each by noise of its own and along a direction of its own; only the second changes its
-    brightness. ``on_pairs`` is told how many pairs were done.
+    A row is a :class:`~vioframe.bench.detectors.metrics.PairScore` with its ``detector``, ``degradation``, ``level``
+    and ``pair``. Both views are degraded, each by noise of its own and along a direction of its own; only the second
+    changes its brightness. ``on_pairs`` is told how many pairs were done.
     """
     size = min(_LARGEST_JOB, -(-len(pairs) // workers))
     numbered = list(enumerate(pairs))
@@ -61,78 +60,54 @@ def score_detectors(
         _Job(tuple(numbered[k : k + size]), tuple(entrants), tuple(degradations), seed)
         for k in range(0, len(pairs), size)
     ]
-    parts = map_in_processes(_score, jobs, workers, lambda part: on_pairs(len(next(iter(part.values())))))
-    return {key: [score for part in parts for score in part[key]] for key in parts[0]}
+    parts = map_in_processes(_score, jobs, workers, lambda part: on_pairs(len({row["pair"] for row in part})))
+    return pd.DataFrame([row for part in parts for row in part])
 
 
-def _score(job: _Job) -> dict[tuple[str, Degradation], list[PairScore]]:
+def _score(job: _Job) -> list[dict[str, Any]]:
     installed = registry.load()
     ready = [(entrant, installed.create_detector(entrant.name, entrant.options)) for entrant in job.entrants]
-    scores: dict[tuple[str, Degradation], list[PairScore]] = {
-        (entrant.label, degradation): [] for degradation in job.degradations for entrant in job.entrants
-    }
+    rows = []
     with single_threaded():
         for number, pair in job.pairs:
-            views = pair.load(RESOLUTION)
+            views = pair(RESOLUTION)
             for degradation in job.degradations:
-                first, second = _degraded(views, degradation, (job.seed, number))
+                images = _degraded(views, degradation, (job.seed, number))
                 for entrant, detector in ready:
-                    found = [detect(entrant, detector, image, _CANDIDATES) for image in (first, second)]
-                    score = score_pair(found[0], found[1], views.H_21, RESOLUTION, TOP_K)
-                    scores[entrant.label, degradation].append(score)
-    return scores
+                    first, second = (detect(entrant, detector, image, _CANDIDATES) for image in images)
+                    score = score_pair(first, second, views.H_21, RESOLUTION, TOP_K)
+                    rows.append({"detector": entrant.label, **degradation.columns, "pair": number, **asdict(score)})
+    return rows
 
 
-def _degraded(views: Views, degradation: Degradation, seed: tuple[int, ...]) -> tuple[Image, Image]:
+def _degraded(views: Views, degradation: Degradation, seed: tuple[int, ...]) -> list[Image]:
     """Both views: noise and direction of each its own, brightness that of the first unchanged."""
     rng = np.random.default_rng((*seed, *degradation.name.encode()))
-    first, second = (
+    return [
         degradation(image, Circumstances(rng, direction_rad=float(rng.uniform(0.0, np.pi)), phase=phase))
         for image, phase in ((views.first, 0.0), (views.second, 1.0))
-    )
-    return first, second
-
-
-def quality_rows(scores: Scores, baseline: str = BASELINE) -> list[Row]:
-    """A row a detector and degradation: means over the pairs, spreads, and leads over the label ``baseline``."""
-    return [
-        quality_row(label, degradation, of_it, None if label == baseline else scores.get((baseline, degradation)))
-        for (label, degradation), of_it in scores.items()
     ]
 
 
-def quality_row(
-    label: str, degradation: Degradation, scores: Sequence[PairScore], baseline: Sequence[PairScore] | None
-) -> Row:
-    """Mean, standard deviation and number for each figure, shares of right homographies, and the lead.
+def summary(scores: pd.DataFrame, baseline: str = BASELINE) -> pd.DataFrame:
+    """A row a detector and degradation: means over the pairs, their deviations, shares of right homographies, leads.
 
-    The leads over ``baseline``, on the same pairs, come with the half width of their 95 % confidence interval; ``won``
-    and ``lost`` are leads that exceed it.
+    ``lead_X`` is that in X over the detector ``baseline`` on the same pairs, ``lead_X_half_width`` half its 95 %
+    interval by the normal law; missing where there are no two pairs. What cannot be told, as without descriptors, is
+    missing too.
     """
-    row: dict[str, Any] = {
-        "detector": label,
-        "degradation": degradation.name,
-        "level": degradation.level,
-        "pairs": len(scores),
-        "points": float(np.mean([s.points for s in scores])),
-        "repeatability": _spread([s.repeatability for s in scores]),
-        "distinct": _spread([s.distinct for s in scores]),
-        "localisation_px": _spread([s.localisation_px for s in scores]),
-        "matching_score": _spread([s.matching_score for s in scores]),
-    }
-    errors = [s.corner_error_px for s in scores if s.corner_error_px is not None]
-    if errors:
-        row["homography"] = {f"{px:g}px": float(np.mean(np.array(errors) <= px)) for px in CORNERS_WITHIN_PX}
-    if baseline is not None:
-        row["lead"] = {
-            figure: lead_of_pairs(*(np.array([getattr(s, figure) for s in of]) for of in (scores, baseline)))
-            for figure in LEADS
-        }
-    return row
-
-
-def _spread(values: Sequence[float | None]) -> dict[str, Any] | None:
-    known = [value for value in values if value is not None]
-    if not known:
-        return None
-    return {"mean": float(np.mean(known)), "sd": float(np.std(known)), "of": len(known)}
+    scores = scores.astype(dict.fromkeys((*_SPREAD, "corner_error_px"), float))
+    cases = scores.groupby(CASE, sort=False)
+    out = cases.agg(pairs=("pair", "size"), points=("points", "mean"))
+    for figure in _SPREAD:
+        out[figure], out[f"{figure}_sd"] = cases[figure].mean(), cases[figure].std(ddof=0)
+    error_px = scores["corner_error_px"]
+    for px in CORNERS_WITHIN_PX:
+        right = (error_px <= px).where(error_px.notna()).astype(float)
+        out[f"homography_{px:g}px"] = right.groupby([scores[key] for key in CASE], sort=False).mean()
+    for figure in LEADS:
+        by_detector = scores.set_index([*CASE[1:], "pair", "detector"])[figure].unstack("detector")
+        if baseline in by_detector:
+            ahead = by_detector.drop(columns=baseline).sub(by_detector[baseline], axis=0).stack().groupby(CASE)
+            out[f"lead_{figure}"], out[f"lead_{figure}_half_width"] = ahead.mean(), CONFIDENCE * ahead.sem()
+    return out.reset_index()

@@ -10,12 +10,10 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 
 from vioframe.bench.detectors.entrants import Entrant, detect
-from vioframe.bench.detectors.quoted import TABLE_3_2
 from vioframe.bench.processes import usable_cores
-from vioframe.bench.results import Row
 from vioframe.interfaces import Detector
 from vioframe.runs import machine
-from vioframe.types import Float, Image, Int
+from vioframe.types import Image
 
 RESOLUTION = (640, 480)
 MAX_POINTS = 300
@@ -38,15 +36,15 @@ def time_detectors(
     rounds: int,
     max_points: int = MAX_POINTS,
     on_round: Callable[[int], None] = lambda count: None,
-) -> list[Row]:
-    """A row a detector: every image in every round, one at a time.
+) -> list[dict[str, Any]]:
+    """A row a detector: median and quartiles of frames a second and ms, over every image in every round.
 
     The detectors take turns within a round, so that whatever else the machine does slows all of them alike. A round
     of a detector begins with a call that is not counted: caches, and threads that others left spinning, are then its
     own. A whole round before the first warms up. Raises :class:`PluginError` where a detector fails.
     """
-    seconds: list[list[float]] = [[] for _ in ready]
-    points: list[list[int]] = [[] for _ in ready]
+    ms: list[list[float]] = [[] for _ in ready]
+    keypoints: list[list[int]] = [[] for _ in ready]
     for number in range(rounds + 1):
         for k, (entrant, detector) in enumerate(ready):
             detect(entrant, detector, images[-1], max_points)
@@ -55,22 +53,17 @@ def time_detectors(
                 found = detect(entrant, detector, image, max_points)
                 taken = perf_counter() - begin
                 if number > 0:
-                    seconds[k].append(taken)
-                    points[k].append(len(found.xy))
+                    ms[k].append(1e3 * taken)
+                    keypoints[k].append(len(found.xy))
         on_round(1)
-    return [_row(*one, np.array(s), np.array(p)) for one, s, p in zip(ready, seconds, points, strict=True)]
-
-
-def devices() -> list[str]:
-    """The processor with its threads, and the graphics cards that torch, where a detector has loaded it, can use."""
-    import cv2
-
-    found = [f"{machine.cpu_model()}, {usable_cores()} cores, OpenCV on {cv2.getNumThreads()} threads"]
-    torch = sys.modules.get("torch")
-    if torch is not None:
-        found[0] += f", torch on {torch.get_num_threads()}"
-        found += [torch.cuda.get_device_name(k) for k in range(torch.cuda.device_count())]
-    return found
+    rows = []
+    for k, (entrant, detector) in enumerate(ready):
+        low, median, high = (float(q) for q in np.quantile(ms[k], [0.25, 0.5, 0.75]))
+        fps = {"fps": 1e3 / median, "fps_low": 1e3 / high, "fps_high": 1e3 / low}
+        on = f"{detector.device}, {detector.precision}" if isinstance(detector, Placed) else "cpu"
+        rest = {"keypoints": float(np.median(keypoints[k])), "calls": len(ms[k]), "on": on}
+        rows.append({"detector": entrant.label, **fps, "ms": median, "ms_low": low, "ms_high": high, **rest})
+    return rows
 
 
 def speed_settings(images: str, image_count: int, rounds: int) -> dict[str, Any]:
@@ -85,19 +78,13 @@ def speed_settings(images: str, image_count: int, rounds: int) -> dict[str, Any]
     }
 
 
-def _row(entrant: Entrant, detector: Detector, seconds: Float, points: Int) -> Row:
-    low, median, high = np.quantile(seconds, [0.25, 0.5, 0.75])
-    quoted = TABLE_3_2.get(entrant.name)
-    return {
-        "detector": entrant.label,
-        "calls": len(seconds),
-        "measured": {
-            "fps": float(1.0 / median),
-            "fps_quartiles": [float(1.0 / high), float(1.0 / low)],
-            "ms": 1e3 * float(median),
-            "ms_quartiles": [1e3 * float(low), 1e3 * float(high)],
-            "points": float(np.median(points)),
-            "on": f"{detector.device}, {detector.precision}" if isinstance(detector, Placed) else "cpu",
-        },
-        "quoted": None if quoted is None else {"fps": quoted.fps, "source": quoted.source},
-    }
+def devices() -> list[str]:
+    """The processor with its threads, and the graphics cards that torch, where a detector has loaded it, can use."""
+    import cv2
+
+    found = [f"{machine.cpu_model()}, {usable_cores()} cores, OpenCV on {cv2.getNumThreads()} threads"]
+    torch = sys.modules.get("torch")
+    if torch is not None:
+        found[0] += f", torch on {torch.get_num_threads()}"
+        found += [torch.cuda.get_device_name(k) for k in range(torch.cuda.device_count())]
+    return found

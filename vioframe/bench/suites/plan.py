@@ -10,7 +10,6 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
-from vioframe.bench.contenders import Contender as TrialContender
 from vioframe.bench.montecarlo import Setup
 from vioframe.bench.suites import sources
 from vioframe.bench.suites.code import code_version
@@ -69,7 +68,7 @@ class TrialJob(Job):
     """A back-end on simulated tracks."""
 
     setup: Setup
-    contender: TrialContender
+    contender: PartConfig
     seed: int
 
 
@@ -210,7 +209,7 @@ def _trials(suite: Suite, installed: Registry) -> Iterator[TrialJob]:
             {"code": code, "config": _digest(backend.name, options), "data": _digest(suite.setup, seed)},
             _TRIAL_S * setup.duration_s,
             setup,
-            TrialContender(backend.name, options, backend.called),
+            PartConfig(name=backend.name, options=options),
             seed,
         )
 

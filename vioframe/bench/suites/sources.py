@@ -15,9 +15,8 @@ from vioframe.parts.options import did_you_mean
 from vioframe.parts.registry import FLIGHT, Registry
 from vioframe.report.suite.results import Data
 from vioframe.simulation import config as simulation
-from vioframe.simulation.config import SimulationConfig
-from vioframe.simulation.files import MANIFEST, simulation_folder
-from vioframe.simulation.recorded_motion import GROUND_TRUTH_FILES, find_file, motion_files, sensor_folder
+from vioframe.simulation.config import MANIFEST, SimulationConfig, simulation_folder
+from vioframe.simulation.scenario import GROUND_TRUTH_FILES, find_file, motion_files, sensor_folder
 
 DEFAULT_STAND_IN_S = 30.0
 # EuRoC's own site has MACHINE/SEQUENCE/SEQUENCE.bag.

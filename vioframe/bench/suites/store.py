@@ -23,7 +23,7 @@ from vioframe.parts.registry import describe
 from vioframe.report.suite.results import SUITE_FILE, TASK_FILE, TASKS_FOLDER
 from vioframe.runs import machine
 from vioframe.runs.recorder import write_json, write_whole
-from vioframe.simulation.files import simulation_folder
+from vioframe.simulation.config import simulation_folder
 
 Result = Mapping[str, Any]
 

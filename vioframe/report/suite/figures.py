@@ -112,15 +112,15 @@ def _stress(groups: Sequence[Group]) -> Iterator[tuple[str, Figure]]:
 
 
 def _trials(results: SuiteResults) -> Iterator[tuple[str, Figure]]:
-    from vioframe.report import plot_montecarlo
+    from vioframe.report import montecarlo
 
     found = outcomes(results)
     for flight in dict.fromkeys(outcome.flight for outcome in found):
         judged = [outcome for outcome in found if outcome.flight == flight and outcome.nees("pose")]
         if judged:
-            yield _file_name(f"nees_{flight}"), _of_tracks(plot_montecarlo.nees_over_time(judged))
+            yield _file_name(f"nees_{flight}"), _of_tracks(montecarlo.nees_over_time(judged))
     if any(trial.figures for outcome in found for trial in outcome.trials):
-        yield "trials", _of_tracks(plot_montecarlo.trials(found))
+        yield "trials", _of_tracks(montecarlo.trials(found))
 
 
 def _of_tracks(figure: Figure) -> Figure:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 
 from vioframe.bench.detectors.quoted import TABLE_3_2
-from vioframe.evaluation.consistency import Outcome as Trials
+from vioframe.evaluation.consistency import Trials
 from vioframe.report.suite.captions import WHAT
 from vioframe.report.suite.page_blocks import Headline
 from vioframe.report.suite.pooled import BAND_M, inside_band

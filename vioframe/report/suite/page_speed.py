@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vioframe.evaluation.consistency import PARTS
-from vioframe.evaluation.consistency import Outcome as Trials
+from vioframe.evaluation.consistency import PARTS, Trials
 from vioframe.report.suite.page_blocks import Case, Plot
 from vioframe.report.suite.page_look import BAND_COLOUR, TRUTH_COLOUR, Look, axes, compact, panels, picture
 from vioframe.report.suite.results import Data, TaskResult

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vioframe.evaluation.consistency import PARTS, Outcome, Trial
+from vioframe.evaluation.consistency import PARTS, Trial, Trials
 from vioframe.report.suite.captions import condition_text, task_path
 from vioframe.report.suite.results import Kind, Labels, SuiteResults, TaskResult
 from vioframe.report.suite.statistics import listed_names
@@ -21,7 +21,7 @@ _NOT_FIGURES = ("seed", "failure", "detail", "nees")
 class Campaign:
     """One back-end on one flight; ``links`` lead to the folders of its trials, by seed, relative to the results."""
 
-    outcome: Outcome
+    outcome: Trials
     links: tuple[tuple[str, str], ...]
 
 
@@ -41,13 +41,13 @@ def campaigns(results: SuiteResults) -> list[Campaign]:
     ]
 
 
-def outcomes(results: SuiteResults) -> list[Outcome]:
+def outcomes(results: SuiteResults) -> list[Trials]:
     """The same without the links."""
     return [campaign.outcome for campaign in campaigns(results)]
 
 
 def _campaign(backend: str, flight: str, own: Sequence[tuple[Trial, TaskResult]]) -> Campaign:
-    outcome = Outcome(backend, backend, {}, {"flight": flight}, tuple(trial for trial, _ in own))
+    outcome = Trials(backend, backend, {}, {"flight": flight}, tuple(trial for trial, _ in own))
     return Campaign(outcome, tuple((f"seed {trial.seed}", task_path(task)) for trial, task in own))
 
 
