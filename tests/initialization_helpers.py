@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from vioframe.estimation.initialization import InitialEstimate, InitializationOptions, Initializer
+from vioframe.estimation.initialization import InitialEstimate, Initializer
 from vioframe.geometry import so3
 from vioframe.geometry.cameras import Camera
 from vioframe.simulation import Packet, TrackSequence
@@ -56,11 +56,9 @@ class Errors:
     seconds: float
 
 
-def first_estimate(
-    packets: Sequence[Packet], calibration: Calibration, options: InitializationOptions | None = None
-) -> tuple[InitialEstimate | None, Initializer]:
+def first_estimate(packets: Sequence[Packet], calibration: Calibration) -> tuple[InitialEstimate | None, Initializer]:
     """What the initialiser says first."""
-    initializer = Initializer(calibration, options)
+    initializer = Initializer(calibration)
     for imu, tracks in packets:
         estimate = initializer.add(imu, tracks)
         if estimate is not None:

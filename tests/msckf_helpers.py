@@ -6,12 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 
+from vioframe.estimation.factors.tracks import TrackTable
 from vioframe.geometry import so3
 from vioframe.io.calibration import packaged_calibration
 from vioframe.simulation import TrackSequence, simulated_sequence
 from vioframe.types import Calibration, CalibrationEstimate, CameraSigma, Float, NavState
 from vioframe_msckf.state import FilterState
-from vioframe_msckf.tracks import ObservationTable
 
 CALIBRATION = packaged_calibration("euroc", cameras=["cam0"])
 START_COV = np.diag(np.repeat([0.005, 0.001, 0.02, 0.005, 0.05], 3) ** 2)
@@ -50,14 +50,14 @@ def random_state(
     return state
 
 
-def seeing_state(seed: int = 0, clones: int = 6) -> tuple[FilterState, ObservationTable]:
+def seeing_state(seed: int = 0, clones: int = 6) -> tuple[FilterState, TrackTable]:
     """A filter that knows to a centimetre where it has been on a simulated flight, and what it saw from there."""
     sequence = simulated_sequence("figure_eight", seed=seed, duration_s=2.0)
     start = sequence.true_states[0]
     state = FilterState(
         replace(start, cov=np.eye(15)), prior_of(sequence.calibration), extrinsics=True, offset=True, intrinsics=True
     )
-    observations = ObservationTable()
+    observations = TrackTable()
     for k in range(0, 3 * clones, 3):
         true = sequence.true_states[k]
         state.R_WB, state.p_WB, state.v_WB = true.R_WB, true.p_WB, true.v_WB

@@ -9,7 +9,10 @@ import numpy as np
 from msckf_helpers import random_covariance
 from numpy.typing import NDArray
 
-from vioframe.estimation.inertial.imu_factors import ImuFactors, StateArrays
+from vioframe.estimation.factors.inertial import ImuFactors, StateArrays
+from vioframe.estimation.factors.landmarks import camera_poses, in_hosts, positions
+from vioframe.estimation.factors.problem import STATE_SIZE, Prior, Problem, Variables
+from vioframe.estimation.factors.reprojection import CALIBRATION_SIZE, Calibrated, Sightings, pixels_by_residual
 from vioframe.estimation.inertial.preintegration import join_segments, preintegrate
 from vioframe.estimation.standstill import Standstill
 from vioframe.geometry.cameras import Camera
@@ -17,10 +20,6 @@ from vioframe.geometry.kernels import intrinsics_of
 from vioframe.io.calibration import packaged_calibration
 from vioframe.simulation import simulated_sequence
 from vioframe.types import Float
-from vioframe_sliding_window.landmarks import camera_poses, in_hosts, positions
-from vioframe_sliding_window.problem import STATE_SIZE, Calibrated, Prior, Problem, Variables
-from vioframe_sliding_window.reprojection import Sightings
-from vioframe_sliding_window.reprojection_kernels import CALIBRATION_SIZE, pixels_by_residual
 
 CAMERA = packaged_calibration("euroc").camera
 NATURAL = np.repeat([0.01, 0.05, 0.1, 0.005, 0.05], 3)
@@ -89,7 +88,7 @@ def without_sightings(problem: Problem) -> Problem:
 
 def only(sightings: Sightings, rows: slice | NDArray[np.bool_]) -> Sightings:
     s = sightings
-    return replace(s, seen=s.seen[rows], xy=s.xy[rows], velocity=s.velocity[rows], to_px=s.to_px[rows])
+    return s._replace(seen=s.seen[rows], xy=s.xy[rows], velocity=s.velocity[rows], to_px=s.to_px[rows])
 
 
 def moved(x: Variables, rng: np.random.Generator, scale: float) -> Variables:

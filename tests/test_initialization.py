@@ -12,8 +12,8 @@ from april_board import april_sequence
 from initialization_helpers import Errors, Motion, first_estimate, judge, seen_by, velocity_of, without_points
 
 from vioframe.estimation.initialization import InitialEstimate, Initializer
-from vioframe.estimation.initialization.attitude import level_rotation
 from vioframe.frontend import Frontend, FrontendOptions
+from vioframe.geometry import so3
 from vioframe.geometry.trajectory import Trajectory
 from vioframe.incidents import Incidents
 from vioframe.io.synchronise import synchronise
@@ -54,7 +54,7 @@ def assert_sound(estimate: InitialEstimate) -> None:
     """What every back-end may rely on."""
     first, newest = estimate.states[0], estimate.states[-1]
     np.testing.assert_allclose(first.p_WB, 0.0, atol=1e-9)
-    np.testing.assert_allclose(first.R_WB, level_rotation(first.R_WB[2]), atol=1e-9)  # yaw zero
+    np.testing.assert_allclose(first.R_WB, so3.level_rotation(first.R_WB[2]), atol=1e-9)  # yaw zero
     for state in estimate.states:
         np.testing.assert_allclose(state.R_WB @ state.R_WB.T, np.eye(3), atol=1e-9)
     assert [s.t_ns for s in estimate.states] == sorted({s.t_ns for s in estimate.states})

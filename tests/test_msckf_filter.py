@@ -7,6 +7,7 @@ import pytest
 from msckf_helpers import drawn_start, random_covariance, since
 
 from vioframe.bench import BackendRun, run_backend
+from vioframe.estimation.factors.tracks import TrackTable
 from vioframe.estimation.lifecycle import LifeCycle
 from vioframe.estimation.recovery import continued_from
 from vioframe.geometry import so3
@@ -14,7 +15,6 @@ from vioframe.simulation import simulated_sequence
 from vioframe.types import Float, FrameTracks, NavState, Status
 from vioframe_msckf.backend import Msckf
 from vioframe_msckf.options import MsckfOptions
-from vioframe_msckf.tracks import ObservationTable
 from vioframe_msckf.updates import select_tracks
 
 
@@ -37,7 +37,7 @@ def as_bytes(run: BackendRun) -> bytes:
 
 
 def test_observations_are_filed_by_track_and_clone():
-    table = ObservationTable()
+    table = TrackTable()
     for t_ns, ids in enumerate(([7, 3], [3, 5], [5, 7])):
         table.add_frame(tracks(t_ns, ids))
     assert table.ids.tolist() == [3, 5, 7]
@@ -46,8 +46,8 @@ def test_observations_are_filed_by_track_and_clone():
         assert table.xy[row, column].tolist() == [table.ids[row], column]
     assert (table.xy_normalised == 0.1 * table.xy).all()
     assert table.lengths().tolist() == [2, 2, 2]
-    table.drop_oldest_frame()
-    table.drop_oldest_frame()
+    table.drop_frame(0)
+    table.drop_frame(0)
     assert table.ids.tolist() == [5, 7]
     assert table.seen.tolist() == [[True], [True]]
     table.drop(np.array([0]))
@@ -62,7 +62,7 @@ class Clones:
 
 
 def test_selection_takes_lost_tracks_first_and_full_ones_as_landmarks_while_there_is_room():
-    table = ObservationTable()
+    table = TrackTable()
     # 1-3 reach back to the first clone and go on, 4 and 5 are lost after 3 and 4 views, 6 is lost after one, 7 is new.
     for t_ns, ids in enumerate(([1, 2, 3, 5, 6], [1, 2, 3, 4, 5], [1, 2, 3, 4, 5], [1, 2, 4, 5, 3], [1, 2, 3, 7])):
         table.add_frame(tracks(t_ns, ids))

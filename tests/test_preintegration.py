@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from vioframe.estimation.inertial.imu_factors import ImuFactors, StateArrays
+from vioframe.estimation.factors.inertial import ImuFactors, StateArrays
 from vioframe.estimation.inertial.preintegration import Preintegrated, join_segments, preintegrate
 from vioframe.geometry import so3
 from vioframe.types import DBA, DBG, DP, DTHETA, DV, Float, ImuNoise, ImuSegment, NavState, g_W

@@ -14,6 +14,7 @@ from threadpoolctl import threadpool_limits
 
 from vioframe.bench import BackendRun, run_backend
 from vioframe.errors import ConfigError
+from vioframe.estimation.factors.tracks import TrackTable
 from vioframe.estimation.inertial.preintegration import Preintegrated, join_segments, preintegrate
 from vioframe.estimation.lifecycle import LifeCycle
 from vioframe.estimation.options import EstimationOptions
@@ -25,10 +26,8 @@ from vioframe.simulation.flights import flight as named_flight
 from vioframe.simulation.tracks import TrackOptions, TrackSimulator
 from vioframe.types import DTHETA, CameraOnBody, Estimate, Float, FrameTracks, NavState, Status
 from vioframe_sliding_window.backend import SlidingWindow
-from vioframe_sliding_window.keyframes import parallax
 from vioframe_sliding_window.options import SlidingWindowOptions as Options
-from vioframe_sliding_window.tracks import TrackTable
-from vioframe_sliding_window.window import Window
+from vioframe_sliding_window.window import Window, parallax
 
 UP = np.array([0.0, 0.0, 1.0])
 CALIBRATED = Options(calibrate_extrinsics=False, calibrate_time_offset=False)
@@ -262,7 +261,7 @@ def frames(*xy: Float) -> TrackTable:
     table = TrackTable()
     for t_ns, points in enumerate(xy):
         tracks = FrameTracks(t_ns, np.arange(len(points)), np.zeros(len(points), np.int64), points, points)
-        table.add_frame(tracks, np.zeros((len(points), 2, 2)))
+        table.add_frame(tracks)
     return table
 
 

@@ -20,15 +20,15 @@ from sliding_window_helpers import (
     without_sightings,
 )
 
-from vioframe.estimation.inertial.imu_factors import ImuFactors
+from vioframe.estimation.factors import reprojection
+from vioframe.estimation.factors.inertial import ImuFactors
+from vioframe.estimation.factors.landmarks import camera_poses, positions
+from vioframe.estimation.factors.problem import Prior, Problem, Variables, pose_columns
+from vioframe.estimation.factors.reprojection import Poses, Sightings
 from vioframe.geometry import so3
 from vioframe.geometry.cameras import Camera
 from vioframe.geometry.kernels import intrinsics_of
 from vioframe.types import Float
-from vioframe_sliding_window import reprojection_kernels
-from vioframe_sliding_window.landmarks import camera_poses, positions
-from vioframe_sliding_window.problem import Prior, Problem, Variables, pose_columns
-from vioframe_sliding_window.reprojection import Poses, Sightings
 
 CAMERAS = {
     "radtan": CAMERA,
@@ -75,7 +75,7 @@ def assembled(x: Variables, first: Variables, s: Sightings) -> tuple[Float, Floa
     """The same as the kernels have it."""
     camera, n = x.camera, 15 * len(x.states) + 7
     poses, first_poses = (Poses.of(v.states.R_WB, v.states.p_WB) for v in (x, first))
-    H_p, b_p, V, W, c = s.linearise(poses, first_poses, camera.R_BC, camera.p_BC, camera.offset_s, x.landmarks)
+    H_p, b_p, V, W, c = s.linearise(poses, first_poses, camera, x.landmarks)
     total = n + 3 * len(x.landmarks)
     H, b, columns = np.zeros((total, total)), np.zeros(total), pose_columns(len(x.states))
     H[np.ix_(columns, columns)], b[columns] = H_p, b_p
@@ -248,7 +248,7 @@ def test_residuals_are_pixels_of_the_distorted_image(camera, on_sphere):
     """To first order: of a step ten times smaller the error is a hundred times smaller."""
     rng = np.random.default_rng(0)
     xy = camera.undistort(rng.uniform([5.0, 5.0], [747.0, 475.0], (50, 2)))
-    to_px = reprojection_kernels.pixels_by_residual(*intrinsics_of(camera), xy, on_sphere)
+    to_px = reprojection.pixels_by_residual(*intrinsics_of(camera), xy, on_sphere)
     direction = rng.normal(size=xy.shape)
     errors = []
     for step in (1e-3, 1e-4):
@@ -256,7 +256,7 @@ def test_residuals_are_pixels_of_the_distorted_image(camera, on_sphere):
         T, r = np.empty((2, 3)), np.empty(2)
         predicted = []
         for i in range(len(xy)):
-            reprojection_kernels._residual(p_C[i], *xy[i], to_px[i], on_sphere, T, r)
+            reprojection._residual(p_C[i], *xy[i], to_px[i], on_sphere, T, r)
             predicted.append(r.copy())
         moved_px = camera.distort(xy + step * direction) - camera.distort(xy)
         assert np.linalg.norm(moved_px, axis=1).mean() > 300.0 * step
@@ -270,11 +270,10 @@ def test_errors_are_root_mean_squares_and_infinite_behind_the_camera(on_sphere):
     problem, x = flown_window(on_sphere=on_sphere)
     s = problem.sightings
     poses, camera = Poses.of(x.states.R_WB, x.states.p_WB), x.camera
-    calibration = camera.R_BC, camera.p_BC, camera.offset_s
     r = residuals(x, s)
     row, _ = np.nonzero(s.seen)
     expected = np.sqrt(np.bincount(row, (r * r).sum(axis=1)) / (2.0 * s.seen.sum(axis=1))) / s.sigma
-    np.testing.assert_allclose(s.errors(poses, *calibration, x.landmarks), expected, rtol=1e-9)
+    np.testing.assert_allclose(s.errors(poses, camera, x.landmarks), expected, rtol=1e-9)
     # Every other one a centimetre from its host, so that cameras that flew on have it behind them.
     near = x.landmarks.copy()
     near[::2, 2] = 100.0
@@ -283,8 +282,8 @@ def test_errors_are_root_mean_squares_and_infinite_behind_the_camera(on_sphere):
     depth = np.einsum("kj,lkj->lk", R_WC[..., 2], p_WF[:, None] - p_WC)
     behind = ((depth < 0.0) & s.seen).any(axis=1)
     assert 0 < behind.sum() < len(behind)
-    np.testing.assert_array_equal(np.isinf(s.errors(poses, *calibration, near)), behind)
-    assert np.isfinite(s.cost(poses, *calibration, near))
+    np.testing.assert_array_equal(np.isinf(s.errors(poses, camera, near)), behind)
+    assert np.isfinite(s.cost(poses, camera, near))
 
 
 def test_sphere_and_plane_agree_to_first_order():

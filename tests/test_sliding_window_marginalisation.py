@@ -10,14 +10,13 @@ from msckf_helpers import after
 from sliding_window_helpers import flown_window, moved, natural, only, standing
 
 from vioframe.bench import run_backend
-from vioframe.estimation.inertial.imu_factors import ImuFactors, StateArrays
+from vioframe.estimation.factors.inertial import ImuFactors, StateArrays
+from vioframe.estimation.factors.problem import STATE_SIZE, Prior, Problem, Variables, marginalise_oldest, schur
 from vioframe.simulation import simulated_sequence
 from vioframe.types import DP, DTHETA, DV, Float, NavState
 from vioframe_sliding_window import window as window_module
 from vioframe_sliding_window.backend import SlidingWindow
-from vioframe_sliding_window.marginalisation import marginalise_oldest, schur
 from vioframe_sliding_window.options import SlidingWindowOptions
-from vioframe_sliding_window.problem import STATE_SIZE, Prior, Problem, Variables
 
 UP = np.array([0.0, 0.0, 1.0])
 FLIGHTS = ("figure_eight", "aggressive", "stop_and_go")
@@ -80,14 +79,14 @@ def short_tracks(frames: int, noise_px: float = 2.0) -> tuple[Problem, Variables
     seen = s.seen & (np.arange(frames) < s.seen.argmax(axis=1)[:, None] + SPAN)
     enough = seen.sum(axis=1) >= 2
     rows = np.flatnonzero(enough)[np.argsort(seen[enough].argmax(axis=1), kind="stable")]
-    problem = replace(problem, sightings=only(replace(s, seen=seen), rows))
+    problem = replace(problem, sightings=only(s._replace(seen=seen), rows))
     return problem, replace(x, landmarks=x.landmarks[rows])
 
 
 def part(problem: Problem, prior: Prior, frames: slice, readings: slice, rows: np.ndarray) -> Problem:
     """Some of the factors, over some of the states, with another prior on these."""
     s = only(problem.sightings, rows)
-    s = replace(s, seen=s.seen[:, frames], xy=s.xy[:, frames], velocity=s.velocity[:, frames], to_px=s.to_px[:, frames])
+    s = s._replace(seen=s.seen[:, frames], xy=s.xy[:, frames], velocity=s.velocity[:, frames], to_px=s.to_px[:, frames])
     f = problem.readings
     some = ImuFactors(*(getattr(f, field.name)[readings] for field in fields(f)))
     still = {k - frames.start: still for k, still in problem.still.items() if frames.start <= k < frames.stop}

@@ -9,13 +9,13 @@ from __future__ import annotations
 import numpy as np
 from scipy.stats import chi2
 
+from vioframe.estimation.factors.tracks import TrackTable
 from vioframe.estimation.recovery import noise_over
 from vioframe.stopwatch import Stopwatch
 from vioframe.types import Estimate, FrameTracks, ImuSegment, Start, Status
 from vioframe_msckf.options import MsckfOptions
 from vioframe_msckf.standstill import hold_still
 from vioframe_msckf.state import FilterState
-from vioframe_msckf.tracks import ObservationTable
 from vioframe_msckf.updates import promote_tracks, select_tracks, update_from_landmarks, update_from_tracks
 
 
@@ -38,7 +38,7 @@ class Msckf:
             intrinsics=options.calibrate_intrinsics,
         )
         self._noise, self._noise_at_rest = start.calibration.calibration.imu, start.noise_at_rest
-        self._observations = ObservationTable()
+        self._observations = TrackTable()
 
     def process(self, imu: ImuSegment, tracks: FrameTracks, still: bool) -> Estimate:
         """Filter one frame."""
@@ -69,7 +69,7 @@ class Msckf:
         observations.drop(np.concatenate([selection.finished, promoted]))
         if len(state.clones) >= options.max_clones:
             state.drop_oldest_clone()
-            observations.drop_oldest_frame()
+            observations.drop_frame(0)
         watch.lap("marginalise")
 
         return Estimate(

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from vioframe.estimation.factors.tracks import TrackTable
 from vioframe.types import Float, FrameTracks, Int
 from vioframe_msckf.measurement import (
     ACCEPTED,
@@ -19,7 +20,6 @@ from vioframe_msckf.measurement import (
 )
 from vioframe_msckf.options import MsckfOptions
 from vioframe_msckf.state import CALIBRATION, FilterState, compress
-from vioframe_msckf.tracks import ObservationTable
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,7 +30,7 @@ class Selection:
     promoted: NDArray[np.intp]
 
 
-def select_tracks(observations: ObservationTable, state: FilterState, options: MsckfOptions) -> Selection:
+def select_tracks(observations: TrackTable, state: FilterState, options: MsckfOptions) -> Selection:
     """Tracks that were lost or reach back to the oldest clone of a full window, the longest first.
 
     Lost tracks too short to be used are dropped from the table. Full tracks fill the free landmark slots first.
@@ -52,7 +52,7 @@ def select_tracks(observations: ObservationTable, state: FilterState, options: M
 
 
 def update_from_tracks(
-    state: FilterState, observations: ObservationTable, rows: NDArray[np.intp], options: MsckfOptions, gate: Float
+    state: FilterState, observations: TrackTable, rows: NDArray[np.intp], options: MsckfOptions, gate: Float
 ) -> tuple[Int, Float]:
     """The multi-state constraint update; returns ids and positions of the landmarks it accepted."""
     window = Window.of(state, options.first_estimate_jacobians)
@@ -101,7 +101,7 @@ def update_from_landmarks(state: FilterState, tracks: FrameTracks, options: Msck
 
 
 def promote_tracks(
-    state: FilterState, observations: ObservationTable, rows: NDArray[np.intp], options: MsckfOptions, gate: Float
+    state: FilterState, observations: TrackTable, rows: NDArray[np.intp], options: MsckfOptions, gate: Float
 ) -> NDArray[np.intp]:
     """Take the tracks ``rows`` into the state as landmarks; returns the rows used up, promoted or implausible.
 

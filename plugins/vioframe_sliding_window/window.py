@@ -5,9 +5,14 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from vioframe.estimation.inertial.imu_factors import ImuFactors, StateArrays
+from vioframe.arrays import Bool
+from vioframe.estimation.factors.inertial import ImuFactors, StateArrays
+from vioframe.estimation.factors.landmarks import image_velocities, in_hosts, positions, triangulate_tracks
+from vioframe.estimation.factors.problem import STATE_SIZE, Prior, Problem, Variables, marginalise_oldest
+from vioframe.estimation.factors.reprojection import CALIBRATION_SIZE, Calibrated, Sightings, pixels_by_residual
+from vioframe.estimation.factors.solver import solve, solve_positive
+from vioframe.estimation.factors.tracks import LandmarkTable, TrackTable
 from vioframe.estimation.inertial.preintegration import Preintegrated, join_segments, preintegrate
 from vioframe.estimation.recovery import noise_over
 from vioframe.estimation.standstill import Standstill
@@ -23,15 +28,7 @@ from vioframe.types import (
     NavState,
     Start,
 )
-from vioframe_sliding_window.keyframes import parallax
-from vioframe_sliding_window.landmarks import image_velocities, in_hosts, positions, triangulate_tracks
-from vioframe_sliding_window.marginalisation import marginalise_oldest
 from vioframe_sliding_window.options import SlidingWindowOptions
-from vioframe_sliding_window.problem import STATE_SIZE, Calibrated, Prior, Problem, Variables
-from vioframe_sliding_window.reprojection import Poses, Sightings
-from vioframe_sliding_window.reprojection_kernels import CALIBRATION_SIZE, pixels_by_residual
-from vioframe_sliding_window.solver import solve, solve_positive
-from vioframe_sliding_window.tracks import Bool, Rows, TrackTable
 
 # Biases that moved farther from those the readings were integrated with have them integrated anew, rad/s and m/s^2.
 _REPROPAGATE_GYRO, _REPROPAGATE_ACCEL = 0.01, 0.1
@@ -62,7 +59,7 @@ class Window:
         self._newest_is_keyframe = True
         self._cov = state.cov
         self._camera_model, self._intrinsics = intrinsics_of(camera.model)
-        self.tracks = TrackTable()
+        self.tracks = LandmarkTable()
         self._add_tracks(start.tracks)
 
     def __len__(self) -> int:
@@ -111,7 +108,8 @@ class Window:
     def _add_tracks(self, tracks: FrameTracks) -> None:
         on_sphere = self._options.residual == "sphere"
         to_px = pixels_by_residual(self._camera_model, self._intrinsics, tracks.xy_normalised, on_sphere)
-        self.tracks.add_frame(tracks, to_px)
+        rows = self.tracks.add_frame(tracks)
+        self.tracks.to_px[rows, -1] = to_px
 
     @property
     def is_full(self) -> bool:
@@ -148,9 +146,9 @@ class Window:
     def triangulate(self) -> None:
         """Find the landmarks of tracks that have been seen often enough."""
         tracks = self.tracks
-        rows = np.flatnonzero(~tracks.known & (tracks.seen.sum(axis=1) >= self._options.min_observations))
+        rows = np.flatnonzero(~tracks.known & (tracks.lengths() >= self._options.min_observations))
         known, landmarks = triangulate_tracks(
-            self._states, self._camera, tracks.seen[rows], tracks.xy[rows], self._sigma
+            self._states, self._camera, tracks.seen[rows], tracks.xy_normalised[rows], self._sigma
         )
         tracks.landmarks[rows], tracks.known[rows] = landmarks, known
 
@@ -169,7 +167,11 @@ class Window:
         options, rows = self._options, np.flatnonzero(self.tracks.known)
         problem = self._problem(rows)
         solution = solve(
-            problem, self._variables(rows), self._active(), options.max_iterations, 1e-3 * options.max_solve_ms
+            problem,
+            self._variables(rows),
+            self._active(),
+            options.max_iterations,
+            max_seconds=1e-3 * options.max_solve_ms,
         )
         x = solution.variables
         self._states, self._camera, self.tracks.landmarks[rows] = x.states, x.camera, x.landmarks
@@ -182,14 +184,10 @@ class Window:
         tracks = self.tracks
         rows = np.flatnonzero(tracks.known)
         x = self._variables(rows)
-        poses = Poses.of(x.states.R_WB, x.states.p_WB)
-        camera = x.camera
-        errors = self._sightings(rows).errors(poses, camera.R_BC, camera.p_BC, camera.offset_s, x.landmarks)
+        errors = self._sightings(rows).errors(x.poses, x.camera, x.landmarks)
         bad = (errors * self._options.pixel_sigma > self._options.outlier_px) | (x.landmarks[:, 2] <= 0.0)
         newest = tracks.seen[rows, -1]
-        keep = np.ones(len(tracks.ids), dtype=bool)
-        keep[rows[bad]] = False
-        tracks.keep(keep)
+        tracks.drop(rows[bad])
         return int((bad & newest).sum()), int(newest.sum())
 
     @property
@@ -231,32 +229,32 @@ class Window:
         rows, p_WF = rows[enough], p_WF[of[enough]]
         tracks.landmarks[rows], tracks.known[rows] = in_hosts(self._states, self._camera, tracks.hosts[rows], p_WF)
 
-    def _variables(self, rows: Rows) -> Variables:
+    def _variables(self, rows: Int) -> Variables:
         return Variables(self._states, self._camera, self.tracks.landmarks[rows])
 
-    def _problem(self, rows: Rows) -> Problem:
+    def _problem(self, rows: Int) -> Problem:
         """All factors of the window, with the landmarks of ``rows``."""
         first_estimates = self._options.first_estimate_jacobians
         readings = ImuFactors.stack(self._readings)
         return Problem(self._prior, readings, self._still, self._sightings(rows), first_estimates)
 
-    def _oldest_problem(self, rows: Rows, seen: Bool) -> Problem:
+    def _oldest_problem(self, rows: Int, seen: Bool) -> Problem:
         """The factors that touch the oldest state; ``seen`` (L, K) is what counts of the sightings of ``rows``."""
         return replace(
             self._problem(rows),
             readings=ImuFactors.stack(self._readings[:1]),
             still={k: still for k, still in self._still.items() if k == 0},
-            sightings=replace(self._sightings(rows), seen=seen),
+            sightings=self._sightings(rows)._replace(seen=seen),
         )
 
-    def _sightings(self, rows: Rows) -> Sightings:
+    def _sightings(self, rows: Int) -> Sightings:
         options, tracks = self._options, self.tracks
         velocity = image_velocities(
             self._states, self._camera, self._gyro_B, tracks.hosts[rows], tracks.landmarks[rows]
         )
         return Sightings(
             tracks.seen[rows],
-            tracks.xy[rows],
+            tracks.xy_normalised[rows],
             velocity,
             tracks.to_px[rows],
             options.pixel_sigma,
@@ -264,7 +262,7 @@ class Window:
             options.residual == "sphere",
         )
 
-    def _active(self) -> NDArray[np.intp]:
+    def _active(self) -> Int:
         """The entries of the error vector that are estimated."""
         options, n = self._options, STATE_SIZE * len(self)
         active = np.ones(n + CALIBRATION_SIZE, dtype=bool)
@@ -283,3 +281,17 @@ class Window:
         sigma[active[at + STATE_SIZE :] - at - STATE_SIZE] = np.sqrt(np.diag(end)[STATE_SIZE:])
         cov = end[:STATE_SIZE, :STATE_SIZE]
         return 0.5 * (cov + cov.T), sigma
+
+
+def parallax(tracks: TrackTable, before: int, now: int, R_CbCn: Float) -> tuple[int, float]:
+    """Number of tracks common to two frames, and their mean motion on the z = 1 plane with the rotation taken out.
+
+    ``R_CbCn`` (3, 3) takes the later camera's axes to the earlier one's.
+    """
+    common = tracks.seen[:, before] & tracks.seen[:, now]
+    if not common.any():
+        return 0, 0.0
+    rays = np.column_stack([tracks.xy_normalised[common, now], np.ones(common.sum())]) @ R_CbCn.T
+    ahead = rays[:, 2] > 0.0
+    moved = rays[ahead, :2] / rays[ahead, 2:] - tracks.xy_normalised[common, before][ahead]
+    return int(common.sum()), float(np.linalg.norm(moved, axis=1).mean()) if ahead.any() else np.inf

@@ -11,6 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from vioframe.errors import ConfigError, DivergedError, PluginError
+from vioframe.estimation import initialization
 from vioframe.estimation.initialization import Initializer
 from vioframe.estimation.options import EstimationOptions
 from vioframe.estimation.recovery import check_plausible, continued_from
@@ -60,7 +61,7 @@ class LifeCycle:
             raise ConfigError("an initial state needs a covariance, and a camera whose rotation on the body is known")
         self._options = options or EstimationOptions()
         self._backend, self._name = backend, name or type(backend).__name__
-        self._initializer = Initializer(calibration)
+        self._initializer = Initializer(calibration, self._options.imu_noise_factor)
         self._standstill = StandstillDetector(self._options.standstill_disparity_px)
         self._initial_state = initial_state
         self._following = False
@@ -165,6 +166,7 @@ def warm_up(backend: Backend, calibration: Calibration) -> None:
     Long enough to come through every step of a window of some ten frames once, so that all compiled code is there, or
     loaded from the cache, before the first frame of a flight. A back-end may find this flight too odd to follow.
     """
+    initialization.warm_up(calibration)
     if not calibration.cameras[0].rotation_known:
         calibration = calibration.with_camera(0, R_BC=np.eye(3), rotation_known=True)
     with suppress(DivergedError, np.linalg.LinAlgError):

@@ -137,3 +137,17 @@ def rotation_z(yaw: float) -> Float:
     """(3, 3) rotation by ``yaw`` rad about z."""
     c, s = np.cos(yaw), np.sin(yaw)
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+
+
+def level_rotation(up_B: Float) -> Float:
+    """R_WB (3, 3) of the body whose vertical is ``up_B`` (3,), any norm: the smallest rotation that puts it upright.
+
+    It has no part about the vertical (its twist is zero), which is what yaw zero means here. An Euler yaw would not do:
+    EuRoC's IMU flies with its x axis up, where Euler angles are singular.
+    """
+    up = up_B / np.linalg.norm(up_B)
+    axis = np.cross(up, [0.0, 0.0, 1.0])
+    sine, cosine = np.linalg.norm(axis), up[2]
+    if sine < 1e-12:
+        return np.eye(3) if cosine > 0.0 else exp([np.pi, 0.0, 0.0])
+    return exp(axis / sine * np.arctan2(sine, cosine))

@@ -12,74 +12,98 @@ from dataclasses import replace
 
 import numpy as np
 
-from vioframe.estimation.inertial.imu_factors import ImuFactors, StateArrays
+from vioframe.arrays import Bool, Float, Int
+from vioframe.estimation.factors.inertial import StateArrays
+from vioframe.estimation.factors.landmarks import positions
+from vioframe.estimation.factors.problem import Problem, Variables
+from vioframe.estimation.factors.reprojection import Calibrated
+from vioframe.estimation.factors.solver import Solution
 from vioframe.estimation.inertial.preintegration import Preintegrated, preintegrate
-from vioframe.estimation.initialization import bundle_adjustment
-from vioframe.estimation.initialization import landmarks as lm
-from vioframe.estimation.initialization.alignment import Alignment, align, rotations
-from vioframe.estimation.initialization.attitude import level_rotation
-from vioframe.estimation.initialization.bundle_adjustment import Problem, Solution
-from vioframe.estimation.initialization.estimate import InitialEstimate, RefusalError
-from vioframe.estimation.initialization.gyro_bias import estimate_gyro_bias
-from vioframe.estimation.initialization.judgement import check_fit, check_lookahead, check_parallax, check_uncertainty
-from vioframe.estimation.initialization.landmarks import Observations
-from vioframe.estimation.initialization.options import InitializationOptions
-from vioframe.estimation.initialization.structure import Structure, solve_structure
-from vioframe.estimation.initialization.window import Bool, Packet, Window, build_window, spread_indices
-from vioframe.types import DP, DV, Calibration, Float, NavState
+from vioframe.estimation.initialization.bundle_adjustment import adjusted, adjustment, covariance
+from vioframe.estimation.initialization.closed_form import (
+    Alignment,
+    Structure,
+    align,
+    estimate_gyro_bias,
+    rotations,
+    solve_structure,
+)
+from vioframe.estimation.initialization.window import (
+    BIAS_ACCEL_SIGMA,
+    BIAS_GYRO_SIGMA,
+    PIXEL_SIGMA,
+    InitialEstimate,
+    Packet,
+    RefusalError,
+    Window,
+    build_window,
+    spread_indices,
+)
+from vioframe.geometry.so3 import level_rotation
+from vioframe.types import DP, DTHETA, DV, Calibration, FrameTracks, ImuSegment, NavState, g_W
 
 _MIN_VIEWS = 4
 # Tracks farther off than this are not noise: standard deviations, typical over all views.
 _EPIPOLAR_LIMIT, _STRUCTURE_LIMIT, _ADJUSTED_LIMIT = 3.0, 10.0, 3.0
 _FARTHEST_M = 200.0
+# Frames of the window that are estimated, tracks that are used, the longest first, and how few refuse the attempt.
+_KEYFRAMES, _MOST_LANDMARKS, _FEWEST_LANDMARKS = 10, 100, 20
+# The newest part of the window is predicted from the rest to test the estimate.
+_LOOKAHEAD_S, _LARGEST_LOOKAHEAD_PX, _FEWEST_COMMON = 0.2, 3.0, 8
+# Least median parallax, with the rotation taken out; most that the observations may disagree with the estimate (RMS).
+_LEAST_PARALLAX_PX, _LARGEST_ERROR_PX = 5.0, 2.0
+# The readings' residuals, per degree of freedom: vibration makes them larger than the data sheet's noise.
+_MAX_INERTIAL = 9.0
+_MAX_BIAS_SIGMAS = 4.0
+# Largest standard deviations that are accepted: of scale (relative), velocity on any axis, and gravity's direction.
+_SCALE_SIGMA, _VELOCITY_SIGMA, _TILT_SIGMA_DEG = 0.06, 0.05, 1.0
 
 
-def initialise(packets: Sequence[Packet], calibration: Calibration, options: InitializationOptions) -> InitialEstimate:
+def initialise(packets: Sequence[Packet], calibration: Calibration) -> InitialEstimate:
     """Estimate from consecutive ``packets``, the newest last; raises :class:`RefusalError`."""
     t_ns = np.array([tracks.t_ns for _, tracks in packets])
-    held_out = int((t_ns > t_ns[-1] - options.lookahead_s * 1e9).sum())
-    chosen = spread_indices(t_ns[:-held_out], options.keyframes)
-    sigma = options.pixel_sigma / calibration.cameras[0].model.focal_px
+    held_out = int((t_ns > t_ns[-1] - _LOOKAHEAD_S * 1e9).sum())
+    chosen = spread_indices(t_ns[:-held_out], _KEYFRAMES)
+    sigma = PIXEL_SIGMA / calibration.cameras[0].model.focal_px
 
-    window = build_window(packets, [*chosen, len(packets) - 1], _MIN_VIEWS, options.max_landmarks)
-    _require(window, "tracks are long enough", options)
-    window, bias_gyro = _with_gyro_bias(window, calibration, sigma, options)
+    window = build_window(packets, [*chosen, len(packets) - 1], _MIN_VIEWS, _MOST_LANDMARKS)
+    _require(window, "tracks are long enough")
+    window, bias_gyro = _with_gyro_bias(window, calibration, sigma)
     imu = _preintegrate(window, bias_gyro, np.zeros(3), calibration)
     R_B0B = rotations(imu)
-    check_parallax(window, R_B0B, calibration, options)
+    _check_parallax(window, R_B0B, calibration)
 
-    window, structure = _structure(window, R_B0B @ calibration.cameras[0].R_BC, sigma, options)
-    alignment = align(structure.position, imu[:-1], calibration, options.bias_accel_sigma)
+    window, structure = _structure(window, R_B0B @ calibration.cameras[0].R_BC, sigma)
+    alignment = align(structure.position, imu[:-1], calibration.cameras[0].p_BC, BIAS_ACCEL_SIGMA)
     if alignment.scale <= 0.0:
         raise RefusalError("the readings contradict the direction of the motion in the images")
-    states, landmarks = _start_of_adjustment(window.without_last(), structure, alignment, bias_gyro)
-    problem = _problem(window.without_last(), states, calibration, sigma, options)
-    solution = bundle_adjustment.solve(problem, states, landmarks)
-    keep = _explained(problem, solution)
+    x = _start_of_adjustment(window.without_last(), structure, alignment, bias_gyro, calibration)
+    problem, solution = _adjusted(window.without_last(), x, calibration)
+    keep = _explained(problem, solution.variables)
     window = window.only(keep)
-    _require(window, "tracks fit the bundle adjustment", options)
-    problem = _problem(window.without_last(), solution.states, calibration, sigma, options)
-    solution = bundle_adjustment.solve(problem, solution.states, solution.landmarks[keep])
-    check_fit(problem, solution, options)
+    _require(window, "tracks fit the bundle adjustment")
+    x = replace(solution.variables, landmarks=solution.variables.landmarks[keep])
+    problem, solution = _adjusted(window.without_last(), x, calibration)
+    _check_fit(problem, solution)
 
-    predicted = _predict(packets[-held_out:], solution.states.unstack(window.t_ns[:-1])[-1], calibration)
-    p_WF = lm.positions(solution.states, solution.landmarks, problem.observations, calibration)
-    check_lookahead(predicted, [tracks for _, tracks in packets[-held_out:]], window.ids, p_WF, calibration, options)
+    x = solution.variables
+    predicted = _predict(packets[-held_out:], x.states.unstack(window.t_ns[:-1])[-1], calibration)
+    p_WF = _positions(problem, x)
+    _check_lookahead(predicted, [tracks for _, tracks in packets[-held_out:]], window.ids, p_WF, calibration)
 
-    states = StateArrays.stack([*solution.states.unstack(window.t_ns[:-1]), predicted[-1]])
-    problem = _problem(window, states, calibration, sigma, options)
-    solution = bundle_adjustment.solve(problem, states, solution.landmarks)
-    check_fit(problem, solution, options)
-    cov = bundle_adjustment.covariance(problem, solution)
-    check_uncertainty(solution, cov, options)
-    p_WF = lm.positions(solution.states, solution.landmarks, problem.observations, calibration)
-    keep = _explained(problem, solution)
-    return _estimate(window.only(keep), solution, cov, p_WF[keep])
+    x = replace(x, states=x.states.append(StateArrays.stack(predicted[-1:])))
+    problem, solution = _adjusted(window, x, calibration)
+    _check_fit(problem, solution)
+    x = solution.variables
+    cov = covariance(problem, x)
+    _check_uncertainty(x.states.p_WB, cov)
+    keep = _explained(problem, x)
+    return _estimate(window.only(keep), x.states, cov, _positions(problem, x)[keep])
 
 
-def _require(window: Window, what: str, options: InitializationOptions) -> None:
-    if len(window.ids) < options.min_landmarks:
-        raise RefusalError(f"{len(window.ids)} {what}, {options.min_landmarks} are needed")
+def _require(window: Window, what: str) -> None:
+    if len(window.ids) < _FEWEST_LANDMARKS:
+        raise RefusalError(f"{len(window.ids)} {what}, {_FEWEST_LANDMARKS} are needed")
 
 
 def _preintegrate(
@@ -88,34 +112,32 @@ def _preintegrate(
     return [preintegrate(segment, bias_gyro_B, bias_accel_B, calibration.imu) for segment in window.segments]
 
 
-def _with_gyro_bias(
-    window: Window, calibration: Calibration, sigma: float, options: InitializationOptions
-) -> tuple[Window, Float]:
+def _with_gyro_bias(window: Window, calibration: Calibration, sigma: float) -> tuple[Window, Float]:
     """The tracks that lie on their epipolar lines, and the gyroscope's bias (3,) that puts them there."""
     imu = _preintegrate(window, np.zeros(3), np.zeros(3), calibration)
-    bias, distance = estimate_gyro_bias(window, imu, calibration.cameras[0].R_BC, sigma, options.bias_gyro_sigma)
-    if np.linalg.norm(bias) > 3.0 * options.bias_gyro_sigma:
+    bias, distance = estimate_gyro_bias(window, imu, calibration.cameras[0].R_BC, sigma, BIAS_GYRO_SIGMA)
+    if np.linalg.norm(bias) > 3.0 * BIAS_GYRO_SIGMA:
         raise RefusalError(f"gyroscope bias of {np.linalg.norm(bias):.2f} rad/s is not plausible")
     window = window.only(distance < _EPIPOLAR_LIMIT)
-    _require(window, "tracks lie on their epipolar lines", options)
+    _require(window, "tracks lie on their epipolar lines")
     return window, bias
 
 
-def _structure(window: Window, R_B0C: Float, sigma: float, options: InitializationOptions) -> tuple[Window, Structure]:
+def _structure(window: Window, R_B0C: Float, sigma: float) -> tuple[Window, Structure]:
     """The structure without the newest keyframe, from the tracks that fit it."""
     for _ in range(2):
         structure = solve_structure(window.without_last(), R_B0C[:-1], sigma)
         typical = np.nanmedian(structure.error, axis=0)
         keep = structure.good & (typical < _STRUCTURE_LIMIT * sigma)
         window = window.only(keep)
-        _require(window, "tracks have parallax and fit the structure", options)
+        _require(window, "tracks have parallax and fit the structure")
     return window, structure.only(keep)
 
 
 def _start_of_adjustment(
-    window: Window, structure: Structure, alignment: Alignment, bias_gyro_B: Float
-) -> tuple[StateArrays, Float]:
-    """States in a world with z up, and landmarks (L, 3) [x y rho] in the first frame that sees them."""
+    window: Window, structure: Structure, alignment: Alignment, bias_gyro_B: Float, calibration: Calibration
+) -> Variables:
+    """States in a world with z up, and landmarks [x y rho] in the first frame that sees them."""
     R_WB0 = level_rotation(-alignment.g_B0)
     count = len(window.t_ns)
     states = StateArrays(
@@ -128,38 +150,33 @@ def _start_of_adjustment(
     track = np.arange(len(window.ids))
     host = window.seen.argmax(axis=0)
     inverse_depth = 1.0 / (alignment.scale * structure.depth[host, track])
-    return states, np.column_stack([window.xy[host, track], inverse_depth])
+    landmarks = np.column_stack([window.xy[host, track], inverse_depth])
+    return Variables(states, _camera(calibration), landmarks)
 
 
-def _problem(
-    window: Window, states: StateArrays, calibration: Calibration, sigma: float, options: InitializationOptions
-) -> Problem:
-    """The adjustment of ``window``, its readings integrated at the biases of ``states``."""
-    imu = [
-        preintegrate(segment, bias_gyro, bias_accel, calibration.imu)
-        for segment, bias_gyro, bias_accel in zip(
-            window.segments, states.bias_gyro_B[:-1], states.bias_accel_B[:-1], strict=True
-        )
-    ]
-    return Problem(
-        Observations.of(window),
-        ImuFactors.stack(imu),
-        calibration,
-        sigma,
-        options.bias_gyro_sigma,
-        options.bias_accel_sigma,
-    )
+def _camera(calibration: Calibration) -> Calibrated:
+    # Contiguous, as what the solver makes of it is: kernels are compiled for each layout that they meet.
+    camera = calibration.cameras[0]
+    return Calibrated(np.ascontiguousarray(camera.R_BC), np.ascontiguousarray(camera.p_BC))
 
 
-def _explained(problem: Problem, solution: Solution) -> Bool:
+def _adjusted(window: Window, x: Variables, calibration: Calibration) -> tuple[Problem, Solution]:
+    """The adjustment of ``window`` from ``x``, its readings integrated at the biases there."""
+    biases = zip(x.states.bias_gyro_B[:-1], x.states.bias_accel_B[:-1], strict=True)
+    imu = [preintegrate(segment, *bias, calibration.imu) for segment, bias in zip(window.segments, biases, strict=True)]
+    problem = adjustment(window, imu, x, calibration.cameras[0].model.focal_px)
+    return problem, adjusted(problem, x)
+
+
+def _explained(problem: Problem, x: Variables) -> Bool:
     """(L,) whether a track's landmark lies in front of its cameras, at a finite depth, and near its observations."""
-    obs = problem.observations
-    r, depth_ratio = lm.project(solution.states, solution.landmarks, obs, problem.calibration)
-    views = np.diff(np.append(obs.start, len(obs.frame)))
-    rms = np.sqrt(np.add.reduceat((r**2).sum(axis=1), obs.start) / (2 * views)) / problem.sigma
-    in_front = np.minimum.reduceat(depth_ratio, obs.start) > 0.0
-    keep: Bool = (rms < _ADJUSTED_LIMIT) & in_front & (solution.landmarks[:, 2] > 1.0 / _FARTHEST_M)
-    return keep
+    errors = problem.sightings.errors(x.poses, x.camera, x.landmarks)
+    return np.asarray((errors < _ADJUSTED_LIMIT) & (x.landmarks[:, 2] > 1.0 / _FARTHEST_M))
+
+
+def _positions(problem: Problem, x: Variables) -> Float:
+    """(L, 3) m of the landmarks in the world."""
+    return positions(x.states, x.camera, problem.sightings.seen.argmax(axis=1), x.landmarks)
 
 
 def _predict(packets: Sequence[Packet], last: NavState, calibration: Calibration) -> list[NavState]:
@@ -171,19 +188,111 @@ def _predict(packets: Sequence[Packet], last: NavState, calibration: Calibration
     return out
 
 
-def _estimate(window: Window, solution: Solution, cov: Float, p_WF: Float) -> InitialEstimate:
+def _estimate(window: Window, adjusted: StateArrays, cov: Float, p_WF: Float) -> InitialEstimate:
     """The world turned and moved so that yaw and position are zero at the first state."""
-    R_0, p_0 = solution.states.R_WB[0], solution.states.p_WB[0]
+    R_0, p_0 = adjusted.R_WB[0], adjusted.p_WB[0]
     R_new = level_rotation(R_0[2]) @ R_0.T  # R_0[2] is the vertical in the body
     turn = np.eye(15)
     turn[DP, DP] = turn[DV, DV] = R_new
     states = StateArrays(
-        R_new @ solution.states.R_WB,
-        (solution.states.p_WB - p_0) @ R_new.T,
-        solution.states.v_WB @ R_new.T,
-        solution.states.bias_gyro_B,
-        solution.states.bias_accel_B,
+        R_new @ adjusted.R_WB,
+        (adjusted.p_WB - p_0) @ R_new.T,
+        adjusted.v_WB @ R_new.T,
+        adjusted.bias_gyro_B,
+        adjusted.bias_accel_B,
     ).unstack(window.t_ns)
     newest = turn @ cov[-15:, -15:] @ turn.T
     states[-1] = replace(states[-1], cov=0.5 * (newest + newest.T))
     return InitialEstimate("dynamic", tuple(states), window.ids, (p_WF - p_0) @ R_new.T)
+
+
+def _check_parallax(window: Window, R_B0B: Float, calibration: Calibration) -> None:
+    """The median track must move by enough pixels that the rotations ``R_B0B`` (K, 3, 3) do not explain."""
+    rays = np.concatenate([window.xy, np.ones((*window.xy.shape[:2], 1))], axis=2)
+    rays_B0 = rays @ np.swapaxes(R_B0B @ calibration.cameras[0].R_BC, -1, -2)
+    rays_B0 /= np.linalg.norm(rays_B0, axis=2, keepdims=True)
+    first = rays_B0[window.seen.argmax(axis=0), np.arange(len(window.ids))]
+    angle = np.nanmax(np.linalg.norm(rays_B0 - first, axis=2), axis=0)
+    parallax = float(np.median(angle)) * calibration.cameras[0].model.focal_px
+    if not parallax >= _LEAST_PARALLAX_PX:
+        raise RefusalError(f"parallax of {parallax:.1f} px, {_LEAST_PARALLAX_PX:.1f} px are needed")
+
+
+def _check_fit(problem: Problem, solution: Solution) -> None:
+    """Observations, readings and biases must be as the noise and the priors have them."""
+    if not solution.converged:
+        raise RefusalError("the bundle adjustment did not converge")
+    x, sightings = solution.variables, problem.sightings
+    errors = sightings.errors(x.poses, x.camera, x.landmarks)
+    used = ~np.isinf(errors)  # what is behind a camera is let go of, and says nothing of the others
+    views = sightings.seen.sum(axis=1)[used]
+    rms = sightings.sigma * float(np.sqrt((views * errors[used] ** 2).sum() / views.sum()))
+    if not rms <= _LARGEST_ERROR_PX:
+        raise RefusalError(f"reprojection error of {rms:.1f} px RMS, {_LARGEST_ERROR_PX:.1f} px are allowed")
+    inertial = float((problem.reading_residuals(x.states) ** 2).mean())
+    if not inertial <= _MAX_INERTIAL:
+        raise RefusalError(f"the readings disagree with the images: {inertial:.1f} times their noise's variance")
+    bias = float(np.linalg.norm(x.states.bias_accel_B[-1]))
+    if not bias <= _MAX_BIAS_SIGMAS * BIAS_ACCEL_SIGMA:
+        raise RefusalError(f"accelerometer bias of {bias:.2f} m/s^2 is not plausible")
+
+
+def _check_lookahead(
+    predicted: Sequence[NavState],
+    seen: Sequence[FrameTracks],
+    ids: Int,
+    p_WF: Float,
+    calibration: Calibration,
+) -> None:
+    """States predicted by the readings must see the landmarks ``ids`` (L,), ``p_WF`` (L, 3) where the frames do."""
+    camera = calibration.cameras[0]
+    for state, tracks in zip(predicted, seen, strict=True):
+        _, a, b = np.intersect1d(ids, tracks.ids, return_indices=True)
+        if len(a) < _FEWEST_COMMON:
+            raise RefusalError(f"only {len(a)} landmarks were still tracked in the frames held back")
+        p_C = ((p_WF[a] - state.p_WB) @ state.R_WB - camera.p_BC) @ camera.R_BC
+        error = np.linalg.norm(p_C[:, :2] / p_C[:, 2:] - tracks.xy_normalised[b], axis=1)
+        px = float(np.median(np.where(p_C[:, 2] > 0.0, error, np.inf))) * camera.model.focal_px
+        if not px <= _LARGEST_LOOKAHEAD_PX:
+            raise RefusalError(f"the prediction misses a later frame by {px:.1f} px")
+
+
+def _check_uncertainty(p_WB: Float, cov: Float) -> None:
+    """Velocity, gravity's direction and scale must be determined well; ``cov`` (15 K, 15 K) is of all states.
+
+    ``p_WB`` (K, 3) is the path.
+    """
+    newest = cov[-15:, -15:]
+    velocity = float(np.sqrt(np.linalg.eigvalsh(newest[DV, DV])[-1]))
+    if not velocity <= _VELOCITY_SIGMA:
+        raise RefusalError(f"velocity known to {velocity:.3f} m/s only (standard deviation)")
+    tilt = float(np.rad2deg(np.sqrt(np.linalg.eigvalsh(newest[DTHETA, DTHETA])[-1])))
+    if not tilt <= _TILT_SIGMA_DEG:
+        raise RefusalError(f"gravity's direction known to {tilt:.2f} deg only (standard deviation)")
+    scale = scale_sigma(p_WB, cov)
+    if not scale <= _SCALE_SIGMA:
+        raise RefusalError(f"scale known to {100.0 * scale:.0f} % only (standard deviation)")
+
+
+def scale_sigma(p_WB: Float, cov: Float) -> float:
+    """Relative standard deviation of the path's size, sum q_k . dp_k / sum |q_k|^2 with q from the path's centre.
+
+    Translations and rotations of the whole path have no part in it.
+    """
+    q = p_WB - p_WB.mean(axis=0)
+    by_state = np.zeros((len(q), 15))
+    by_state[:, DP] = q / (q**2).sum()
+    a = by_state.ravel()
+    return float(np.sqrt(a @ cov @ a))
+
+
+def warm_up(calibration: Calibration) -> None:
+    """Compile the kernels of the adjustment, or load them from the cache, so that the first attempt does not wait."""
+    t_ns, half_ns = np.arange(4) * 100_000_000, np.arange(3) * 50_000_000
+    xy = np.tile(np.random.default_rng(0).uniform(-0.3, 0.3, (20, 2)), (4, 1, 1))
+    segments = tuple(ImuSegment(t + half_ns, np.zeros((3, 3)), np.tile(-g_W, (3, 1))) for t in t_ns[:-1])
+    window = Window(t_ns, segments, np.arange(20), xy, np.ones((4, 20), bool))
+    state = NavState(0, np.eye(3), *np.zeros((4, 3)))
+    x = Variables(StateArrays.stack([state] * 4), _camera(calibration), np.column_stack([xy[0], np.full(20, 0.2)]))
+    problem, solution = _adjusted(window, x, calibration)
+    _explained(problem, solution.variables)

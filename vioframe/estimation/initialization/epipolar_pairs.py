@@ -13,8 +13,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from vioframe.arrays import Bool
 from vioframe.estimation.inertial.preintegration import Preintegrated
-from vioframe.estimation.initialization.window import Bool
 from vioframe.geometry import so3
 from vioframe.types import Float, Int
 

@@ -2,7 +2,9 @@
 
     chain keyframes -> turned about two axes? -> closed form -> refine on all tracks -> judge
 
-Translation plays no part, so that neither scale, gravity nor the lever arm need be known. Derivation:
+A rotation R_BiBj of the body is R_BC R_CiCj R_BC' seen by the camera, hence log R_BiBj = R_BC log R_CiCj: one axis, in
+two frames (Park, Martin, "Robot Sensor Calibration: Solving AX = XB on the Euclidean Group", T-RA 1994). Translation
+plays no part, so that neither scale, gravity nor the lever arm need be known. Derivation:
 ``docs/derivations/initialization.md``.
 """
 
@@ -10,17 +12,17 @@ from __future__ import annotations
 
 import logging
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from vioframe.arrays import Float, Int
 from vioframe.estimation.inertial.preintegration import Preintegrated, join_segments, preintegrate
-from vioframe.estimation.initialization.estimate import RefusalError
-from vioframe.estimation.initialization.hand_eye_solver import Chain, Solution, second_turn, solve
-from vioframe.estimation.initialization.options import InitializationOptions
-from vioframe.estimation.initialization.window import finite_tracks
+from vioframe.estimation.initialization.epipolar_pairs import BearingPairs, relative_rotations
+from vioframe.estimation.initialization.window import BIAS_GYRO_SIGMA, LARGEST_IMU_GAP_S, PIXEL_SIGMA, RefusalError
 from vioframe.geometry import so3
-from vioframe.types import Calibration, Float, FrameTracks, ImuSegment
+from vioframe.types import Calibration, FrameTracks, ImuSegment
 
 _log = logging.getLogger("vioframe.estimation.initialization")
 
@@ -30,6 +32,22 @@ _FEWEST_KEYFRAMES, _MOST_KEYFRAMES = 10, 60
 # simulated and real recordings show 0.05 to 0.5 degrees.
 _SYSTEMATIC_DEG = 0.3
 _MAX_MISFIT, _LEAST_MISFIT = 2.0, 0.1
+# Turns about other axes than the main one (root of their sum of squares) that an attempt needs, rad. VINS-Mono asks for
+# 0.25; here what is too little shows in the covariance, of which this is the largest standard deviation accepted.
+_LEAST_SECOND_TURN, _LARGEST_SIGMA_DEG = 0.15, 0.4
+_FEWEST_TRACKS, _MOST_TRACKS = 15, 80
+# Keyframes from the first of a pair to the second. One of two fifths of a second turns enough and keeps most tracks.
+_STEPS, _COARSE_STEP = (1, 2, 4, 8), 2
+# Iterations and Cauchy's scale (standard deviations) of each stage for a pair on its own ...
+_PAIR_STAGES = ((6, 20.0), (6, 5.0), (6, 2.0))
+_PAIR_PRIOR, _LARGEST_PAIR_STEP = 0.5, 0.2  # rad
+# ... and for all: iterations, the longest step used, Cauchy's scale.
+_STAGES = ((6, 2, 50.0), (6, 4, 20.0), (8, 8, 5.0), (15, 8, 2.0))
+_CONVERGED = 1e-5  # rad and rad/s
+_ALIGNMENT_ITERATIONS, _ALIGNMENT_SIGMA = 10, np.deg2rad(1.0)
+_UNOBSERVED = 1e-6  # information, 1/rad^2, far below what any pair of frames brings
+# The median of |x| for x ~ N(0, 1).
+_MEDIAN = 0.6745
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,9 +73,8 @@ class RotationCalibrator:
     The body must turn about two axes. Every attempt is logged to ``vioframe.estimation.initialization``.
     """
 
-    def __init__(self, calibration: Calibration, options: InitializationOptions | None = None) -> None:
-        self._calibration = calibration
-        self._options = options or InitializationOptions()
+    def __init__(self, calibration: Calibration) -> None:
+        self._noise, self._focal_px = calibration.imu, calibration.cameras[0].model.focal_px
         self._tracks: deque[FrameTracks] = deque(maxlen=_MOST_KEYFRAMES)
         self._imu: deque[Preintegrated] = deque(maxlen=_MOST_KEYFRAMES - 1)
         self._since_keyframe: list[ImuSegment] = []
@@ -75,7 +92,7 @@ class RotationCalibrator:
 
     def add(self, imu: ImuSegment, tracks: FrameTracks) -> CameraRotation | None:
         """Take one frame and the readings since the one before; the rotation once it can be trusted, else None."""
-        if imu.largest_gap_s > self._options.largest_imu_gap_s:
+        if imu.largest_gap_s > LARGEST_IMU_GAP_S:
             self.reset()
         if not self._chain(imu, tracks) or len(self._tracks) < _FEWEST_KEYFRAMES:
             return None
@@ -96,38 +113,37 @@ class RotationCalibrator:
     def _chain(self, imu: ImuSegment, tracks: FrameTracks) -> bool:
         """Whether the frame became a keyframe."""
         if not self._tracks:
-            self._tracks.append(finite_tracks(tracks))
+            self._tracks.append(tracks.finite())
             return True
         self._since_keyframe.append(imu)
         if tracks.t_ns - self._tracks[-1].t_ns < _KEYFRAME_NS:
             return False
         zero = np.zeros(3)
-        self._imu.append(preintegrate(join_segments(self._since_keyframe), zero, zero, self._calibration.imu))
-        self._tracks.append(finite_tracks(tracks))
+        self._imu.append(preintegrate(join_segments(self._since_keyframe), zero, zero, self._noise))
+        self._tracks.append(tracks.finite())
         self._since_keyframe.clear()
         return True
 
     def _attempt(self) -> CameraRotation:
-        options, chain = self._options, Chain(tuple(self._tracks), tuple(self._imu))
+        chain = Chain(tuple(self._tracks), tuple(self._imu))
         turned = second_turn(chain)
-        if not turned >= options.min_second_turn_rad:
+        if not turned >= _LEAST_SECOND_TURN:
             raise RefusalError(
-                f"turned by {turned:.2f} rad about a second axis, {options.min_second_turn_rad:.2f} are needed; "
+                f"turned by {turned:.2f} rad about a second axis, {_LEAST_SECOND_TURN:.2f} are needed; "
                 "turn the vehicle about two axes"
             )
-        sigma = options.pixel_sigma / self._calibration.cameras[0].model.focal_px
-        return self._judge(solve(chain, sigma, options.bias_gyro_sigma))
+        return self._judge(_solve(chain, PIXEL_SIGMA / self._focal_px, BIAS_GYRO_SIGMA))
 
-    def _judge(self, solution: Solution) -> CameraRotation:
+    def _judge(self, solution: _Solution) -> CameraRotation:
         """Refuse what the tracks contradict; the scatter they show stands in for the noise that was assumed."""
         if not solution.misfit <= _MAX_MISFIT:
             raise RefusalError(f"the tracks disagree with the gyroscope by {solution.misfit:.1f} times their noise")
         bias = float(np.linalg.norm(solution.bias_gyro_B))
-        if not bias <= 3.0 * self._options.bias_gyro_sigma:
+        if not bias <= 3.0 * BIAS_GYRO_SIGMA:
             raise RefusalError(f"gyroscope bias of {bias:.2f} rad/s is not plausible")
         scatter = max(solution.misfit, _LEAST_MISFIT) ** 2 * np.linalg.inv(solution.information)
         found = CameraRotation(solution.R_BC, scatter + np.eye(3) * np.deg2rad(_SYSTEMATIC_DEG) ** 2)
-        if not found.sigma_deg <= self._options.max_camera_rotation_sigma_deg:
+        if not found.sigma_deg <= _LARGEST_SIGMA_DEG:
             raise RefusalError(
                 f"the camera's rotation is known to {found.sigma_deg:.2f} deg only (standard deviation); "
                 "turn the vehicle about two axes"
@@ -135,3 +151,148 @@ class RotationCalibrator:
         if not solution.settled:
             raise RefusalError("the refinement of the camera's rotation did not settle")
         return found
+
+
+@dataclass(frozen=True, slots=True)
+class Chain:
+    """K keyframes ``tracks`` and the K - 1 measurements ``imu`` between them, integrated without bias."""
+
+    tracks: Sequence[FrameTracks]
+    imu: Sequence[Preintegrated]
+
+    def pairs(self, steps: Sequence[int]) -> Pairs:
+        """All pairs that are one of ``steps`` apart and share enough tracks; of very many tracks, some."""
+        first, second, points = [], [], []
+        for step in steps:
+            for i, (a, b) in enumerate(zip(self.tracks, self.tracks[step:], strict=False)):
+                _, in_a, in_b = np.intersect1d(a.ids, b.ids, return_indices=True)
+                if len(in_a) >= _FEWEST_TRACKS:
+                    some = np.linspace(0, len(in_a) - 1, min(len(in_a), _MOST_TRACKS)).astype(np.int64)
+                    first.append(i)
+                    second.append(i + step)
+                    points.append((a.xy_normalised[in_a[some]], b.xy_normalised[in_b[some]]))
+        xy = np.zeros((2, len(points), _MOST_TRACKS, 2))
+        common = np.zeros((len(points), _MOST_TRACKS), bool)
+        for k, (xy_1, xy_2) in enumerate(points):
+            xy[0, k, : len(xy_1)], xy[1, k, : len(xy_2)], common[k, : len(xy_1)] = xy_1, xy_2, True
+        return Pairs(np.array(first, np.int64), np.array(second, np.int64), BearingPairs.of(xy[0], xy[1], common))
+
+
+@dataclass(frozen=True, slots=True)
+class Pairs:
+    """P pairs of keyframes, ``first`` and ``second`` (P,), and their tracks."""
+
+    first: Int
+    second: Int
+    bearings: BearingPairs
+
+    def up_to(self, step: int) -> Pairs:
+        """Those at most ``step`` keyframes apart."""
+        near = self.second - self.first <= step
+        b = self.bearings
+        return Pairs(self.first[near], self.second[near], BearingPairs(b.f[near], b.g[near], b.common[near]))
+
+
+@dataclass(frozen=True, slots=True)
+class _Solution:
+    """``R_BC`` (3, 3) and ``bias_gyro_B`` (3,) rad/s; ``information`` (3, 3) about R_BC's right perturbation, 1/rad^2.
+
+    ``misfit`` is the typical distance of a track from its epipolar lines over the noise that was assumed. The iteration
+    may not have ``settled``.
+    """
+
+    R_BC: Float
+    bias_gyro_B: Float
+    information: Float
+    misfit: float
+    settled: bool
+
+
+def second_turn(chain: Chain) -> float:
+    """How much the body turned about other axes than its main one, rad: without that R_BC cannot be known.
+
+    To first order the second-smallest singular value of the quaternion equations q_B q_BC = q_BC q_C, by which
+    VINS-Mono decides (Qin, Li, Shen, T-RO 2018). A steady turn does not count: it could be the gyroscope's bias.
+    """
+    k = np.arange(len(chain.tracks) - _COARSE_STEP)
+    turns = so3.log(relative_rotations(chain.imu, np.zeros(3), k, k + _COARSE_STEP)[0])
+    return float(np.linalg.norm(np.linalg.svd(turns - turns.mean(axis=0), compute_uv=False)[1:]))
+
+
+def _solve(chain: Chain, sigma: float, bias_sigma: float) -> _Solution:
+    """From tracks with noise ``sigma`` on the z = 1 plane; ``bias_sigma`` is the bias's prior about zero, rad/s.
+
+    Raises :class:`RefusalError` where there are too few tracks.
+    """
+    pairs = chain.pairs(_STEPS)
+    if len(pairs.first) < len(chain.tracks):
+        raise RefusalError("too few tracks from one keyframe to the next")
+    R_BC, bias = _align_axes(chain, sigma, bias_sigma)
+    for iterations, longest, cauchy in _STAGES:
+        used = pairs.up_to(longest)
+        weight = used.bearings.common.astype(np.float64)
+        for _ in range(iterations):
+            R_B1B2, by_bias = relative_rotations(chain.imu, bias, used.first, used.second)
+            R_C1C2 = R_BC.T @ R_B1B2 @ R_BC
+            equations = used.bearings.linearise(R_C1C2, weight, sigma, cauchy)
+            # R_CB R_B1B2 Exp(dtheta_B) R_BC = R_C1C2 Exp(R_CB dtheta_B), and turning R_BC on the right by d turns
+            # R_C1C2 into Exp(-d) R_C1C2 Exp(d) = R_C1C2 Exp((I - R_C2C1) d).
+            A = np.concatenate([R_BC.T @ by_bias, np.eye(3) - np.swapaxes(R_C1C2, -1, -2)], axis=2)
+            transposed = np.swapaxes(A, -1, -2)
+            H = (transposed @ equations.H @ A).sum(axis=0)
+            b = (transposed @ equations.b[..., None]).sum(axis=0)[:, 0]
+            H[:3, :3] += np.eye(3) / bias_sigma**2
+            H[3:, 3:] += np.eye(3) * _UNOBSERVED
+            b[:3] += bias / bias_sigma**2
+            step = np.linalg.solve(H, -b)
+            bias, R_BC, weight = bias + step[:3], R_BC @ so3.exp(step[3:]), equations.weight
+            if np.linalg.norm(step) < _CONVERGED:
+                break
+    settled = bool(np.linalg.norm(step) < 100.0 * _CONVERGED)
+    information = H[3:, 3:] - H[3:, :3] @ np.linalg.solve(H[:3, :3], H[:3, 3:])
+    common = used.bearings.common
+    misfit = float(np.median(equations.distance[common])) / _MEDIAN
+    return _Solution(R_BC, bias, information * _independent_share(chain, int(common.sum())), misfit, settled)
+
+
+def _align_axes(chain: Chain, sigma: float, bias_sigma: float) -> tuple[Float, Float]:
+    """R_BC (3, 3) and the bias (3,) from the turns of pairs: argmin sum w |beta - R_BC gamma - bias dt|^2.
+
+    ``beta`` and ``gamma`` (P, 3) are the rotation vectors of body and camera. The bias is eliminated, which leaves an
+    orthogonal Procrustes problem. An angle is the same in both frames: where they differ, the pair counts little.
+    """
+    pairs = chain.pairs([_COARSE_STEP])
+    dt = np.array([sum(m.dt_s for m in chain.imu[i : i + _COARSE_STEP]) for i in pairs.first])
+    beta = so3.log(relative_rotations(chain.imu, np.zeros(3), pairs.first, pairs.second)[0])
+    gamma = so3.log(_turns_of_camera(pairs.bearings, sigma))
+    off = np.abs(np.linalg.norm(beta, axis=1) - np.linalg.norm(gamma, axis=1))
+    for _ in range(_ALIGNMENT_ITERATIONS):
+        scale = max(_ALIGNMENT_SIGMA, 1.5 * float(np.median(off)))
+        weight = 1.0 / (1.0 + (off / scale) ** 2)
+        total = (weight * dt**2).sum() + (_ALIGNMENT_SIGMA / bias_sigma) ** 2
+        beta_dt, gamma_dt = (weight * dt) @ beta, (weight * dt) @ gamma
+        R_BC = so3.project((beta * weight[:, None]).T @ gamma - np.outer(beta_dt, gamma_dt) / total)
+        bias = (beta_dt - R_BC @ gamma_dt) / total
+        off = np.linalg.norm(beta - gamma @ R_BC.T - dt[:, None] * bias, axis=1)
+    return R_BC, bias
+
+
+def _turns_of_camera(bearings: BearingPairs, sigma: float) -> Float:
+    """R_C1C2 (P, 3, 3) of each pair by itself, beginning with the rotation that explains it best without moving."""
+    f, g = (v / np.maximum(np.linalg.norm(v, axis=-1, keepdims=True), 1.0) for v in (bearings.f, bearings.g))
+    R = so3.project(np.swapaxes(f, -1, -2) @ g)
+    weight = bearings.common.astype(np.float64)
+    for iterations, cauchy in _PAIR_STAGES:
+        for _ in range(iterations):
+            equations = bearings.linearise(R, weight, sigma, cauchy)
+            step = -np.linalg.solve(equations.H + np.eye(3) / _PAIR_PRIOR**2, equations.b[..., None])[..., 0]
+            length = np.linalg.norm(step, axis=1, keepdims=True)
+            R = R @ so3.exp(step * np.minimum(1.0, _LARGEST_PAIR_STEP / np.maximum(length, 1e-12)))
+            weight = equations.weight
+    return R
+
+
+def _independent_share(chain: Chain, rows: int) -> float:
+    """Pairs overlap: of ``rows`` equations, a track with V views brings 2 V - 3 that are independent."""
+    _, views = np.unique(np.concatenate([t.ids for t in chain.tracks]), return_counts=True)
+    return min(1.0, float(np.maximum(2 * views - 3, 0).sum()) / rows)

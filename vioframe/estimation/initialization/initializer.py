@@ -8,29 +8,33 @@ from dataclasses import replace
 import numpy as np
 
 from vioframe.estimation.initialization import dynamic, static
-from vioframe.estimation.initialization.estimate import InitialEstimate, RefusalError
 from vioframe.estimation.initialization.hand_eye import CameraRotation, RotationCalibrator
-from vioframe.estimation.initialization.options import InitializationOptions
-from vioframe.estimation.initialization.window import Packet, finite_tracks
-from vioframe.types import Calibration, FrameTracks, ImuNoise, ImuSegment
+from vioframe.estimation.initialization.window import LARGEST_IMU_GAP_S, InitialEstimate, Packet, RefusalError
+from vioframe.types import Calibration, FrameTracks, ImuSegment
 
 _log = logging.getLogger("vioframe.estimation.initialization")
+
+# Length of the standstill that the static method needs.
+_STATIC_WINDOW_S = 1.0
+# The dynamic method is first tried when the window is this long, and looks back no farther than this; every so often.
+_SHORTEST_WINDOW_S, _LONGEST_WINDOW_S, _ATTEMPT_INTERVAL_S = 1.5, 3.0, 0.1
+# Times ``imu_noise_factor`` in the dynamic method, which has no later readings to correct what vibration, scale and
+# alignment errors do over its seconds: with 8 in all its squared errors on EuRoC's flights are as its covariance says.
+_IN_MOTION = 2.0
 
 
 class Initializer:
     """Tries the static method at every frame, and the dynamic one every so often, until one is sure of itself.
 
     Where the camera's rotation on the body is not known both wait for its hand-eye calibration, which is done once.
-    Every attempt is logged to ``vioframe.estimation.initialization``.
+    ``imu_noise_factor`` is that of :meth:`~vioframe.types.ImuNoise.in_flight`. Every attempt is logged to
+    ``vioframe.estimation.initialization``.
     """
 
-    def __init__(self, calibration: Calibration, options: InitializationOptions | None = None) -> None:
-        options = options or InitializationOptions()
+    def __init__(self, calibration: Calibration, imu_noise_factor: float = 4.0) -> None:
         self._calibration = calibration
-        self._in_flight = replace(calibration, imu=_inflated(calibration.imu, options.imu_noise_factor))
-        self._options = options
-        known = calibration.cameras[0].rotation_known
-        self._calibrator = None if known else RotationCalibrator(calibration, options)
+        self._in_flight = replace(calibration, imu=calibration.imu.in_flight(_IN_MOTION * imu_noise_factor))
+        self._calibrator = None if calibration.cameras[0].rotation_known else RotationCalibrator(calibration)
         self._camera_rotation: CameraRotation | None = None
         self._refusals: dict[str, str] = {}
         self._packets: list[Packet] = []
@@ -61,11 +65,11 @@ class Initializer:
 
     def add(self, imu: ImuSegment, tracks: FrameTracks) -> InitialEstimate | None:
         """Take one frame; an estimate whose newest state is at this frame, or None as long as none can be trusted."""
-        if imu.largest_gap_s > self._options.largest_imu_gap_s:
+        if imu.largest_gap_s > LARGEST_IMU_GAP_S:
             self.reset()
             _log.info("no readings for %.2f s: begun anew", imu.largest_gap_s)
-        self._packets.append((imu, finite_tracks(tracks)))
-        self._packets = self._last(self._options.longest_window_s)
+        self._packets.append((imu, tracks.finite()))
+        self._packets = self._last(_LONGEST_WINDOW_S)
         if self._calibrator is not None and not self._find_camera_rotation(self._calibrator, imu, tracks):
             return None
         for method, attempt in (("static", self._static), ("dynamic", self._dynamic)):
@@ -94,20 +98,20 @@ class Initializer:
         return True
 
     def _static(self) -> InitialEstimate | None:
-        packets = self._last(self._options.static_window_s)
-        if _duration_s(packets) < 0.95 * self._options.static_window_s:
+        packets = self._last(_STATIC_WINDOW_S)
+        if _duration_s(packets) < 0.95 * _STATIC_WINDOW_S:
             return None
-        return static.initialise(packets, self._calibration, self._options)
+        return static.initialise(packets, self._calibration.imu)
 
     def _dynamic(self) -> InitialEstimate | None:
         newest_ns = self._packets[-1][1].t_ns
         last_ns = self._last_attempt_ns
-        if last_ns is not None and newest_ns - last_ns < self._options.attempt_interval_s * 1e9:
+        if last_ns is not None and newest_ns - last_ns < _ATTEMPT_INTERVAL_S * 1e9:
             return None
-        if _duration_s(self._packets) < self._options.shortest_window_s:
+        if _duration_s(self._packets) < _SHORTEST_WINDOW_S:
             return None
         self._last_attempt_ns = newest_ns
-        return dynamic.initialise(self._packets, self._in_flight, self._options)
+        return dynamic.initialise(self._packets, self._in_flight)
 
     def _last(self, seconds: float) -> list[Packet]:
         """The frames of the last ``seconds``."""
@@ -117,13 +121,3 @@ class Initializer:
 
 def _duration_s(packets: list[Packet]) -> float:
     return (packets[-1][1].t_ns - packets[0][1].t_ns) * 1e-9
-
-
-def _inflated(noise: ImuNoise, factor: float) -> ImuNoise:
-    return ImuNoise(
-        noise.gyro_density * factor,
-        noise.accel_density * factor,
-        noise.gyro_walk * factor,
-        noise.accel_walk * factor,
-        noise.rate_hz,
-    )

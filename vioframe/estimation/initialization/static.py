@@ -9,51 +9,50 @@ from functools import reduce
 import numpy as np
 
 from vioframe.estimation.inertial.preintegration import join_segments
-from vioframe.estimation.initialization.attitude import level_rotation
-from vioframe.estimation.initialization.estimate import InitialEstimate, RefusalError
-from vioframe.estimation.initialization.options import InitializationOptions
-from vioframe.estimation.initialization.window import Packet
+from vioframe.estimation.initialization.window import BIAS_ACCEL_SIGMA, InitialEstimate, Packet, RefusalError
 from vioframe.geometry import so3
-from vioframe.types import DBA, DBG, DP, DTHETA, DV, GRAVITY_M_S2, Calibration, Float, ImuSegment, NavState, g_W
+from vioframe.types import DBA, DBG, DP, DTHETA, DV, GRAVITY_M_S2, Float, ImuNoise, ImuSegment, NavState, g_W
 
 _MIN_COMMON, _MIN_FRAMES = 10, 6
-_BLOCK_S = 0.1
+# Most that means over blocks of readings may vary, rad/s and m/s^2, and the median feature may move between the thirds
+# of the window: what standing on the ground with spinning rotors (V1_01_easy) stays within, and no flight does.
+_BLOCK_S, _GYRO_STD, _ACCEL_STD, _DISPARITY_PX = 0.1, 0.02, 0.2, 1.5
 # How well "at rest" fixes what it says, m and m/s; position and yaw are the origin by definition.
 _VELOCITY_SIGMA = 0.02
 _GAUGE_SIGMA = 1e-4
 _LARGEST_RATE = 0.5  # rad/s, far beyond any bias
 
 
-def initialise(packets: Sequence[Packet], calibration: Calibration, options: InitializationOptions) -> InitialEstimate:
+def initialise(packets: Sequence[Packet], noise: ImuNoise) -> InitialEstimate:
     """Estimate from consecutive ``packets``, the newest last; raises :class:`RefusalError` unless they are at rest.
 
     At constant velocity an accelerometer sees what it sees at rest, hence the images must stand still too.
     """
-    _check_readings(packets, options)
-    _check_images(packets, options)
+    _check_readings(packets)
+    _check_images(packets)
     imu = join_segments([segment for segment, _ in packets[1:]])
 
     gyro, accel = imu.gyro_B.mean(axis=0), imu.accel_B.mean(axis=0)
     norm = float(np.linalg.norm(accel))
     excess = norm - GRAVITY_M_S2
-    if abs(excess) > 3.0 * options.bias_accel_sigma:
+    if abs(excess) > 3.0 * BIAS_ACCEL_SIGMA:
         raise RefusalError(f"the accelerometer's mean is {norm:.2f} m/s^2, too far from gravity's {GRAVITY_M_S2}")
-    R_WB = level_rotation(accel)
+    R_WB = so3.level_rotation(accel)
     # Of all biases that explain the mean's length the smallest, which is the likeliest, points along gravity.
     bias_accel = excess * accel / norm
-    cov = _covariance(imu, R_WB, calibration, options)
+    cov = _covariance(imu, R_WB, noise)
     states = [NavState(tracks.t_ns, R_WB, np.zeros(3), np.zeros(3), gyro, bias_accel) for _, tracks in packets]
     states[-1] = replace(states[-1], cov=cov)
     return InitialEstimate("static", tuple(states))
 
 
-def _check_readings(packets: Sequence[Packet], options: InitializationOptions) -> None:
+def _check_readings(packets: Sequence[Packet]) -> None:
     """Means over a tenth of a second must be steady: rotors shake a standing vehicle, but do not carry it off."""
     blocks = _block_means([segment for segment, _ in packets[1:]])
     gyro_std, accel_std = blocks[:, :3].std(axis=0).max(), blocks[:, 3:].std(axis=0).max()
-    if gyro_std > options.static_gyro_std:
+    if gyro_std > _GYRO_STD:
         raise RefusalError(f"not at rest: the gyroscope varies by {gyro_std:.3f} rad/s")
-    if accel_std > options.static_accel_std:
+    if accel_std > _ACCEL_STD:
         raise RefusalError(f"not at rest: the accelerometer varies by {accel_std:.2f} m/s^2")
     rate = np.linalg.norm(blocks[:, :3].mean(axis=0))
     if rate > _LARGEST_RATE:
@@ -72,7 +71,7 @@ def _block_means(segments: Sequence[ImuSegment]) -> Float:
     return np.stack(means)
 
 
-def _check_images(packets: Sequence[Packet], options: InitializationOptions) -> None:
+def _check_images(packets: Sequence[Packet]) -> None:
     """A feature's typical place must be the same in every third of the window: medians quieten noise and outliers."""
     frames = [tracks for _, tracks in packets]
     if len(frames) < _MIN_FRAMES:
@@ -84,19 +83,19 @@ def _check_images(packets: Sequence[Packet], options: InitializationOptions) -> 
     first, middle, last = (np.median(third, axis=0) for third in np.array_split(xy, 3))
     for a, b in ((first, middle), (middle, last), (first, last)):
         moved = float(np.median(np.linalg.norm(b - a, axis=1)))
-        if moved > options.static_disparity_px:
+        if moved > _DISPARITY_PX:
             raise RefusalError(f"not at rest: features moved by {moved:.1f} px")
 
 
-def _covariance(imu: ImuSegment, R_WB: Float, calibration: Calibration, options: InitializationOptions) -> Float:
+def _covariance(imu: ImuSegment, R_WB: Float, noise: ImuNoise) -> Float:
     """(15, 15): the mean specific force ties tilt and accelerometer bias together, accel = R_WB' (-g_W) + bias.
 
     A bias across gravity cannot be told from a tilt: the two are each as uncertain as the prior of the bias and almost
     fully correlated.
     """
     duration = imu.duration_s
-    gyro_variance = imu.gyro_B.var(axis=0) / len(imu.t_ns) + calibration.imu.gyro_walk**2 * duration
-    accel_variance = imu.accel_B.var(axis=0) / len(imu.t_ns) + calibration.imu.accel_walk**2 * duration
+    gyro_variance = imu.gyro_B.var(axis=0) / len(imu.t_ns) + noise.gyro_walk**2 * duration
+    accel_variance = imu.accel_B.var(axis=0) / len(imu.t_ns) + noise.accel_walk**2 * duration
     information = np.zeros((15, 15))
     J = np.zeros((3, 15))
     J[:, DTHETA] = so3.hat(R_WB.T @ -g_W)
@@ -107,6 +106,6 @@ def _covariance(imu: ImuSegment, R_WB: Float, calibration: Calibration, options:
     information[DP, DP] += np.eye(3) / _GAUGE_SIGMA**2
     information[DV, DV] += np.eye(3) / _VELOCITY_SIGMA**2
     information[DBG, DBG] += np.diag(1.0 / gyro_variance)
-    information[DBA, DBA] += np.eye(3) / options.bias_accel_sigma**2
+    information[DBA, DBA] += np.eye(3) / BIAS_ACCEL_SIGMA**2
     cov = np.asarray(np.linalg.inv(information), np.float64)
     return 0.5 * (cov + cov.T)

@@ -1,19 +1,46 @@
-"""The frames an initialisation is made from, with their tracks as arrays."""
+"""What an initialisation is made from, frames with their tracks as arrays, and what it comes to."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import pairwise
+from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from vioframe.arrays import Bool
+from vioframe.estimation.factors.tracks import TrackTable
 from vioframe.estimation.inertial.preintegration import join_segments
-from vioframe.types import Float, FrameTracks, ImuSegment, Int
+from vioframe.types import Float, FrameTracks, ImuSegment, Int, NavState
 
-Bool = NDArray[np.bool_]
 Packet = tuple[ImuSegment, FrameTracks]
+
+PIXEL_SIGMA = 1.0
+"""Standard deviation of an observation, px."""
+BIAS_GYRO_SIGMA, BIAS_ACCEL_SIGMA = 0.2, 0.15
+"""Priors of the biases about zero, rad/s and m/s^2; those of EuRoC's IMU are 0.08 and 0.13."""
+LARGEST_IMU_GAP_S = 0.1
+"""A longer stretch without readings begins everything anew."""
+
+
+@dataclass(frozen=True, slots=True)
+class InitialEstimate:
+    """Where an estimator begins, in a world with z up whose origin and yaw zero are those of the first state.
+
+    ``states`` are the window's frames, oldest first. The last is the newest frame and has ``cov`` (15, 15), with
+    position and yaw, which nothing measures, pinned at that frame. ``landmark_ids`` (L,) and ``p_WF`` (L, 3) m are the
+    dynamic method's landmarks.
+    """
+
+    method: Literal["static", "dynamic"]
+    states: tuple[NavState, ...]
+    landmark_ids: Int = field(default_factory=lambda: np.empty(0, np.int64))
+    p_WF: Float = field(default_factory=lambda: np.empty((0, 3)))
+
+
+class RefusalError(Exception):
+    """An attempt came to nothing; the message says why in one line. Never leaves the package."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,21 +70,16 @@ def build_window(packets: Sequence[Packet], chosen: Sequence[int], min_views: in
     """The frames ``chosen``, ascending indices of ``packets``, and the tracks that ``min_views`` or more see."""
     tracks = [packets[k][1] for k in chosen]
     segments = tuple(join_segments([imu for imu, _ in packets[a + 1 : b + 1]]) for a, b in pairwise(chosen))
-    ids, views = np.unique(np.concatenate([t.ids for t in tracks]), return_counts=True)
+    table = TrackTable()
+    for frame in tracks:
+        table.add_frame(frame)
     # The longest first; the older id where they are equally long.
-    order = np.lexsort((ids, -views))
-    order = order[views[order] >= min_views][:max_landmarks]
-    ids = np.sort(ids[order])
-    xy = np.full((len(chosen), len(ids), 2), np.nan)
-    for k, track in enumerate(tracks):
-        _, column, row = np.intersect1d(ids, track.ids, return_indices=True)
-        xy[k, column] = track.xy_normalised[row]
-    return Window(np.array([t.t_ns for t in tracks]), segments, ids, xy, ~np.isnan(xy[..., 0]))
-
-
-def finite_tracks(tracks: FrameTracks) -> FrameTracks:
-    """Without the points that could not be undistorted."""
-    return tracks.finite()
+    views = table.lengths()
+    order = np.argsort(-views, kind="stable")
+    rows = np.sort(order[views[order] >= min_views][:max_landmarks])
+    seen = table.seen[rows].T
+    xy = np.where(seen[..., None], np.swapaxes(table.xy_normalised[rows], 0, 1), np.nan)
+    return Window(np.array([t.t_ns for t in tracks]), segments, table.ids[rows], xy, seen)
 
 
 def spread_indices(t_ns: Int, count: int) -> list[int]:

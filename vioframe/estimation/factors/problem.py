@@ -1,7 +1,10 @@
-"""What the solver minimises: prior, readings, standstill and sightings over the states of the window, and calibration.
+"""What the solver minimises: prior, readings, standstill and sightings over the states of a window, and calibration.
 
 The error vector is [dtheta dp dv dbg dba] of every state, oldest first, then [dtheta_BC dp_BC d_offset]; landmarks are
-eliminated before it is solved for (Triggs et al., "Bundle Adjustment: A Modern Synthesis", 2000, section 6.1).
+eliminated before it is solved for (Triggs et al., "Bundle Adjustment: A Modern Synthesis", 2000, section 6.1). A state
+that has to go leaves all that its factors say about the others behind as the prior (Sibley, Matthies, Sukhatme,
+"Sliding window filter with application to planetary landing", J. Field Robotics 2010). Derivation:
+``docs/derivations/sliding_window.md``.
 """
 
 from __future__ import annotations
@@ -12,23 +15,16 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from vioframe.estimation.inertial.imu_factors import ImuFactors, StateArrays
+from vioframe.arrays import Bool, Float
+from vioframe.estimation.factors.inertial import ImuFactors, StateArrays
+from vioframe.estimation.factors.reprojection import CALIBRATION_SIZE, Calibrated, Poses, Sightings, eliminate
 from vioframe.estimation.standstill import Standstill
 from vioframe.geometry import so3
-from vioframe.types import Float, NavState
-from vioframe_sliding_window.reprojection import Poses, Sightings
-from vioframe_sliding_window.reprojection_kernels import CALIBRATION_SIZE, eliminate
+from vioframe.types import NavState
 
 STATE_SIZE = 15
-
-
-@dataclass(frozen=True, slots=True)
-class Calibrated:
-    """The calibration that is estimated: the camera on the body, and what is left of the time offset, s."""
-
-    R_BC: Float
-    p_BC: Float
-    offset_s: float
+# Eigenvalues below this part of the largest tell nothing: rounding made them.
+_NULL = 1e-12
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,6 +34,10 @@ class Variables:
     states: StateArrays
     camera: Calibrated
     landmarks: Float
+
+    @property
+    def poses(self) -> Poses:
+        return Poses.of(self.states.R_WB, self.states.p_WB)
 
     def retract(self, step: Float, landmark_step: Float) -> Variables:
         """Moved by ``step`` (15 K + 7,) and ``landmark_step`` (L, 3)."""
@@ -61,7 +61,7 @@ class Prior:
     b: Float
     states: StateArrays
     camera: Calibrated
-    frozen: NDArray[np.bool_]
+    frozen: Bool
 
     @staticmethod
     def of(state: NavState, camera: Calibrated, camera_cov: Float) -> Prior:
@@ -130,8 +130,8 @@ class Problem:
         """Half the sum of squares, robust for the sightings, up to a constant."""
         d = self.prior.difference(x)
         total = 0.5 * d @ self.prior.H @ d + self.prior.b @ d
-        total += self.sightings.cost(*self._seen_from(x))
-        r = self._reading_residuals(x.states)
+        total += self.sightings.cost(x.poses, x.camera, x.landmarks)
+        r = self.reading_residuals(x.states)
         total += 0.5 * float((r * r).sum())
         for k, still in self.still.items():
             total += 0.5 * float(((_still_residual(still, x.states, k) / still.sigma) ** 2).sum())
@@ -150,20 +150,16 @@ class Problem:
             at = slice(STATE_SIZE * k, STATE_SIZE * (k + 1))
             H[at, at] += J.T @ J
             b[at] += J.T @ residual
-        poses, *rest = self._seen_from(x)
+        poses = x.poses
         first_poses = Poses.of(first.R_WB, first.p_WB) if self.first_estimates else poses
-        H_visual, b_visual, V, W, c = self.sightings.linearise(poses, first_poses, *rest)
+        H_visual, b_visual, V, W, c = self.sightings.linearise(poses, first_poses, x.camera, x.landmarks)
         columns = pose_columns(K)
         H[np.ix_(columns, columns)] += H_visual
         b[columns] += b_visual
         return Normal(H, b, V, W, c, columns)
 
-    def _seen_from(self, x: Variables) -> tuple[Poses, Float, Float, float, Float]:
-        poses = Poses.of(x.states.R_WB, x.states.p_WB)
-        return poses, x.camera.R_BC, x.camera.p_BC, x.camera.offset_s, x.landmarks
-
-    def _reading_residuals(self, states: StateArrays) -> Float:
-        """Whitened, (count, 15)."""
+    def reading_residuals(self, states: StateArrays) -> Float:
+        """Of the readings between each state and the next, whitened, (count, 15)."""
         count = len(self.readings.dt_s)
         r = self.readings.residuals(states[:count], states[1 : count + 1])
         return np.asarray((self.readings.sqrt_information @ r[..., None])[..., 0])
@@ -172,7 +168,7 @@ class Problem:
         count = len(self.readings.dt_s)
         if not count:
             return
-        r = self._reading_residuals(states)
+        r = self.reading_residuals(states)
         _, J_i, J_j = self.readings.linearise(first[:count], first[1 : count + 1])
         J = self.readings.sqrt_information @ np.concatenate([J_i, J_j], axis=2)
         J_T = np.swapaxes(J, -1, -2)
@@ -218,3 +214,36 @@ def pose_columns(K: int) -> NDArray[np.intp]:
     """Indices of [dtheta dp] of every state, and of the calibration, in the error vector of K states."""
     poses = (STATE_SIZE * np.arange(K)[:, None] + np.arange(6)).ravel()
     return np.concatenate([poses, STATE_SIZE * K + np.arange(CALIBRATION_SIZE)])
+
+
+def marginalise_oldest(problem: Problem, x: Variables) -> Prior:
+    """The prior on all states but the first, and calibration, that replaces all of ``problem``.
+
+    ``problem`` holds just the factors that touch the first state. Its landmarks go with it, robust weights as they are
+    at ``x``. States it touches are frozen at ``x`` unless they were before.
+    """
+    normal = problem.linearise(x)
+    H, b, _ = normal.reduced(0.0)
+    K = len(x.states)
+    touched = (H[: STATE_SIZE * K].reshape(K, -1) != 0.0).any(axis=1)
+    prior = problem.prior
+    first = prior.first(x.states)
+    # The gradient at the first estimates, from which the prior counts.
+    b = b - H @ prior.difference(x)
+    H, b = schur(H, b, STATE_SIZE)
+    return Prior(H, b, first[1:], prior.camera, (prior.frozen | touched)[1:])
+
+
+def schur(H: Float, b: Float, count: int) -> tuple[Float, Float]:
+    """Equations without the first ``count`` unknowns, which are at their best for whatever the others are.
+
+    Directions of which ``H`` knows nothing are left out by a pseudo-inverse.
+    """
+    m, r = slice(0, count), slice(count, None)
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(H)[m], 1e-12))
+    values, U = np.linalg.eigh(H[m, m] * scale[:, None] * scale)
+    good = values > _NULL * values[-1]
+    half = (scale[:, None] * U[:, good]) / np.sqrt(values[good])
+    Z = half.T @ H[m, r]
+    reduced = H[r, r] - Z.T @ Z
+    return 0.5 * (reduced + reduced.T), b[r] - Z.T @ (half.T @ b[m])

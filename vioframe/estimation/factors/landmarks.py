@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from vioframe.estimation.inertial.imu_factors import StateArrays
+from vioframe.arrays import Bool, Float, Int
+from vioframe.estimation.factors.inertial import StateArrays
+from vioframe.estimation.factors.reprojection import Calibrated
 from vioframe.geometry.triangulation import MIN_DEPTH_M, triangulate
 from vioframe.jit import kernel
-from vioframe.types import Float
-from vioframe_sliding_window.problem import Calibrated
-from vioframe_sliding_window.tracks import Bool, Rows
 
 
 def triangulate_tracks(
@@ -17,18 +16,17 @@ def triangulate_tracks(
 ) -> tuple[Bool, Float]:
     """Which of F tracks, ``seen`` (F, K) at ``xy`` (F, K, 2), have a trustworthy landmark, and [x y rho] (F, 3)."""
     R_WC, p_WC = camera_poses(states, camera)
-    known, landmarks = _triangulate_all(R_WC, p_WC, seen, xy, sigma)
-    return known, landmarks
+    return _triangulate_all(R_WC, p_WC, seen, xy, sigma)
 
 
-def positions(states: StateArrays, camera: Calibrated, hosts: Rows, landmarks: Float) -> Float:
+def positions(states: StateArrays, camera: Calibrated, hosts: Int, landmarks: Float) -> Float:
     """p_WF (L, 3) m of [x y rho] (L, 3) in the frames ``hosts`` (L,)."""
     R_WC, p_WC = camera_poses(states, camera)
     p_C = np.column_stack([landmarks[:, :2], np.ones(len(landmarks))]) / landmarks[:, 2:]
     return (R_WC[hosts] @ p_C[..., None])[..., 0] + p_WC[hosts]
 
 
-def in_hosts(states: StateArrays, camera: Calibrated, hosts: Rows, p_WF: Float) -> tuple[Float, Bool]:
+def in_hosts(states: StateArrays, camera: Calibrated, hosts: Int, p_WF: Float) -> tuple[Float, Bool]:
     """[x y rho] (L, 3) of points (L, 3) m in the frames ``hosts`` (L,), and which of them lie well in front (L,)."""
     R_WC, p_WC = camera_poses(states, camera)
     p_C = (np.swapaxes(R_WC[hosts], -1, -2) @ (p_WF - p_WC[hosts])[..., None])[..., 0]
@@ -37,7 +35,7 @@ def in_hosts(states: StateArrays, camera: Calibrated, hosts: Rows, p_WF: Float) 
     return np.column_stack([p_C[:, 0] / z, p_C[:, 1] / z, 1.0 / z]), in_front
 
 
-def image_velocities(states: StateArrays, camera: Calibrated, gyro_B: Float, hosts: Rows, landmarks: Float) -> Float:
+def image_velocities(states: StateArrays, camera: Calibrated, gyro_B: Float, hosts: Int, landmarks: Float) -> Float:
     """(L, K, 2) 1/s: how [x y rho] (L, 3) in the frames ``hosts`` (L,) move on the z = 1 plane of every frame.
 
     ``gyro_B`` (K, 3) rad/s are the readings at the frames. A fixed point moves by p_C' = -w x p_C - v as seen from a
@@ -61,7 +59,7 @@ def camera_poses(states: StateArrays, camera: Calibrated) -> tuple[Float, Float]
 
 
 @kernel
-def _triangulate_all(R_WC, p_WC, seen, xy, sigma):
+def _triangulate_all(R_WC: Float, p_WC: Float, seen: Bool, xy: Float, sigma: float) -> tuple[Bool, Float]:
     count = len(seen)
     known = np.zeros(count, dtype=np.bool_)
     landmarks = np.zeros((count, 3))

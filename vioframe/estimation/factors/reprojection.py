@@ -1,9 +1,22 @@
-"""Compiled loops over all sightings of all landmarks: see :mod:`vioframe_sliding_window.reprojection`."""
+"""Reprojection factors: residuals, Jacobians and normal equations of all landmarks of a window, compiled.
+
+A landmark m = [x y rho] of the host h is seen from the frame f at the direction of
+
+    X = R_BC^T (R_fh q + rho t_fh - rho p_BC),   q = R_BC [x y 1]^T + rho p_BC,
+
+with R_fh = R_WBf^T R_WBh and t_fh = R_WBf^T (p_WBh - p_WBf): rho times its position in the camera. Being polynomial in
+rho, it holds for points as far as one likes. Residuals are evaluated at the estimate, Jacobians at the first estimates
+of poses that are in the prior. Derivation: ``docs/derivations/sliding_window.md``.
+"""
+
+from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
+from vioframe.arrays import Bool, Float
 from vioframe.geometry.kernels import distort
 from vioframe.jit import kernel
 
@@ -13,8 +26,70 @@ CALIBRATION_SIZE = 7
 """Error of the calibration: [dtheta_BC dp_BC d_offset]."""
 
 
+Linearised = tuple[Float, Float, Float, Float, Float]
+
+
+class Calibrated(NamedTuple):
+    """The calibration that is estimated: the camera on the body, and what is left of the time offset, s."""
+
+    R_BC: Float
+    p_BC: Float
+    offset_s: float = 0.0
+
+
+class Poses(NamedTuple):
+    """Of the body in every frame, R_WB (K, 3, 3) and p_WB (K, 3), and what takes one frame's body to another's.
+
+    ``R_fh`` (K, K, 3, 3) and ``t_fh`` (K, K, 3) by [frame, host].
+    """
+
+    R_WB: Float
+    R_fh: Float
+    t_fh: Float
+
+    @staticmethod
+    def of(R_WB: Float, p_WB: Float) -> Poses:
+        R_BW = np.swapaxes(R_WB, -1, -2)
+        R_fh = R_BW[:, None] @ R_WB[None]
+        t_fh = (R_BW[:, None] @ (p_WB[None] - p_WB[:, None])[..., None])[..., 0]
+        return Poses(np.ascontiguousarray(R_WB), R_fh, t_fh)
+
+
+class Sightings(NamedTuple):
+    """What was seen of L landmarks in K frames, as in the table of tracks, with its noise and robust loss.
+
+    ``seen`` (L, K); ``xy`` (L, K, 2) on the z = 1 plane, and how they move there, ``velocity`` (L, K, 2) 1/s.
+    ``to_px`` (L, K, 2, 2) turns residuals into pixels, in which ``sigma`` is the standard deviation; ``cauchy`` is the
+    scale of the robust loss, in standard deviations. Residuals are on the plane, or on the unit sphere.
+    """
+
+    seen: Bool
+    xy: Float
+    velocity: Float
+    to_px: Float
+    sigma: float
+    cauchy: float
+    on_sphere: bool = False
+
+    def cost(self, poses: Poses, camera: Calibrated, landmarks: Float) -> float:
+        """Half the robust sum of squares."""
+        return _cost(poses, camera, self, landmarks)
+
+    def errors(self, poses: Poses, camera: Calibrated, landmarks: Float) -> Float:
+        """(L,) root mean square residual of each landmark, standard deviations; infinite behind a camera."""
+        return _errors(poses, camera, self, landmarks)
+
+    def linearise(self, poses: Poses, first: Poses, camera: Calibrated, landmarks: Float) -> Linearised:
+        """H (n, n), b (n,) of poses and calibration, and V (L, 3, 3), W (L, 3, n), c (L, 3) of the landmarks.
+
+        n = 6 K + 7: [dtheta dp] of every frame, then the calibration. The gradient is [b c], the Gauss-Newton matrix
+        [H W^T; W V], with the robust weights in them. Jacobians are taken at the poses ``first``.
+        """
+        return _linearise(poses, first, camera, self, landmarks)
+
+
 @kernel
-def pixels_by_residual(model, k, xy, on_sphere):
+def pixels_by_residual(model: int, k: Float, xy: Float, on_sphere: bool) -> Float:
     """(N, 2, 2) px of the distorted image by the residual at points (N, 2) of the z = 1 plane."""
     out = np.empty((len(xy), 2, 2))
     T = np.empty((2, 3))
@@ -34,7 +109,7 @@ def pixels_by_residual(model, k, xy, on_sphere):
 
 
 @kernel
-def eliminate(V, W, c, damping):
+def eliminate(V: Float, W: Float, c: Float, damping: float) -> tuple[Float, Float, Float]:
     """Y (L, 3, n), z (L, 3) and inverse factors (L, 3, 3) with Y^T Y = W^T V^-1 W, Y^T z = W^T V^-1 c, V damped."""
     count, _, n = W.shape
     Y = np.empty((count, 3, n))
@@ -67,14 +142,14 @@ def eliminate(V, W, c, damping):
 
 
 @kernel
-def _in_body(R_BC, p_BC, m, q):
+def _in_body(R_BC: Float, p_BC: Float, m: Float, q: Float) -> None:
     """``q`` (3,): rho times the landmark's position in the host's body."""
     for i in range(3):
         q[i] = R_BC[i, 0] * m[0] + R_BC[i, 1] * m[1] + R_BC[i, 2] + m[2] * p_BC[i]
 
 
 @kernel
-def _in_camera(R_fh, t_fh, R_BC, p_BC, rho, q, b, X):
+def _in_camera(R_fh: Float, t_fh: Float, R_BC: Float, p_BC: Float, rho: float, q: Float, b: Float, X: Float) -> None:
     """``b`` and ``X`` (3,): rho times the landmark's position in the frame's body, and in its camera."""
     for i in range(3):
         b[i] = R_fh[i, 0] * q[0] + R_fh[i, 1] * q[1] + R_fh[i, 2] * q[2] + rho * t_fh[i]
@@ -85,7 +160,7 @@ def _in_camera(R_fh, t_fh, R_BC, p_BC, rho, q, b, X):
 
 
 @kernel
-def _tangents(x, y, T):
+def _tangents(x: float, y: float, T: Float) -> None:
     """``T`` (2, 3): two orthonormal directions across the ray [x y 1]."""
     length = math.sqrt(1.0 + x * x)
     T[0, 0], T[0, 1], T[0, 2] = 1.0 / length, 0.0, -x / length
@@ -97,7 +172,7 @@ def _tangents(x, y, T):
 
 
 @kernel
-def _residual(X, x, y, to_px, on_sphere, T, r):
+def _residual(X: Float, x: float, y: float, to_px: Float, on_sphere: bool, T: Float, r: Float) -> None:
     """``r`` (2,) px between the direction ``X`` (3,) and the observation [x y 1]; across ``T`` on the sphere."""
     if on_sphere:
         length = math.sqrt(X[0] * X[0] + X[1] * X[1] + X[2] * X[2])
@@ -112,7 +187,9 @@ def _residual(X, x, y, to_px, on_sphere, T, r):
 
 
 @kernel
-def _residual_jacobian(X, vx, vy, to_px, on_sphere, T, D, by_offset):
+def _residual_jacobian(
+    X: Float, vx: float, vy: float, to_px: Float, on_sphere: bool, T: Float, D: Float, by_offset: Float
+) -> None:
     """``D`` (2, 3) by ``X``, and ``by_offset`` (2,) by the time offset, where the image moves by (vx, vy)."""
     if on_sphere:
         length = math.sqrt(X[0] * X[0] + X[1] * X[1] + X[2] * X[2])
@@ -140,7 +217,7 @@ def _residual_jacobian(X, vx, vy, to_px, on_sphere, T, D, by_offset):
 
 
 @kernel
-def _times(A, M, out):
+def _times(A: Float, M: Float, out: Float) -> None:
     """``out`` = A M, (2, 3) times (3, 3)."""
     for i in range(2):
         for k in range(3):
@@ -148,7 +225,9 @@ def _times(A, M, out):
 
 
 @kernel
-def cost(R_fh, t_fh, R_BC, p_BC, offset_s, seen, xy, velocity, to_px, landmarks, sigma, cauchy, on_sphere):
+def _cost(poses: Poses, camera: Calibrated, s: Sightings, landmarks: Float) -> float:
+    R_BC, p_BC, offset_s = camera
+    seen, xy, velocity, to_px, sigma, cauchy, on_sphere = s
     q, b, X, r, T = np.empty(3), np.empty(3), np.empty(3), np.empty(2), np.empty((2, 3))
     count, frames = seen.shape
     total = 0.0
@@ -160,15 +239,17 @@ def cost(R_fh, t_fh, R_BC, p_BC, offset_s, seen, xy, velocity, to_px, landmarks,
                 continue
             host = f if host < 0 else host
             x, y = xy[i, f, 0] - offset_s * velocity[i, f, 0], xy[i, f, 1] - offset_s * velocity[i, f, 1]
-            _in_camera(R_fh[f, host], t_fh[f, host], R_BC, p_BC, landmarks[i, 2], q, b, X)
+            _in_camera(poses.R_fh[f, host], poses.t_fh[f, host], R_BC, p_BC, landmarks[i, 2], q, b, X)
             _residual(X, x, y, to_px[i, f], on_sphere, T, r)
-            s = (r[0] * r[0] + r[1] * r[1]) / (sigma * sigma * cauchy * cauchy)
-            total += 0.5 * cauchy * cauchy * math.log(1.0 + s)
+            squared = (r[0] * r[0] + r[1] * r[1]) / (sigma * sigma * cauchy * cauchy)
+            total += 0.5 * cauchy * cauchy * math.log(1.0 + squared)
     return total
 
 
 @kernel
-def errors(R_fh, t_fh, R_BC, p_BC, offset_s, seen, xy, velocity, to_px, landmarks, sigma, on_sphere):
+def _errors(poses: Poses, camera: Calibrated, s: Sightings, landmarks: Float) -> Float:
+    R_BC, p_BC, offset_s = camera
+    seen, xy, velocity, to_px, sigma, _, on_sphere = s
     q, b, X, r, T = np.empty(3), np.empty(3), np.empty(3), np.empty(2), np.empty((2, 3))
     count, frames = seen.shape
     out = np.empty(count)
@@ -180,7 +261,7 @@ def errors(R_fh, t_fh, R_BC, p_BC, offset_s, seen, xy, velocity, to_px, landmark
                 continue
             host = f if host < 0 else host
             x, y = xy[i, f, 0] - offset_s * velocity[i, f, 0], xy[i, f, 1] - offset_s * velocity[i, f, 1]
-            _in_camera(R_fh[f, host], t_fh[f, host], R_BC, p_BC, landmarks[i, 2], q, b, X)
+            _in_camera(poses.R_fh[f, host], poses.t_fh[f, host], R_BC, p_BC, landmarks[i, 2], q, b, X)
             _residual(X, x, y, to_px[i, f], on_sphere, T, r)
             total += (r[0] * r[0] + r[1] * r[1]) / (sigma * sigma)
             if X[2] <= _LEAST_DEPTH_RATIO:
@@ -191,24 +272,9 @@ def errors(R_fh, t_fh, R_BC, p_BC, offset_s, seen, xy, velocity, to_px, landmark
 
 
 @kernel
-def linearise(
-    R_fh,
-    t_fh,
-    R_first,
-    R_fh_first,
-    t_fh_first,
-    R_BC,
-    p_BC,
-    offset_s,
-    seen,
-    xy,
-    velocity,
-    to_px,
-    landmarks,
-    sigma,
-    cauchy,
-    on_sphere,
-):
+def _linearise(poses: Poses, first: Poses, camera: Calibrated, s: Sightings, landmarks: Float) -> Linearised:
+    R_BC, p_BC, offset_s = camera
+    seen, xy, velocity, to_px, sigma, cauchy, on_sphere = s
     count, frames = seen.shape
     n = 6 * frames + CALIBRATION_SIZE
     H, g = np.zeros((n, n)), np.zeros(n)
@@ -234,17 +300,17 @@ def linearise(
             host = f if host < 0 else host
             vx, vy = velocity[i, f, 0], velocity[i, f, 1]
             x, y = xy[i, f, 0] - offset_s * vx, xy[i, f, 1] - offset_s * vy
-            _in_camera(R_fh[f, host], t_fh[f, host], R_BC, p_BC, rho, q, b, X)
+            _in_camera(poses.R_fh[f, host], poses.t_fh[f, host], R_BC, p_BC, rho, q, b, X)
             _residual(X, x, y, to_px[i, f], on_sphere, T, r)
             weight = 1.0 / (1.0 + (r[0] * r[0] + r[1] * r[1]) / (sigma * sigma * cauchy * cauchy))
             scale = math.sqrt(weight) / sigma
 
-            _in_camera(R_fh_first[f, host], t_fh_first[f, host], R_BC, p_BC, rho, q, b, X)
+            _in_camera(first.R_fh[f, host], first.t_fh[f, host], R_BC, p_BC, rho, q, b, X)
             _residual_jacobian(X, vx, vy, to_px[i, f], on_sphere, T, D, by_offset)
             _times(D, R_CB, A)
-            _times(A, R_fh_first[f, host], B)
+            _times(A, first.R_fh[f, host], B)
             _times(B, R_BC, C)
-            _times(A, R_first[f].T, E)
+            _times(A, first.R_WB[f].T, E)
             for a in range(2):
                 r[a] *= scale
                 moved = host != f
@@ -260,7 +326,7 @@ def linearise(
                     J[a, 9 + k] = -J[a, 3 + k]
                     J[a, 12 + k] = scale * by_camera if moved else 0.0
                     J[a, 15 + k] = scale * rho * (B[a, k] - A[a, k]) if moved else 0.0
-                    by_rho += A[a, k] * t_fh_first[f, host, k] + (B[a, k] - A[a, k]) * p_BC[k]
+                    by_rho += A[a, k] * first.t_fh[f, host, k] + (B[a, k] - A[a, k]) * p_BC[k]
                 J[a, 18] = scale * by_offset[a]
                 J_m[a, 0], J_m[a, 1] = scale * C[a, 0], scale * C[a, 1]
                 J_m[a, 2] = scale * by_rho if moved else 0.0
