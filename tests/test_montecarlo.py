@@ -235,7 +235,7 @@ def test_only_a_monte_carlo_is_replaced_and_only_on_request(parts):
 
 
 def test_results_do_not_depend_on_the_number_of_processes(parts):
-    command = ["--backend", "drawn", "--backend", "unlucky", "--seeds", "4", "--flight", "hover"]
+    command = ["--backend", "drawn", "--backend", "unlucky", "--seeds", "4"]
     for workers in (1, 2):
         montecarlo(*command, "--workers", workers, "--out", f"by_{workers}")
     assert results("by_1") == results("by_2")
