@@ -102,7 +102,7 @@ def plan(suite: Suite, folders: Sequence[Path], installed: Registry) -> Plan:
 
 def _create(suite: Suite, installed: Registry) -> None:
     """Make every part once: what is missing is said now, and kernels are compiled before the workers all would."""
-    calibration = packaged_calibration("euroc")
+    calibration = packaged_calibration("euroc", cameras=["cam0"])
     for detector in suite.detectors:
         installed.create_detector(detector.name, detector.options)
     for backend in suite.backends:
