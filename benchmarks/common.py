@@ -71,10 +71,10 @@ def backend_rows(
     installed = registry.load()
     config = configuration.override(Config(backend=PartConfig(name=backend)), installed, assignments)
     for about, sequence in sequences:
-        estimator = installed.create_backend(backend, sequence.calibration, config.backend.options)
+        estimator = installed.create_backend(backend, config.backend.options)
         # Small matrices: more threads only wait for one another. Set here, when every BLAS has been loaded.
         with threadpool_limits(1):
-            run = run_backend(sequence, estimator)
+            run = run_backend(sequence, estimator, config.estimation_options)
         yield {**about, **backend_row(sequence, run)}
 
 

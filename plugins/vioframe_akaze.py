@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from typing import Annotated
 
-from pydantic import NonNegativeFloat, PositiveInt
+from pydantic import NonNegativeFloat
 
 from vioframe.frontend.opencv_keypoints import detect
 from vioframe.interfaces import DetectorFactory
@@ -18,12 +18,11 @@ class Akaze:
         self,
         *,
         threshold: Annotated[NonNegativeFloat, "weakest determinant kept; lower finds more"] = 0.001,
-        octaves: Annotated[PositiveInt, "how often the resolution is halved, plus one"] = 4,
         descriptors: Annotated[bool, "also compute the 61-byte descriptors, which tracking does not use"] = False,
     ) -> None:
         import cv2
 
-        self._akaze = cv2.AKAZE.create(threshold=threshold, nOctaves=octaves)
+        self._akaze = cv2.AKAZE.create(threshold=threshold)
         self._descriptors = descriptors
 
     def detect(self, image: Image, max_points: int) -> Keypoints:

@@ -16,13 +16,12 @@ class Orb:
         self,
         *,
         fast_threshold: Annotated[int, "contrast of a corner to the ring around it, grey levels"] = 20,
-        levels: Annotated[int, "pyramid levels"] = 8,
-        scale_factor: Annotated[float, "ratio of one level's size to the next"] = 1.2,
+        levels: Annotated[int, "pyramid levels, each a factor of 1.2 smaller than the one before"] = 8,
         descriptors: Annotated[bool, "also compute the 32-byte descriptors, which tracking does not use"] = False,
     ) -> None:
         import cv2
 
-        self._orb = cv2.ORB.create(nlevels=levels, scaleFactor=scale_factor, fastThreshold=fast_threshold)
+        self._orb = cv2.ORB.create(nlevels=levels, fastThreshold=fast_threshold)
         self._descriptors = descriptors
 
     def detect(self, image: Image, max_points: int) -> Keypoints:

@@ -16,15 +16,12 @@ class Sift:
         self,
         *,
         contrast_threshold: Annotated[float, "weakest blob kept; lower finds more"] = 0.02,
-        edge_threshold: Annotated[float, "largest ratio of the two curvatures; higher admits edges"] = 10.0,
         descriptors: Annotated[bool, "also compute the 128-vectors, which tracking does not use"] = False,
     ) -> None:
         import cv2
 
         # Without the precise upscale every point is 0.23 px off on both axes.
-        self._sift = cv2.SIFT.create(
-            contrastThreshold=contrast_threshold, edgeThreshold=edge_threshold, enable_precise_upscale=True
-        )
+        self._sift = cv2.SIFT.create(contrastThreshold=contrast_threshold, enable_precise_upscale=True)
         self._descriptors = descriptors
 
     def detect(self, image: Image, max_points: int) -> Keypoints:

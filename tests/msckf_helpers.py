@@ -10,11 +10,18 @@ from vioframe.estimation.factors.tracks import TrackTable
 from vioframe.geometry import so3
 from vioframe.io.calibration import packaged_calibration
 from vioframe.simulation import TrackSequence, simulated_sequence
-from vioframe.types import Float, NavState
+from vioframe.types import Calibration, CalibrationEstimate, CameraSigma, Float, NavState
 from vioframe_msckf.state import FilterState
 
+CALIBRATION = packaged_calibration("euroc", cameras=["cam0"])
 START_COV = np.diag(np.repeat([0.005, 0.001, 0.02, 0.005, 0.05], 3) ** 2)
 """How well a drawn start is known: rad, m, m/s, rad/s, m/s^2."""
+
+
+def prior_of(calibration: Calibration) -> CalibrationEstimate:
+    """``calibration`` as well known as the life cycle takes any to be."""
+    intrinsics = np.repeat([1.0, 0.005], 4)
+    return CalibrationEstimate(calibration, (CameraSigma(np.full(3, 0.005), np.full(3, 0.015), 0.01, intrinsics),))
 
 
 def random_covariance(rng: np.random.Generator, n: int) -> Float:
@@ -30,9 +37,7 @@ def random_state(
     """A filter in the midst of a flight; ``scale`` is that of its standard deviations."""
     rng = np.random.default_rng(seed)
     nav = NavState(0, so3.exp(rng.normal(size=3)), *(rng.normal(size=3) for _ in range(4)), np.eye(15))
-    state = FilterState(
-        nav, packaged_calibration("euroc"), extrinsics=calibrate, offset=calibrate, intrinsics=calibrate
-    )
+    state = FilterState(nav, prior_of(CALIBRATION), extrinsics=calibrate, offset=calibrate, intrinsics=calibrate)
     for _ in range(clones):
         state.R_WB, state.p_WB = state.R_WB @ so3.exp(0.1 * rng.normal(size=3)), state.p_WB + 0.3 * rng.normal(size=3)
         state.augment_clone(rng.normal(size=3))
@@ -50,7 +55,7 @@ def seeing_state(seed: int = 0, clones: int = 6) -> tuple[FilterState, TrackTabl
     sequence = simulated_sequence("figure_eight", seed=seed, duration_s=2.0)
     start = sequence.true_states[0]
     state = FilterState(
-        replace(start, cov=np.eye(15)), sequence.calibration, extrinsics=True, offset=True, intrinsics=True
+        replace(start, cov=np.eye(15)), prior_of(sequence.calibration), extrinsics=True, offset=True, intrinsics=True
     )
     observations = TrackTable()
     for k in range(0, 3 * clones, 3):
@@ -77,9 +82,9 @@ def drawn_start(sequence: TrackSequence, frame: int, seed: int, cov: Float = STA
     )
 
 
-def after(sequence: TrackSequence, frame: int) -> TrackSequence:
-    """The packets that follow ``frame``."""
-    return replace(sequence, packets=sequence.packets[frame + 1 :])
+def since(sequence: TrackSequence, frame: int) -> TrackSequence:
+    """The packets from ``frame`` on."""
+    return replace(sequence, packets=sequence.packets[frame:])
 
 
 def pose_nees(states: tuple[NavState, ...], truth: dict[int, NavState]) -> tuple[float, float]:

@@ -1,23 +1,29 @@
 """Results folders of made-up suites, in the format of ``vioframe bench``, without running an estimator."""
 
-import json
 from collections.abc import Mapping
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 from ruamel.yaml import YAML
 from trajectory_helpers import disturbed, flight, write_run
 
+from vioframe.bench.suites.tasks import of_errors
 from vioframe.evaluation import evaluate
 from vioframe.geometry.trajectory import Trajectory
-from vioframe.report.suite.results import Data, Kind, Labels, SuiteResults, load_results
+from vioframe.parts.config import read_tree
+from vioframe.report.suite.statistics import Study
 from vioframe.runs.evaluated import write_matched_truth
 from vioframe.runs.folder import RunFolder
+from vioframe.runs.results import Data, Results, load_results, read_rows, write_rows
 
 MACHINE = {"vioframe": "0.1.0", "commit": "abc", "cpu": "a processor", "cpu_count": 2, "versions": {"numpy": "2.0"}}
 POSES = 160
+
+
+THESIS = Path(__file__).parents[1] / "benchmarks" / "thesis" / "thesis.yaml"
+"""A reference that the shipped suites name."""
 
 
 def labels(
@@ -27,42 +33,54 @@ def labels(
     detector: str = "shi_tomasi",
     backend: str = "msckf",
     seed: int = 0,
-) -> Labels:
-    return Labels(sequence, condition, level, detector, backend, seed)
+) -> dict[str, Any]:
+    """The columns of a row that say where in the suite's grid it stands."""
+    where = {"sequence": sequence, "condition": condition, "level": level}
+    return {**where, "detector": detector, "backend": backend, "seed": seed}
 
 
 class MadeUp:
     """A results folder that grows task by task; :meth:`load` reads it back."""
 
-    def __init__(self, path: Path, **suite: Any) -> None:
+    def __init__(self, path: Path, *, reference: bool = False, **suite: Any) -> None:
         self.path = path
         tree = {"name": "made_up", "title": "A made-up suite", "description": "For tests.", "kind": "flights", **suite}
+        if reference:
+            tree["reference"] = read_tree(THESIS)
         path.mkdir(parents=True)
         with (path / "suite.yaml").open("w", encoding="utf-8") as file:
             YAML().dump(tree, file)
 
-    def load(self) -> SuiteResults:
+    def load(self) -> Results:
         return load_results(self.path)
+
+    def study(self) -> Study:
+        return Study(self.load())
+
+    def change(self, task: str, **columns: Any) -> None:
+        """Other values in the row of a task."""
+        rows = read_rows(self.path)
+        write_rows(self.path, {**rows, task: [{**row, **columns} for row in rows[task]]})
 
     def flight(
         self,
-        of: Labels,
+        of: Mapping[str, Any],
         *,
         data: Data = Data.RENDERED,
         sigma_m: float = 0.05,
         bias_m: tuple[float, float, float] | None = None,
         completion: float = 1.0,
-        metrics: Mapping[str, Any] | None = None,
         estimate: Trajectory | None = None,
+        **more: Any,
     ) -> Path:
         """A flight whose estimate is the truth with noise of ``sigma_m``, or ``estimate``; returns its run folder.
 
-        ``bias_m`` is added to the second half of the path, where alignment cannot undo it.
+        ``bias_m`` is added to the second half of the path, where alignment cannot undo it. ``more`` are other columns.
         """
-        run = self.path / "tasks" / key(of) / "run"
+        run = self.path / "runs" / key(of)
         truth = flight(POSES, seed=3)
         if estimate is None:
-            estimate = disturbed(truth, sigma_m, 0.01, seed=of.seed + 17)
+            estimate = disturbed(truth, sigma_m, 0.01, seed=of["seed"] + 17)
             if bias_m is not None:
                 late = (np.arange(POSES) >= POSES // 2)[:, None]
                 estimate = Trajectory(truth.t_ns, estimate.R_WB, estimate.p_WB + late * np.array(bias_m))
@@ -70,94 +88,99 @@ class MadeUp:
         write_run(run, Trajectory(estimate.t_ns, estimate.R_WB, estimate.p_WB, honest), truth, waiting=5)
         write_matched_truth(run)
         folder = RunFolder.open(run)
-        summary = {
-            **folder.summary,
-            "completion": completion,
-            "initialised_after_s": 0.25,
-            "start_s": 5.0 + 0.5 * of.seed,
-        }
         written, timings = folder.trajectory(), folder.timings()
         assert written is not None
         assert timings is not None
-        result = {
-            "summary": summary,
-            "evaluation": evaluate(written, truth).to_dict(),
-            "evaluation_loop": None,
-            "metrics": metrics or {},
-            "stage_ms": timings.mean_ms(),
+        figures = {
+            "completion": completion,
+            "resets": 0,
+            "frames": POSES,
+            "finished": True,
+            "loop_closed": False,
+            "initialised_after_s": 0.25,
+            "start_s": 5.0 + 0.5 * of["seed"],
             "real_time_factor": 2.5,
+            "frame_ms": folder.summary["mean_frame_ms"],
+            **{f"stage_ms.{stage}": ms for stage, ms in timings.mean_ms().items()},
+            **of_errors(evaluate(written, truth)),
         }
-        self._write(Kind.FLIGHT, of, data, result)
+        self._add("flight", of, data, {**figures, **more, "folder": f"runs/{key(of)}"})
         return run
 
-    def failed(self, of: Labels, error: str = "PluginError: it broke", data: Data | None = Data.RENDERED) -> None:
-        self._write(Kind.FLIGHT, of, data, {}, error)
+    def failed(
+        self, of: Mapping[str, Any], error: str = "PluginError: it broke", data: Data | None = Data.RENDERED
+    ) -> None:
+        self._add("flight", of, data, {"status": "failed", "error": error, "attempts": 2})
 
-    def never_initialised(self, of: Labels, data: Data = Data.RENDERED) -> None:
-        event = {"t_ns": 1, "event": "initialisation refused: not at rest"}
-        summary = {"initialised_after_s": None, "completion": 0.0, "frames": POSES, "finished": True, "events": [event]}
-        result = {
-            "summary": summary,
-            "evaluation": None,
-            "evaluation_loop": None,
-            "metrics": {},
-            "stage_ms": {"klt": 3.0},
-        }
-        self._write(Kind.FLIGHT, of, data, result)
+    def never_initialised(self, of: Mapping[str, Any], data: Data = Data.RENDERED) -> None:
+        folder = self.path / "runs" / key(of)
+        folder.mkdir(parents=True)
+        figures = {"completion": 0.0, "frames": POSES, "finished": True, "stage_ms.klt": 3.0, "frame_ms": 3.0}
+        event = "initialisation refused: not at rest"
+        self._add("flight", of, data, {**figures, "last_event": event, "folder": f"runs/{key(of)}"})
 
     def trial(self, backend: str, seed: int, scale: float, failure: str | None = None) -> None:
         """A trial whose NEES is ``scale`` times that of an honest filter, or one that is nothing but a ``failure``."""
-        rng = np.random.default_rng(seed)
-        parts = {"orientation": 3, "position": 3, "pose": 6}
-        nees = {} if failure else {part: (scale * rng.chisquare(dof, 200)).tolist() for part, dof in parts.items()}
-        figures = (
-            {} if failure else {"ate_m": 0.1, "percent": 0.2, "orientation_deg": 0.5, "completion": 1.0, "resets": 0}
-        )
-        trial = {"seed": seed, "failure": failure, "detail": "", **figures, "nees": {}}
-        t_s = [] if failure else (0.05 * np.arange(200)).tolist()
         of = labels("figure_eight", detector="simulated tracks", backend=backend, seed=seed)
-        self._write(Kind.TRIAL, of, Data.SIMULATED, {"trial": trial, "nees": nees, "t_s": t_s})
+        folder = self.path / "runs" / key(of)
+        folder.mkdir(parents=True)
+        figures: dict[str, Any] = {}
+        if not failure:
+            rng = np.random.default_rng(seed)
+            parts = {"orientation": 3, "position": 3, "pose": 6}
+            nees = pd.DataFrame({part: scale * rng.chisquare(dof, 200) for part, dof in parts.items()})
+            nees.insert(0, "t_ns", 50_000_000 * np.arange(200))
+            nees.to_csv(folder / "nees.csv", index=False)
+            figures = {"ate_m": 0.1, "percent": 0.2, "orientation_deg": 0.5, "completion": 1.0, "resets": 0}
+        self._add("trial", of, Data.SIMULATED, {**figures, "failure": failure, "folder": f"runs/{key(of)}"})
 
     def detector_speed(self) -> None:
-        rows = [_speed("shi_tomasi", 250.0, 160.0), _speed("orb", 80.0, 33.0), _speed("fast", 700.0, None)]
         settings = {
             "images": "drawn surfaces",
             "image_count": 8,
             "rounds": 10,
-            "resolution": [640, 480],
+            "width": 640,
+            "height": 480,
             "max_points": 300,
             "devices": ["a processor, 2 cores"],
         }
-        result = {"rows": rows, "absent": {"superpoint": "needs the option 'weights'"}, "settings": settings}
-        self._write(Kind.DETECTOR_SPEED, None, None, result)
+        for name, fps in (("shi_tomasi", 250.0), ("orb", 80.0), ("fast", 700.0)):
+            quartiles = {"fps": fps, "fps_low": 0.9 * fps, "fps_high": 1.1 * fps, "ms": 1e3 / fps}
+            row = {"detector": name, **quartiles, "keypoints": 300.0, "calls": 80, "on": "cpu", **settings}
+            self._add("speed", row, None, row)
+        absent = {"detector": "superpoint", "status": "absent", "error": "needs the option 'weights'"}
+        self._add("speed", absent, None, absent)
 
-    def _write(self, kind: Kind, of: Labels | None, data: Data | None, result: Any, error: str = "") -> None:
-        name = "detector_speed" if of is None else key(of)
-        folder = self.path / "tasks" / name
-        folder.mkdir(parents=True, exist_ok=True)
-        about = "" if of is None else f"{of.sequence}: made up for a test"
-        tree = {
-            "key": name,
-            "kind": kind.value,
-            "labels": None if of is None else asdict(of),
+    def _add(self, kind: str, of: Mapping[str, Any], data: Data | None, figures: Mapping[str, Any]) -> None:
+        task = "detector_speed" if kind == "speed" else key(of)
+        about = "" if kind == "speed" else f"{of['sequence']}: made up for a test"
+        row = {
+            "task": task,
+            "kind": kind,
+            **of,
             "data": None if data is None else data.value,
             "data_note": about,
-            "fingerprint": {"code": "1", "config": "2", "data": "3"},
-            "status": "failed" if error else "ok",
-            "error": error,
-            "attempts": 2 if error else 1,
+            "code": "1",
+            "config": "2",
+            "inputs": "3",
+            "status": "ok",
+            "error": "",
+            "attempts": 1,
             "seconds": 1.0,
             "machine": MACHINE,
-            "result": result,
+            "folder": None,
+            **figures,
         }
-        (folder / "task.json").write_text(json.dumps(tree), encoding="utf-8")
+        rows = read_rows(self.path)
+        write_rows(self.path, {**rows, task: [*(rows.get(task, ()) if kind == "speed" else ()), row]})
 
 
-def key(of: Labels) -> str:
-    return f"{of.sequence}.{of.condition}_{of.level:g}.{of.detector}.{of.backend}.seed{of.seed}".replace(" ", "_")
+def key(of: Mapping[str, Any]) -> str:
+    where = f"{of['sequence']}.{of['condition']}_{of['level']:g}"
+    return f"{where}.{of['detector']}.{of['backend']}.seed{of['seed']}".replace(" ", "_")
 
 
-def comparison(path: Path) -> MadeUp:
+def comparison(path: Path, *, reference: bool = True) -> MadeUp:
     """Two detectors with two back-ends on MH_05_difficult, two seeds; one flight failed, one never initialised."""
     made = MadeUp(
         path,
@@ -165,6 +188,7 @@ def comparison(path: Path) -> MadeUp:
         backends=["sliding_window", "msckf"],
         sequences=[{"name": "MH_05_difficult", "start_s": 5.0}],
         seeds=2,
+        reference=reference,
     )
     for d, detector in enumerate(("shi_tomasi", "keypointnet")):
         for b, backend in enumerate(("msckf", "sliding_window")):
@@ -200,19 +224,3 @@ def stress(path: Path) -> MadeUp:
                     sigma_m = 0.02 * factor * (1.0 + 3.0 * level) * (1.0 + 0.2 * seed)
                     made.flight(of, data=Data.SIMULATED, sigma_m=sigma_m)
     return made
-
-
-def _speed(name: str, fps: float, quoted: float | None) -> dict[str, Any]:
-    return {
-        "detector": name,
-        "calls": 80,
-        "measured": {
-            "fps": fps,
-            "fps_quartiles": [0.9 * fps, 1.1 * fps],
-            "ms": 1e3 / fps,
-            "ms_quartiles": [0.9e3 / fps, 1.1e3 / fps],
-            "points": 300.0,
-            "on": "cpu",
-        },
-        "quoted": None if quoted is None else {"fps": quoted, "source": "thesis"},
-    }

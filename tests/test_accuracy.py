@@ -14,13 +14,13 @@ import numpy as np
 import pytest
 from april_board import april_sequence
 from threadpoolctl import threadpool_limits
-from vioframe.experiment import prepare, record
 
 from vioframe.bench import Row, backend_row, run_backend
 from vioframe.evaluation import TrajectoryErrors, evaluate
 from vioframe.io.convert import convert
 from vioframe.parts import registry
 from vioframe.parts.config import Config, DatasetConfig, PartConfig
+from vioframe.pipeline import prepare, record
 from vioframe.runs.folder import RunFolder
 from vioframe.simulation import REAL_MOTION_SEQUENCES, TrackSequence, real_motion_sequence
 
@@ -51,7 +51,7 @@ def fly(
 
 
 def fly_tracks(sequence: TrackSequence, backend: str = "msckf") -> Row:
-    estimator = installed().create_backend(backend, sequence.calibration, {})
+    estimator = installed().create_backend(backend)
     with threadpool_limits(1):
         return backend_row(sequence, run_backend(sequence, estimator))
 

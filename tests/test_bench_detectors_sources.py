@@ -179,13 +179,13 @@ def test_every_installed_detector_takes_part_unless_some_are_named(installed):
 
 
 def test_options_go_to_whom_they_are_meant_for(installed):
-    specs = ["orb", "orb:levels=2,scale_factor=1.5", "sift"]
-    entrants = parse_entrants(specs, ["orb.fast_threshold=7", "edge_threshold=12"], installed)
+    specs = ["orb", "orb:levels=2,fast_threshold=9", "sift"]
+    entrants = parse_entrants(specs, ["orb.fast_threshold=7", "contrast_threshold=0.01"], installed)
     assert [e.label for e in entrants] == specs
     assert [dict(e.options) for e in entrants] == [
         {"fast_threshold": 7},
-        {"fast_threshold": 7, "levels": 2, "scale_factor": 1.5},
-        {"edge_threshold": 12},
+        {"fast_threshold": 9, "levels": 2},
+        {"contrast_threshold": 0.01},
     ]
 
 

@@ -15,8 +15,9 @@ from april_board import (
     reprojection_px,
     rotation_to_vertical,
 )
+from trajectory_helpers import run_of
 
-from vioframe.bench import backend_row, record, run_backend, table
+from vioframe.bench import backend_row, record, table
 from vioframe.errors import DatasetError, TrajectoryError
 from vioframe.geometry import so3
 from vioframe.geometry.trajectory import Trajectory
@@ -81,18 +82,18 @@ def test_board_poses_recover_a_known_camera():
         # Looking at the board's centre from its front, tilted by up to 30 deg.
         R_AC = so3.exp(rng.uniform(-0.5, 0.5, 3))
         p_AC = np.array([0.33, 0.33, 0.0]) - R_AC @ [0.0, 0.0, 1.2]
-        xy = CALIBRATION.camera.project((p_A - p_AC) @ R_AC)
-        keep = CALIBRATION.camera.contains(xy)
+        xy = CALIBRATION.cameras[0].model.project((p_A - p_AC) @ R_AC)
+        keep = CALIBRATION.cameras[0].model.contains(xy)
         views.append(BoardView(k, np.flatnonzero(keep), xy[keep], p_A[keep]))
         R_true.append(R_AC)
         p_true.append(p_AC)
-    R_AC, p_AC = board_poses(views, CALIBRATION.camera)
+    R_AC, p_AC = board_poses(views, CALIBRATION.cameras[0].model)
     np.testing.assert_allclose(R_AC, R_true, atol=1e-6)
     np.testing.assert_allclose(p_AC, p_true, atol=1e-6)
     noisy = [BoardView(v.t_ns, v.corner, v.xy + rng.normal(0, 0.3, v.xy.shape), v.p_A) for v in views]
-    R_AC, p_AC = board_poses(noisy, CALIBRATION.camera)
+    R_AC, p_AC = board_poses(noisy, CALIBRATION.cameras[0].model)
     assert np.linalg.norm(p_AC - p_true, axis=1).max() < 5e-3
-    assert np.sqrt(np.mean(reprojection_px(noisy, CALIBRATION.camera, R_AC, p_AC) ** 2)) == pytest.approx(
+    assert np.sqrt(np.mean(reprojection_px(noisy, CALIBRATION.cameras[0].model, R_AC, p_AC) ** 2)) == pytest.approx(
         0.3 * np.sqrt(2), rel=0.05
     )
 
@@ -100,8 +101,8 @@ def test_board_poses_recover_a_known_camera():
 def test_april_corners_fit_the_published_calibration(april, april_tracks):
     views = read_board_views(april)
     assert len(views) == 720
-    R_AC, p_AC = board_poses(views, CALIBRATION.camera)
-    assert np.sqrt(np.mean(reprojection_px(views, CALIBRATION.camera, R_AC, p_AC) ** 2)) < 0.42
+    R_AC, p_AC = board_poses(views, CALIBRATION.cameras[0].model)
+    assert np.sqrt(np.mean(reprojection_px(views, CALIBRATION.cameras[0].model, R_AC, p_AC) ** 2)) < 0.42
     # The first image is 15 ms older than the first reading.
     assert len(april_tracks.packets) == 719
     assert april_tracks.ground_truth.path_length_m == pytest.approx(20.0, abs=0.1)
@@ -147,29 +148,23 @@ def test_missing_files_are_named(tmp_path):
         april_sequence(tmp_path)
 
 
-class Oracle:
-    """A back-end that is told the truth, with an offset along x; it takes its time to begin and loses itself once."""
-
-    def __init__(self, states, offset_m):
-        self._states = iter(states)
-        self._offset = np.array([offset_m, 0.0, 0.0])
-        self._frame = -1
-
-    def process(self, imu, tracks):
-        self._frame += 1
-        s = next(self._states)
-        if self._frame < 10:
-            return Estimate(Status.INITIALISING, stage_seconds={"initialise": 0.5})
-        if 20 <= self._frame < 25:
-            return Estimate(Status.LOST)
-        p_WB = s.p_WB + (self._offset if self._frame % 2 else -self._offset)
+def oracle(sequence, offset_m):
+    """What a back-end says that is told the truth, with an offset along x; it begins late and is lost once."""
+    estimates = []
+    for k, s in enumerate(sequence.true_states):
+        p_WB = s.p_WB + np.array([offset_m if k % 2 else -offset_m, 0.0, 0.0])
         state = NavState(s.t_ns, s.R_WB, p_WB, s.v_WB, s.bias_gyro_B, s.bias_accel_B, np.eye(15) * 0.01)
-        return Estimate(Status.TRACKING, state)
+        estimates.append(Estimate(Status.TRACKING, state))
+        if k < 10:
+            estimates[k] = Estimate(Status.INITIALISING, stage_seconds={"initialise": 0.5})
+        elif 20 <= k < 25:
+            estimates[k] = Estimate(Status.LOST)
+    return run_of(sequence, estimates)
 
 
 def test_a_run_is_counted_and_measured():
     sequence = simulated_sequence("figure_eight", max_points=5, duration_s=5.0)
-    run = run_backend(sequence, Oracle(sequence.true_states, offset_m=0.1))
+    run = oracle(sequence, offset_m=0.1)
     row = backend_row(sequence, run)
     assert row["frames"] == 101
     assert row["initialised_s"] == pytest.approx(0.5)
@@ -184,7 +179,7 @@ def test_a_run_is_counted_and_measured():
 
 def test_a_back_end_that_never_begins_is_a_row_too():
     sequence = simulated_sequence("figure_eight", max_points=5, duration_s=0.4)
-    run = run_backend(sequence, Oracle(sequence.true_states, offset_m=0.0))
+    run = oracle(sequence, offset_m=0.0)
     row = backend_row(sequence, run)
     assert row["initialised_s"] is None
     assert row["completion"] == 0.0

@@ -22,10 +22,9 @@ from vioframe.runs.folder import RunFolder
 
 HEAVY = {"cv2", "torch", "open3d", "filterpy", "numba", "matplotlib", "scipy", "numpy", "pydantic", "rich"}
 
-# A recording of 20 frames, a back-end that tracks from the third on, and parts that fail in every way.
+# A recording of 60 frames at rest, of which the first second goes by before the back-end begins, and parts that fail.
 PARTS = """
 import time
-from dataclasses import replace
 import numpy as np
 from vioframe.io.calibration import packaged_calibration
 from vioframe.errors import DatasetError
@@ -33,32 +32,33 @@ from vioframe.geometry.cameras import Camera
 from vioframe.types import *
 
 class Toy:
-    "Twenty small frames of noise."
-    name, frame_count, ground_truth = "toy", 20, None
+    "Sixty small frames of noise."
+    name, frame_count, ground_truth = "toy", 60, None
     def __init__(self, path, *, broken_at: int = 99, pause_s: float = 0.0, calibration: list[str] | None = None):
-        camera = Camera(100.0, 100.0, 32.0, 24.0, (0.0, 0.0, 0.0, 0.0), (64, 48))
-        self.calibration = replace(packaged_calibration("euroc"), camera=camera)
+        camera = Camera(100.0, 100.0, 64.0, 48.0, (0.0, 0.0, 0.0, 0.0), (128, 96))
+        self.calibration = packaged_calibration("euroc", cameras=["cam0"]).with_camera(0, model=camera)
         self.broken_at, self.pause_s = broken_at, pause_s
     @staticmethod
     def accepts(path): return path.suffix == ".toy"
     def measurements(self):
-        image = np.random.default_rng(0).integers(0, 255, (48, 64), dtype=np.uint8)
-        for k in range(240):
+        image = np.random.default_rng(0).integers(0, 255, (96, 128), dtype=np.uint8)
+        for k in range(640):
             yield ImuSample(10**9 + k * 5_000_000, np.zeros(3), np.array([0.0, 0.0, 9.81]))
-            if k % 10 == 0 and k < 200:
+            if k % 10 == 0 and k < 600:
                 if k == 10 * self.broken_at:
                     raise DatasetError("the recording ends in the middle of a message; record it again")
                 time.sleep(self.pause_s)
-                yield Frame(10**9 + k * 5_000_000, image)
+                yield FrameSet(10**9 + k * 5_000_000, (image,))
 
 class Still:
     "Says that the body rests."
-    def __init__(self, calibration, *, raise_at: int = 99, speed: float = 0.0):
-        self.k, self.raise_at, self.speed = 0, raise_at, speed
-    def process(self, imu, tracks):
+    def __init__(self, *, raise_at: int = 99, speed: float = 0.0):
+        self.raise_at, self.speed = raise_at, speed
+    def begin(self, start):
+        self.k = 0
+    def process(self, imu, tracks, still):
         self.k += 1
         if self.k == self.raise_at: raise ZeroDivisionError("division\\nby zero")
-        if self.k < 3: return Estimate(Status.INITIALISING)
         state = NavState(tracks.t_ns, np.eye(3), np.array([self.speed * self.k, 0, 0]), *np.zeros((3, 3)))
         return Estimate(Status.TRACKING, state, np.array([1]), np.ones((1, 3)))
 
@@ -128,15 +128,15 @@ def test_a_run_from_recording_to_folder(toy):
     folder = Path("runs/toy_shi_tomasi_still")
     assert {p.name for p in folder.iterdir()} == {
         *("trajectory.tum", "states.csv", "pose_cov.csv", "tracks.csv", "timings.csv", "map.ply"),
-        *("config.yaml", "machine.json", "summary.json", "calibration"),
+        *("config.yaml", "machine.json", "summary.json", "calibration", "calibration.csv", "calibration_learned"),
     }
     run = RunFolder.open(folder)
     assert run.summary["finished"] is True
-    assert run.summary["frames"] == 20
-    assert run.summary["initialised_after_s"] == pytest.approx(0.1)
+    assert run.summary["frames"] == 60
+    assert run.summary["initialised_after_s"] == pytest.approx(0.95)
     assert run.summary["plugins"]["backend"] == "toy-parts 1.0"
-    assert len(run.trajectory()) == 18
-    assert "20 frames, initialised after 0.10 s, then 100.0% tracked, 0 resets" in result.stdout
+    assert len(run.trajectory()) == 41
+    assert "60 frames, initialised after 0.95 s, then 100.0% tracked, 0 resets" in result.stdout
     assert f"vioframe evaluate {folder}" in result.stdout
     assert "frames/s" in result.stderr
     assert "x real time" in result.stderr
@@ -147,10 +147,11 @@ def test_quiet_says_nothing(toy):
 
 
 def test_a_run_is_repeated_from_its_own_configuration(toy):
-    run_toy(toy, "-o", "speed=0.5", "-o", "max_points=37", "--start", 0.2, "--duration", 0.4, "--out", "a", "--quiet")
+    run_toy(toy, "-o", "speed=0.5", "-o", "max_points=37", "--start", 0.2, "--duration", 1.4, "--out", "a", "--quiet")
     vioframe_("run", "--config", "a/config.yaml", "--out", "b", "--quiet")
-    assert json.loads(Path("b/summary.json").read_text())["frames"] == 9
+    assert json.loads(Path("b/summary.json").read_text())["frames"] == 29
     for name in ("trajectory.tum", "states.csv", "pose_cov.csv", "tracks.csv", "map.ply", "config.yaml"):
+        assert len(Path("a", name).read_bytes()) > 100
         assert Path("a", name).read_bytes() == Path("b", name).read_bytes()
 
 
@@ -170,11 +171,11 @@ def test_another_part_does_not_inherit_the_options_of_the_one_in_the_file(toy):
 
 
 def test_ground_truth_is_kept_with_the_run_and_compared(toy):
-    rows = "".join(f"{1 + 0.05 * k:.9f} {0.5 * (k + 1)} 0 0 0 0 0 1\n" for k in range(20))
+    rows = "".join(f"{1 + 0.05 * k:.9f} {0.5 * (k + 1)} 0 0 0 0 0 1\n" for k in range(60))
     Path("truth.tum").write_text(rows)
     result = run_toy(toy, "-o", "speed=0.5", "--ground-truth", "truth.tum", "--out", "a")
-    assert "ATE 0.0 mm (position and yaw aligned) over 8.5 m" in result.stdout
-    assert len(RunFolder.open("a").ground_truth()) == 20
+    assert "ATE 0.0 mm (position and yaw aligned) over 20.0 m" in result.stdout
+    assert len(RunFolder.open("a").ground_truth()) == 60
 
 
 def test_runs_never_overwrite_one_another_unless_asked(toy):
@@ -190,19 +191,19 @@ def test_runs_never_overwrite_one_another_unless_asked(toy):
 
 
 def test_a_plugin_that_raises_is_named_and_what_was_done_is_kept(toy):
-    line = error_line("run", toy, "--backend", "still", "-o", "raise_at=10", "--quiet", "--out", "a")
+    line = error_line("run", toy, "--backend", "still", "-o", "raise_at=35", "--quiet", "--out", "a")
     assert "plug-in 'toy_parts' (toy-parts 1.0) failed: ZeroDivisionError: division by zero" in line
     assert "what was estimated until then is in a" in line
     run = RunFolder.open("a")
-    assert len(run.trajectory()) == 7
-    assert (run.summary["finished"], run.summary["frames"]) == (False, 9)
+    assert len(run.trajectory()) == 35
+    assert (run.summary["finished"], run.summary["frames"]) == (False, 54)
     assert "toy-parts" in run.summary["stopped_by"]
 
 
 def test_a_recording_that_breaks_off_keeps_what_was_done(toy):
-    line = error_line("run", toy, "--backend", "still", "-o", "broken_at=12", "--quiet", "--out", "a")
+    line = error_line("run", toy, "--backend", "still", "-o", "broken_at=40", "--quiet", "--out", "a")
     assert "ends in the middle of a message; record it again; what was estimated until then is in a" in line
-    assert len(RunFolder.open("a").trajectory()) >= 7
+    assert len(RunFolder.open("a").trajectory()) >= 15
 
 
 def test_an_error_before_the_first_frame_leaves_everything_as_it_was(toy):
@@ -216,7 +217,7 @@ def test_an_error_before_the_first_frame_leaves_everything_as_it_was(toy):
 
 def test_debug_shows_the_traceback(toy):
     with pytest.raises(vioframe.errors.PluginError) as raised:
-        vioframe_("--debug", "run", toy, "--backend", "still", "-o", "raise_at=10", "--quiet")
+        vioframe_("--debug", "run", toy, "--backend", "still", "-o", "raise_at=35", "--quiet")
     assert isinstance(raised.value.__cause__, ZeroDivisionError)
 
 
@@ -234,7 +235,7 @@ def test_ctrl_c_completes_the_folder_and_exits_130(toy, tmp_path):
     assert "Traceback" not in stderr
     run = RunFolder.open("a")
     assert run.summary["finished"] is False
-    assert 4 <= run.summary["frames"] < 20
+    assert 4 <= run.summary["frames"] < 60
     assert Path("a/map.ply").read_text().startswith("ply\n")
 
 

@@ -37,6 +37,7 @@ def test_a_complete_configuration_holds_every_option_of_every_part(installed, fl
     assert set(done.backend.options) == {o.name for o in installed.find(registry.BACKEND, "msckf").options}
     assert set(done.detector.options) == {o.name for o in installed.find(registry.DETECTOR, "shi_tomasi").options}
     assert set(done.frontend) == {o.name for o in options_of(config.FrontendOptions)}
+    assert set(done.estimation) == {o.name for o in options_of(config.EstimationOptions)}
     assert set(done.dataset.options) == {o.name for o in installed.find(registry.DATASET, "euroc").options}
     assert done.dataset.reader == "euroc"
 
@@ -58,6 +59,7 @@ def test_each_option_is_shown_with_its_help(installed):
         ("start_s: -1", "start_s: Input should be greater than or equal to 0"),
         ("duration_s: 0", "duration_s: Input should be greater than 0"),
         ("duration_s: .nan", "duration_s: Input should be a finite number"),
+        ("wait_ms: -1", "wait_ms: Input should be greater than or equal to 0"),
         ("[1, 2]", "must hold keys and values"),
         ("a: b: c", "is not valid YAML"),
         ("start_s: 1\nstart_s: 2", "is not valid YAML: .*duplicate key"),
@@ -78,6 +80,10 @@ def test_a_bad_file_is_refused_with_the_place(tmp_path, text, why):
         ({"frontend": {"max_pionts": 3}}, r"the front-end has no option 'max_pionts' \(did you mean 'max_points'\?\)"),
         ({"frontend": {"max_points": "many"}}, r"the front-end: max_points='many': Input should be a valid integer"),
         ({"frontend": {"max_points": 0}}, "max_points must be at least 1"),
+        ({"estimation": {"imu_noise": 3}}, r"the estimation has no option 'imu_noise' \(did you mean 'imu_noise_f"),
+        ({"estimation": {"imu_noise_factor": float("nan")}}, "imu_noise_factor must be more than zero, got nan"),
+        ({"estimation": {"max_blind_s": 0}}, "max_blind_s must be more than zero"),
+        ({"estimation": {"standstill_disparity_px": -1}}, "standstill_disparity_px must be zero or more"),
         ({"dataset": {"path": "nowhere.bag"}}, r"nowhere\.bag does not exist"),
     ],
 )
@@ -110,13 +116,13 @@ def test_overrides_reach_the_part_they_name_or_the_only_one_that_has_the_key(ins
 
 
 def test_override_values_are_yaml_where_the_option_wants_it_and_text_where_not(installed, flight):
-    assignments = ["grid=[3, 4]", "predict_with_gyro=false", "bit_depth=null", "cameras=2", "equalisation=none"]
+    assignments = ["cameras=[cam1]", "zero_velocity_update=false", "bit_depth=null", "imu=2", "equalisation=none"]
     done = config.complete(config.override(with_data(flight), installed, assignments), installed)
-    assert done.frontend["grid"] == (3, 4)
-    assert done.frontend["predict_with_gyro"] is False
+    assert done.estimation["zero_velocity_update"] is False
     assert done.frontend["equalisation"] == "none"
     assert done.dataset.options["bit_depth"] is None
-    assert done.dataset.options["cameras"] == "2"
+    assert done.dataset.options["cameras"] == ["cam1"]
+    assert done.dataset.options["imu"] == "2"
 
 
 def test_overriding_leaves_the_original_alone(installed, flight):

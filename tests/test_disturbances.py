@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 
 from vioframe.evaluation import evaluate
-from vioframe.experiment import prepare, record
 from vioframe.parts import registry
 from vioframe.parts.config import parse
+from vioframe.pipeline import prepare, record
 from vioframe.runs.folder import RunFolder
-from vioframe.types import Frame, ImuSample
+from vioframe.types import FrameSet, ImuSample
 
 S = 1_000_000_000
 
@@ -39,7 +39,9 @@ class Disturbed:
 
 def painted(grey):
     def change(m, t):
-        return [replace(m, image=np.full_like(m.image, grey))] if isinstance(m, Frame) and 8.0 < t < 9.0 else [m]
+        if not (isinstance(m, FrameSet) and 8.0 < t < 9.0):
+            return [m]
+        return [replace(m, images=tuple(np.full_like(image, grey) for image in m.images))]
 
     return change
 
@@ -76,8 +78,8 @@ class Swapped:
 CASES = {
     "black images": (painted(0), "featureless_image", 1),
     "saturated images": (painted(255), "featureless_image", 1),
-    "short camera gap": (without(Frame, 8.0, 8.5), "camera_gap", 0),
-    "long camera gap": (without(Frame, 8.0, 10.0), "camera_gap", 1),
+    "short camera gap": (without(FrameSet, 8.0, 8.5), "camera_gap", 0),
+    "long camera gap": (without(FrameSet, 8.0, 10.0), "camera_gap", 1),
     "short imu gap": (without(ImuSample, 8.0, 8.1), "imu_gap", 0),
     "long imu gap": (without(ImuSample, 8.0, 9.0), "imu_gap", 1),
     "imu not finite": (not_finite, "imu_nan", 0),

@@ -135,18 +135,18 @@ def test_the_learning_rate_is_halved_where_asked(pictures):
     assert rates == [1e-3, 1e-3, 5e-4, 5e-4]
 
 
-def test_pairs_are_views_of_one_image(pictures, monkeypatch):
+def test_pairs_are_views_of_one_image(pictures):
     """The target, warped back by the homography, is the source, where light does not differ."""
-    monkeypatch.setattr(samples, "_DISTURBED", 0.0)
+    options = replace(SMALL, photometric_probability=0.0)
     for number in range(6):
-        one = pair(pictures[0], SMALL, number)
+        one = pair(pictures[0], options, number)
         back = cv2.warpPerspective(
             one.target, np.linalg.inv(one.homography), SMALL.size, borderMode=cv2.BORDER_CONSTANT, borderValue=np.nan
         )
         seen = np.isfinite(back)
         assert seen.mean() > 0.2
         assert np.median(np.abs(back - one.source)[seen]) < 0.03
-        again = pair(pictures[0], SMALL, number)
+        again = pair(pictures[0], options, number)
         np.testing.assert_array_equal(again.source, one.source)
         np.testing.assert_array_equal(again.homography, one.homography)
 
@@ -168,9 +168,8 @@ def test_each_photometric_effect_does_what_it_says(monkeypatch):
     def in_light(seed=0, **effect):
         for name, value in (dict(zip(LIGHT, UNCHANGED, strict=True)) | effect).items():
             monkeypatch.setattr(samples, name, value)
-        return disturbed(image, np.random.default_rng(seed))
+        return disturbed(image, np.random.default_rng(seed), 1.0)
 
-    monkeypatch.setattr(samples, "_DISTURBED", 1.0)
     # A line of one pixel is shared out over two.
     monkeypatch.setattr(samples, "line_kernel", lambda px, _: line_kernel(px, 0.3) if px > 1.0 else np.ones((1, 1)))
     np.testing.assert_allclose(in_light(), image, atol=1e-6)

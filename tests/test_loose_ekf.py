@@ -5,10 +5,12 @@ from functools import cache
 
 import numpy as np
 import pytest
-from msckf_helpers import after, drawn_start, pose_nees
+from msckf_helpers import drawn_start, pose_nees
 from threadpoolctl import threadpool_limits
 
 from vioframe.bench import BackendRun, run_backend
+from vioframe.estimation.lifecycle import LifeCycle
+from vioframe.estimation.options import EstimationOptions
 from vioframe.evaluation import evaluate
 from vioframe.geometry import so3
 from vioframe.geometry.trajectory import Trajectory
@@ -40,8 +42,8 @@ def flight(duration_s: float = 20.0) -> TrackSequence:
 
 def camera_path(sequence: TrackSequence) -> tuple[Float, Float]:
     """R_WC (N, 3, 3) and p_WC (N, 3) at every frame."""
-    truth, calibration = sequence.ground_truth, sequence.calibration
-    return truth.R_WB @ calibration.R_BC, truth.p_WB + truth.R_WB @ calibration.p_BC
+    truth, (camera,) = sequence.ground_truth, sequence.calibration.cameras
+    return truth.R_WB @ camera.R_BC, truth.p_WB + truth.R_WB @ camera.p_BC
 
 
 def scene(seed: int, points: int = 80) -> tuple[VisionMap, Float]:
@@ -135,7 +137,7 @@ def test_turning_on_the_spot_makes_no_map():
 
 @cache
 def flown() -> tuple[TrackSequence, BackendRun]:
-    return flight(), run_backend(flight(), LooseEkf(flight().calibration))
+    return flight(), run_backend(flight(), LooseEkf())
 
 
 def test_the_flight_has_its_true_length():
@@ -152,9 +154,9 @@ def test_landmarks_are_where_they_are():
     depths = [e.p_WF for e in run.estimates[100:] if len(e.landmark_ids)]
     assert len(depths) > 0.9 * len(run.estimates[100:])
     state, estimate = run.states[-1], run.estimates[-1]
-    tracks, calibration = sequence.packets[-1][1], sequence.calibration
+    tracks, (camera,) = sequence.packets[-1][1], sequence.calibration.cameras
     p_B = (estimate.p_WF - state.p_WB) @ state.R_WB
-    xy = calibration.camera.project((p_B - calibration.p_BC) @ calibration.R_BC)
+    xy = camera.model.project((p_B - camera.p_BC) @ camera.R_BC)
     seen = tracks.xy[[tracks.ids.tolist().index(i) for i in estimate.landmark_ids]]
     assert np.median(np.linalg.norm(xy - seen, axis=1)) < 2.0
     assert sum(e.is_keyframe for e in run.estimates) > 20
@@ -163,13 +165,13 @@ def test_landmarks_are_where_they_are():
 @pytest.mark.parametrize("factor", [0.7, 1.3])
 def test_the_scale_comes_back_from_thirty_per_cent_off(factor):
     sequence = flight()
-    backend = LooseEkf(sequence.calibration)
+    backend = LooseEkf()
+    life = LifeCycle(backend, sequence.calibration)
     speeds = []
     for k, (imu, tracks) in enumerate(sequence.packets):
-        estimate = backend.process(imu, tracks)
-        fusion = backend.fusion
+        estimate = life.process(imu, tracks)
         if k == 200:
-            assert fusion is not None
+            fusion = backend.fusion
             here = predicted_pose(fusion.state, sequence.calibration)
             fusion.tie_anew(here, 1e-6 * np.eye(6), 0.3)
             right = fusion.state.log_scale
@@ -185,8 +187,7 @@ def test_the_covariance_is_of_the_size_of_the_errors(seed):
     """Poses of one odometry hang together, which the filter does not know: the bounds are wide, and on both sides."""
     sequence = simulated_sequence("figure_eight", duration_s=15.0, seed=seed)
     start = drawn_start(sequence, 0, seed)
-    options = LooseEkfOptions(imu_noise_factor=1.0)
-    run = run_backend(after(sequence, 0), LooseEkf(sequence.calibration, options, initial_state=start))
+    run = run_backend(sequence, LooseEkf(), EstimationOptions(imu_noise_factor=1.0), start)
     truth = {state.t_ns: state for state in sequence.true_states}
     orientation, position = pose_nees(run.states, truth)
     assert 0.75 < orientation < 6.0
@@ -202,7 +203,7 @@ def blinded():
         for k, (imu, tracks) in enumerate(sequence.packets)
     )
     renamed = tuple((i, replace(t, ids=t.ids + 1_000_000) if k >= 280 else t) for k, (i, t) in enumerate(packets))
-    return sequence, run_backend(replace(sequence, packets=renamed), LooseEkf(sequence.calibration))
+    return sequence, run_backend(replace(sequence, packets=renamed), LooseEkf())
 
 
 def test_it_says_that_it_is_lost_and_goes_on_from_there(blinded):
@@ -228,8 +229,7 @@ def test_all_new_tracks_are_a_new_vision_frame_and_no_loss():
         (imu, replace(tracks, ids=tracks.ids + 1_000_000) if k >= 200 else tracks)
         for k, (imu, tracks) in enumerate(sequence.packets)
     )
-    backend = LooseEkf(sequence.calibration)
-    run = run_backend(replace(sequence, packets=packets), backend)
+    run = run_backend(replace(sequence, packets=packets), LooseEkf())
     assert run.resets == 0
     assert evaluate(run.trajectory, sequence.ground_truth).ate_m.rmse < 0.1
     seen = [bool(len(estimate.landmark_ids)) for estimate in run.estimates]
@@ -251,7 +251,7 @@ def test_a_wrong_pose_here_and_there_changes_nothing(monkeypatch):
         return replace(sighting, placement=replace(sighting.placement, pose=replace(pose, p_VC=pose.p_VC + 1.0)))
 
     monkeypatch.setattr(VisualOdometry, "track", sometimes_wrong)
-    run = run_backend(sequence, LooseEkf(sequence.calibration))
+    run = run_backend(sequence, LooseEkf())
     assert not any(event.startswith(("lost", "vision", "new")) for e in run.estimates for event in e.events)
     apart = [np.linalg.norm(a.p_WB - b.p_WB) for a, b in zip(run.states, undisturbed.states, strict=True)]
     assert 0.0 < max(apart) < 0.05
@@ -279,19 +279,12 @@ def test_options_that_make_no_sense_are_refused(wrong):
         LooseEkfOptions(**wrong)
 
 
-def test_an_unknown_camera_rotation_and_a_known_start_exclude_each_other():
-    sequence = flight()
-    start = drawn_start(sequence, 0, 0)
-    with pytest.raises(ValueError, match="initial_state"):
-        LooseEkf(sequence.calibration, LooseEkfOptions(unknown_camera_rotation=True), initial_state=start)
-
-
 def test_it_is_found_by_name_with_its_options():
     sequence = flight()
-    backend = registry.load().create_backend("loose_ekf", sequence.calibration, {"max_blind_s": 1.0})
+    backend = registry.load().create_backend("loose_ekf", {"keyframes": 8})
     blind = tuple(
         (i, t.only(np.zeros(len(t.ids), bool)) if k > 100 else t) for k, (i, t) in enumerate(sequence.packets)
     )
-    run = run_backend(replace(sequence, packets=blind[:130]), backend)
+    run = run_backend(replace(sequence, packets=blind[:130]), backend, EstimationOptions(max_blind_s=1.0))
     lost_ns = next(t for t, e in zip(run.t_ns, run.estimates, strict=False) if e.status is Status.LOST)
     assert (lost_ns - run.t_ns[100]) / NS_PER_S == pytest.approx(1.05, abs=0.01)

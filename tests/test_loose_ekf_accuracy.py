@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from vioframe.evaluation import evaluate
-from vioframe.experiment import prepare, record
 from vioframe.parts import registry
 from vioframe.parts.config import Config, DatasetConfig, PartConfig
+from vioframe.pipeline import prepare, record
 from vioframe.runs.folder import RunFolder
 
 TRUTH = "mav0/state_groundtruth_estimate0/data.csv"

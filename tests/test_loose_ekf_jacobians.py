@@ -5,11 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from filterpy.kalman import ExtendedKalmanFilter
-from msckf_helpers import random_covariance
+from msckf_helpers import CALIBRATION, random_covariance
 
 from vioframe.estimation.inertial.propagation import propagate
 from vioframe.geometry import so3
-from vioframe.io.calibration import packaged_calibration
 from vioframe.simulation import simulated_sequence
 from vioframe.types import DP, DTHETA, ImuSegment, NavState, g_W
 from vioframe_loose_ekf import measurement
@@ -18,7 +17,7 @@ from vioframe_loose_ekf.measurement import VisionPose
 from vioframe_loose_ekf.resection import reproject
 from vioframe_loose_ekf.state import DP_WA, DTHETA_WV, IMU, LOG_SCALE, SIZE, FilterState
 
-CALIBRATION = packaged_calibration("euroc")
+CAMERA = CALIBRATION.cameras[0]
 SEEDS = pytest.mark.parametrize("seed", range(4))
 STEP = 1e-6
 
@@ -198,7 +197,7 @@ def test_at_rest_the_readings_measure_and_nothing_moves():
     np.testing.assert_allclose(state.p_WB, truth.p_WB, atol=1e-12)
     assert np.linalg.norm(state.bias_gyro_B) < 3e-3
     # Attitude errors of the body and of the frame placed there are the same errors.
-    correlation = fusion.cov[DTHETA, DTHETA_WV] - fusion.cov[DTHETA, DTHETA] @ CALIBRATION.R_BC
+    correlation = fusion.cov[DTHETA, DTHETA_WV] - fusion.cov[DTHETA, DTHETA] @ CAMERA.R_BC
     np.testing.assert_allclose(correlation, 0.0, atol=1e-10)
     assert np.abs(fusion.cov[DP_WA, DP]).max() > 1e-3
     turning = replace(sequence.packets[5][0], gyro_B=sequence.packets[5][0].gyro_B + 1.0)

@@ -113,7 +113,7 @@ class TestInspection:
     @pytest.mark.parametrize(("first_frame", "how"), [(0, "static"), (60, "dynamic")])
     def test_a_filter_starts_at_rest_and_in_motion(self, first_frame, how):
         sequence = simulated_sequence("inspection", duration_s=8.0, seed=1)
-        backend = INSTALLED.create_backend("msckf", sequence.calibration)
+        backend = INSTALLED.create_backend("msckf")
         run = run_backend(replace(sequence, packets=sequence.packets[first_frame:]), backend)
         assert f"initialised ({how})" in [event for estimate in run.estimates for event in estimate.events]
         truth = dict(zip(sequence.ground_truth.t_ns.tolist(), sequence.ground_truth.p_WB, strict=True))

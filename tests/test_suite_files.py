@@ -10,14 +10,14 @@ from suite_recordings import record_toy
 
 from vioframe.bench.suites import sources
 from vioframe.bench.suites import suite as suites
-from vioframe.bench.suites.euroc import EUROC
 from vioframe.bench.suites.plan import plan
+from vioframe.bench.suites.sources import EUROC
 from vioframe.bench.suites.suite import Suite
 from vioframe.cli import main
 from vioframe.errors import ConfigError, DatasetError, VioframeError
 from vioframe.io.convert import convert
 from vioframe.parts import registry
-from vioframe.report.suite.results import Data
+from vioframe.runs.results import FINGERPRINT, Data
 from vioframe.simulation.config import SimulationConfig, complete
 from vioframe.simulation.record import record
 from vioframe.simulation.recording import SimulatedRecording
@@ -69,6 +69,7 @@ class TestFiles:
             (TOY + "conditions: {fog: [0.5, 0.5]}\n", "fog has a level twice"),
             (TOY + "frontend: {max_pointz: 9}\n", "did you mean 'max_points'"),
             (TOY.replace("[fast]", "[]"), "flights need detectors, backends and sequences"),
+            (TOY + "reference: {band: {half_widthm: 0.2, axes: {}}}\n", "did you mean 'half_width_m'"),
             (TOY + "rounds: 3\n", "rounds does nothing in a suite of kind flights"),
             ("title: t\nkind: trials\nbackends: [msckf]\nsetup: {speed: 1}\n", "its keys are flight"),
             ("title: t\nkind: trials\nbackends: [msckf]\nsetup: {duration_s: 1}\n", "at least 10 s"),
@@ -79,6 +80,16 @@ class TestFiles:
             read(tmp_path, text)
         assert complaint in str(raised.value)
         assert "\n" not in str(raised.value)
+
+    def test_a_suite_may_name_a_file_of_claims(self, tmp_path):
+        (tmp_path / "claims.yaml").write_text("called: somebody\nband: {half_width_m: 0.1, axes: {y: y}}\n")
+        suite = read(tmp_path, TOY + "reference: claims.yaml\n")
+        assert (suite.reference.called, suite.reference.band.half_width_m) == ("somebody", 0.1)
+        assert read(tmp_path, TOY).reference.band is None
+
+    def test_the_thesis_is_the_reference_of_two_suites_alone(self):
+        named = {name for name, path in suites.shipped().items() if suites.read(path).reference.called}
+        assert named == {"detector_fps", "mh05_comparison"}
 
     def test_an_unknown_name_is_met_with_the_nearest(self):
         with pytest.raises(ConfigError, match="did you mean 'stress'"):
@@ -125,12 +136,12 @@ class TestSources:
     def test_data_are_known_by_what_they_are_not_by_where(self, toy, tmp_path):
         copytree(toy, tmp_path / "copy")
         here, there = self.flown("TOY", [toy]), self.flown("TOY", [tmp_path / "copy"])
-        assert sources.fingerprint(here) == sources.fingerprint(there)
+        assert here.digest == there.digest
         for changed in ("imu0/data.csv", "cam0/sensor.yaml"):
-            before = sources.fingerprint(self.flown("TOY", [tmp_path / "copy"]))
+            before = self.flown("TOY", [tmp_path / "copy"]).digest
             file = tmp_path / "copy" / "TOY" / "mav0" / changed
             file.write_text(file.read_text() + "\n")
-            assert sources.fingerprint(self.flown("TOY", [tmp_path / "copy"])) != before
+            assert self.flown("TOY", [tmp_path / "copy"]).digest != before
 
     def test_what_the_simulator_wrote_is_never_called_real(self, tmp_path):
         config = complete(SimulationConfig(duration_s=0.3), INSTALLED)
@@ -186,28 +197,28 @@ class TestPlan:
     def test_a_task_for_each_place_in_the_grid(self, tmp_path):
         text = TOY.replace("[TOY]", "[hover]").replace("[fast]", "[fast, orb]")
         suite = read(tmp_path, text + "conditions: {fog: [0.5, 1.0]}\nseeds: 2\nseeds_vary: recording\n")
-        jobs = plan(suite, (), INSTALLED).jobs
-        assert len({job.key for job in jobs}) == len(jobs) == 2 * 3 * 2
-        recordings = {job.recording.name for job in jobs}
+        tasks = plan(suite, (), INSTALLED).tasks
+        assert len({task.name for task in tasks}) == len(tasks) == 2 * 3 * 2
+        recordings = {task.recording.name for task in tasks}
         assert len(recordings) == 3 * 2
-        assert {job.config.start_s for job in jobs} == {0.0}
+        assert {task.config.start_s for task in tasks} == {0.0}
 
     def test_seeds_that_vary_the_start_share_a_recording(self, tmp_path):
-        jobs = plan(read(tmp_path, TOY.replace("TOY", "hover") + "seeds: 3\n"), (), INSTALLED).jobs
-        assert len({job.recording.name for job in jobs}) == 1
-        assert [job.config.start_s for job in jobs] == [0.0, 0.5, 1.0]
+        tasks = plan(read(tmp_path, TOY.replace("TOY", "hover") + "seeds: 3\n"), (), INSTALLED).tasks
+        assert len({task.recording.name for task in tasks}) == 1
+        assert [task.config.start_s for task in tasks] == [0.0, 0.5, 1.0]
 
     def test_what_a_result_depends_on_is_in_its_fingerprint(self, tmp_path):
         def fingerprint(text):
-            return plan(read(tmp_path, text.replace("TOY", "hover")), (), INSTALLED).jobs[0].fingerprint
+            return plan(read(tmp_path, text.replace("TOY", "hover")), (), INSTALLED).tasks[0].about
 
         first = fingerprint(TOY)
-        assert fingerprint(TOY) == first
+        assert [fingerprint(TOY)[key] for key in FINGERPRINT] == [first[key] for key in FINGERPRINT]
         for text, what in (
             (TOY + "frontend: {max_points: 99}\n", "config"),
             (TOY.replace("[fast]", "[{name: fast, options: {threshold: 9}}]"), "config"),
             (TOY + "metrics: [ate]\n", "config"),
-            (TOY.replace("[TOY]", "[{name: hover, duration_s: 9}]"), "data"),
+            (TOY.replace("[TOY]", "[{name: hover, duration_s: 9}]"), "inputs"),
         ):
             changed = fingerprint(text)
             assert changed[what] != first[what]
@@ -220,17 +231,17 @@ class TestPlan:
 
     def test_a_flight_may_start_later_and_a_stand_in_does_not(self, tmp_path):
         later = TOY.replace("[TOY]", "[{name: hover, start_s: 5, duration_s: 3}, {name: V1_02_medium, start_s: 5}]")
-        hover, stand_in = plan(read(tmp_path, later), (), INSTALLED).jobs
+        hover, stand_in = plan(read(tmp_path, later), (), INSTALLED).tasks
         assert (hover.config.start_s, hover.recording.config.duration_s) == (5.0, 8.0)
         assert stand_in.config.start_s == 0.0
 
     def test_detectors_can_be_timed_on_recorded_frames(self, tmp_path, toy):
         text = "title: t\nkind: detector_speed\nsequences: [TOY]\n"
-        (job,) = plan(read(tmp_path, text), [toy], INSTALLED).jobs
-        assert (job.data, job.recording) == (Data.REAL, toy / "TOY")
-        (drawn,) = plan(read(tmp_path, text), (), INSTALLED).jobs
-        assert (drawn.data, drawn.recording) == (None, None)
-        assert drawn.fingerprint["data"] != job.fingerprint["data"]
+        (task,) = plan(read(tmp_path, text), [toy], INSTALLED).tasks
+        assert (task.about["data"], task.recording) == (Data.REAL, toy / "TOY")
+        (drawn,) = plan(read(tmp_path, text), (), INSTALLED).tasks
+        assert (drawn.about["data"], drawn.recording) == (None, None)
+        assert drawn.about["inputs"] != task.about["inputs"]
 
     def test_what_is_missing_is_said_before_anything_is_flown(self, tmp_path):
         for text in (

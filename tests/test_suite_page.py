@@ -17,13 +17,12 @@ import pytest
 from suite_helpers import MadeUp, comparison, labels, stress
 
 from vioframe.errors import PluginError
-from vioframe.report.suite.page import write_page
-from vioframe.report.suite.page_headline import headline
-from vioframe.report.suite.pooled import inside_band
-from vioframe.report.suite.results import Data
-from vioframe.report.suite.statistics import groups
+from vioframe.report.suite.figures import figures
+from vioframe.report.suite.page import facts, headline, write_page
+from vioframe.report.suite.report import write_report
+from vioframe.report.suite.statistics import inside_band, records
 from vioframe.report.suite.tables import tables
-from vioframe.report.suite.tables_about import evo_command
+from vioframe.runs.results import Data
 
 ENTER = "\ue007"
 """The key, to WebDriver."""
@@ -51,7 +50,13 @@ class Elements(HTMLParser):
 
 
 def write(made: MadeUp) -> Path:
-    return write_page(made.load(), made.path / "report")
+    study = made.study()
+    path = made.path / "report" / "index.html"
+    return write_page(study, tables(study), figures(study), path, "..")
+
+
+def said_by(made: MadeUp) -> list[str]:
+    return list(headline(made.study()))
 
 
 @pytest.fixture(scope="module")
@@ -103,7 +108,11 @@ def test_every_link_leads_to_a_folder_also_after_a_move(compared: MadeUp, page: 
     targets = [href for href in elements.all("href") if not href.startswith(("#", "data:"))]
     assert targets
     assert all((moved / "report" / unquote(target)).is_dir() for target in targets)
-    runs = {str(path.relative_to(compared.path)) for path in compared.path.glob("tasks/*/run")}
+    runs = {
+        str(path.relative_to(compared.path))
+        for path in compared.path.glob("runs/*")
+        if (path / "trajectory.tum").is_file()
+    }
     linked = {unquote(target).removeprefix("../").rstrip("/") for target in targets}
     assert runs <= linked
 
@@ -121,10 +130,21 @@ def test_sections_without_anything_to_show_are_left_out(tried: Path) -> None:
     assert sections == ["speed", "consistency", "machine"]
 
 
+def test_a_page_without_a_reference_shows_none_of_it(tmp_path: Path) -> None:
+    made = comparison(tmp_path / "plain", reference=False)
+    made.detector_speed()
+    text = Elements(write(made).read_text(encoding="utf-8")).text
+    assert "RMSE" in text
+    found = re.findall(r"(?i)\bthesis\b|\bours\b|\bfigure 3|\b3\.9\b|20 cm|\bquoted\b", text)
+    assert found == []
+    with_reference = Elements(write(comparison(tmp_path / "named")).read_text(encoding="utf-8")).text
+    assert {"thesis", "20 cm"} <= set(re.findall(r"thesis|20 cm", with_reference))
+
+
 def test_page_has_every_table_with_its_caption(compared: MadeUp, page: Path) -> None:
     elements = Elements(page.read_text(encoding="utf-8"))
     ids = set(elements.all("id"))
-    for table in tables(compared.load()):
+    for table in tables(compared.study()):
         if table.name != "evo":
             assert f"table-{table.name}" in ids
             assert table.caption in elements.text
@@ -132,11 +152,11 @@ def test_page_has_every_table_with_its_caption(compared: MadeUp, page: Path) -> 
 
 def test_page_prints_the_evo_command_of_every_flight_with_an_error(compared: MadeUp, page: Path) -> None:
     text = Elements(page.read_text(encoding="utf-8")).text
-    evaluated = [f for group in groups(compared.load()) for f in group.flights if f.evaluated]
-    assert len(evaluated) == 6
-    for flight in evaluated:
-        assert evo_command(flight) in text
-        assert f"seed {flight.seed}: ATE {flight.figures['ate_se3_m']:.6f} m" in text
+    evo = next(table for table in tables(compared.study()) if table.name == "evo")
+    assert len(evo.rows) == 6
+    for row in evo.rows:
+        assert row.entries["command"].shown in text
+        assert f"{row.entries['task'].shown}: ATE {row.entries['ATE, SE(3) [m]'].shown} m" in text
 
 
 def test_failures_are_listed_with_their_line(page: Path) -> None:
@@ -151,8 +171,9 @@ def test_plots_say_what_the_data_was_and_whose_pose_is_missing(tmp_path: Path) -
     made.failed(labels(detector="fast"), data=Data.SIMULATED)
     html = write(made).read_text(encoding="utf-8")
     plots = json.loads(re.search(r'<script type="application/json" id="plots">(.*?)</script>', html)[1])
-    caption = plots["paths"]["cases"][0]["caption"]
-    assert caption == "MH_05_difficult: made up for a test. Without any pose to draw: fast with msckf."
+    caption = plots["trajectories_3d"]["cases"][0]["caption"]
+    said = "Data (simulated): MH_05_difficult: made up for a test. Without any pose to draw: fast with msckf."
+    assert caption == said
 
 
 def test_text_from_results_is_never_markup(tried: Path) -> None:
@@ -164,69 +185,80 @@ def test_text_from_results_is_never_markup(tried: Path) -> None:
 def test_missing_libraries_are_one_line_with_the_remedy(
     compared: MadeUp, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.delitem(sys.modules, "vioframe.report.suite.page")
     monkeypatch.setitem(sys.modules, "plotly.offline", None)
     with pytest.raises(PluginError, match=r'plotly\S*: pip install "vioframe\[bench\]"$') as caught:
-        write_page(compared.load(), tmp_path)
+        write_report(compared.load(), tmp_path / "report")
     assert "\n" not in str(caught.value)
 
 
 # The headline ---------------------------------------------------------------------------------------------------------
 
 
-def test_headline_of_one_flight_is_the_time_inside_the_band(tmp_path: Path) -> None:
-    made = MadeUp(tmp_path / "results")
+def test_headline_of_a_claim_is_how_far_it_holds(tmp_path: Path) -> None:
+    made = MadeUp(tmp_path / "results", reference=True)
     made.flight(labels(detector="keypointnet", backend="sliding_window"), bias_m=(0.0, 0.9, 0.0))
     made.flight(labels(detector="shi_tomasi", backend="msckf"), sigma_m=0.01)
-    results = made.load()
-    ours = next(group for group in groups(results) if group.cell.detector == "keypointnet")
-    inside = inside_band(ours.flights[0])
+    study = made.study()
+    subject = next(row for row in records(study.flights) if row["detector"] == "keypointnet")
+    inside = inside_band(study.errors(subject), 0.2)
     assert inside["y"] < 60.0  # The bias shows, so that the two figures cannot be mixed up.
-    said = headline(results)
-    assert said.answer == (
-        f"KeypointNet with the sliding window: y inside ±20 cm for {inside['y']:.0f} % of the estimated "
-        f"time, altitude for {inside['z']:.0f} %."
+    first, more = headline(study)
+    assert first == (
+        f"KeypointNet with sliding_window: y inside ±20 cm for {inside['y']:.0f} % of the estimated time, altitude for "
+        f"{inside['z']:.0f} %."
     )
-    assert "the lowest here is that of Shi-Tomasi with MSCKF" in said.more[0]
+    assert "the lowest here is that of Shi-Tomasi with msckf" in more
+
+
+def test_headline_of_one_flight_is_the_lowest_error(tmp_path: Path) -> None:
+    made = MadeUp(tmp_path / "results")
+    made.flight(labels(detector="keypointnet", backend="sliding_window"))
+    made.flight(labels(detector="shi_tomasi", backend="msckf"), sigma_m=0.01)
+    (said,) = said_by(made)
+    assert re.fullmatch(
+        r"shi_tomasi with msckf: its ATE is \S+ m, the lowest here; next is keypointnet with sliding_window, \S+ m\.",
+        said,
+    )
 
 
 def test_headline_counts_failures(compared: MadeUp) -> None:
-    facts = headline(compared.load()).facts
-    assert facts["Flights complete"] == "6 of 8"
-    assert facts["Tasks failed"] == "1 of 8"
+    known = facts(compared.study())
+    assert known["Flights complete"] == "6 of 8"
+    assert known["Tasks failed"] == "1 of 8"
 
 
 def test_headline_of_hard_conditions_is_who_succeeds(tmp_path: Path) -> None:
-    said = headline(stress(tmp_path / "results").load())
-    assert re.fullmatch(
-        r"Flights that succeed under hard conditions: KeypointNet \d+ %, Shi-Tomasi \d+ %\.", said.answer
-    )
-    assert said.more[0].startswith("KeypointNet with MSCKF against Shi-Tomasi, flight by flight: ")
+    first, more = said_by(stress(tmp_path / "results"))
+    assert re.fullmatch(r"Flights that succeed under hard conditions: keypointnet \d+ %, shi_tomasi \d+ %\.", first)
+    assert more.startswith("keypointnet with msckf against shi_tomasi, flight by flight: 8 won, 0 lost, 0 tied;")
 
 
 def test_headline_compares_nobody_across_recordings(tmp_path: Path) -> None:
-    made = MadeUp(tmp_path / "results")
+    made = MadeUp(tmp_path / "results", reference=True)
     made.flight(labels("a", detector="keypointnet", backend="sliding_window"), data=Data.REAL, sigma_m=0.2)
     made.flight(labels("a", detector="orb", backend="msckf"), data=Data.REAL, sigma_m=0.001, completion=0.2)
     made.flight(labels("b", detector="fast", backend="msckf"), data=Data.SIMULATED, sigma_m=0.001)
-    said = headline(made.load())
-    assert said.answer.startswith("KeypointNet with the sliding window on a (real): y inside")
-    assert "fast" not in said.more[0]
-    assert "ORB" not in said.more[0]
+    first, more = said_by(made)
+    assert first.startswith("KeypointNet with sliding_window on a (real): y inside")
+    assert "fast" not in more
+    assert "ORB" not in more
 
 
 def test_headline_never_mixes_kinds_of_data(tmp_path: Path) -> None:
     made = MadeUp(tmp_path / "results")
     made.flight(labels("a", "fog", 1.0), data=Data.RENDERED, sigma_m=0.001)
     made.failed(labels("b", "fog", 1.0), data=Data.SIMULATED)
-    said = headline(made.load())
-    assert said.answer == "Flights that succeed under hard conditions (rendered): Shi-Tomasi 100 %."
-    assert said.more == ["Flights that succeed under hard conditions (simulated): Shi-Tomasi 0 %."]
+    assert said_by(made) == [
+        "Flights that succeed under hard conditions (rendered): shi_tomasi 100 %.",
+        "Flights that succeed under hard conditions (simulated): shi_tomasi 0 %.",
+    ]
 
 
 def test_headline_of_speed_and_trials(tried: Path) -> None:
     text = Elements(tried.read_text(encoding="utf-8")).text
     assert "fast runs at 700 frames a second on this machine." in text
-    said = re.search(r"The sliding window on figure eight: pose NEES (\S+) times the ideal over 3 trials, (\w+)", text)
+    said = re.search(r"sliding_window on figure_eight: pose NEES (\S+) times the ideal over 3 trials, (\w+)", text)
     assert float(said[1]) == pytest.approx(9.0, rel=0.1)
     assert said[2] == "overconfident"
 
@@ -234,8 +266,9 @@ def test_headline_of_speed_and_trials(tried: Path) -> None:
 def test_headline_of_nothing_but_failures(tmp_path: Path) -> None:
     made = MadeUp(tmp_path / "results")
     made.failed(labels())
-    assert headline(made.load()).answer == "Nothing in this suite has a figure yet."
-    assert "PluginError: it broke" in Elements(write(made).read_text(encoding="utf-8")).text
+    text = Elements(write(made).read_text(encoding="utf-8")).text
+    assert "Nothing in this suite has a figure yet." in text
+    assert "PluginError: it broke" in text
 
 
 # In a browser ---------------------------------------------------------------------------------------------------------
@@ -270,7 +303,7 @@ def load(browser: Any, page: Path, *plots: str, width: int = 1200) -> list[str]:
         browser.get_log(log)
     browser.get(page.as_uri())
     for plot in plots:
-        browser.execute_script(f"document.querySelector('#{plot}').dispatchEvent(new Event('show'))")
+        browser.execute_script(f"document.querySelector('#plot-{plot}').dispatchEvent(new Event('show'))")
     messages = [json.loads(entry["message"])["message"] for entry in browser.get_log("performance")]
     return [m["params"]["request"]["url"] for m in messages if m["method"] == "Network.requestWillBeSent"]
 
@@ -291,7 +324,7 @@ def settle(browser: Any) -> None:
 
 def visible(browser: Any, plot: str) -> list[tuple[str, bool]]:
     """(series, shown or not) of the traces of a plot that have one."""
-    canvases = f"[...document.querySelectorAll('#{plot} .canvas')]"
+    canvases = f"[...document.querySelectorAll('#plot-{plot} .canvas')]"
     traces = browser.execute_script(f"return {canvases}.flatMap(c => c.data.map(t => [t.meta.series, t.visible]))")
     return [(series, shown) for series, shown in traces if series]
 
@@ -320,63 +353,67 @@ def test_page_loads_alone_and_without_errors(browser: Any, request: pytest.Fixtu
 
 
 def test_paths_are_drawn_in_3d_and_hidden_with_the_legend(browser: Any, page: Path) -> None:
-    load(browser, page, "paths", width=600)
+    load(browser, page, "trajectories_3d", width=600)
 
     def coloured() -> int:
         """Pixels of the picture that are not grey: lines of estimates, not of the truth or the axes."""
         size = "{width: 400, height: 300}"
         url = browser.execute_async_script(
-            f"Plotly.toImage(document.querySelector('#paths .canvas'), {size}).then(arguments[0])"
+            f"Plotly.toImage(document.querySelector('#plot-trajectories_3d .canvas'), {size}).then(arguments[0])"
         )
         png = np.frombuffer(b64decode(url.partition(",")[2]), np.uint8)
         image = cv2.imdecode(png, cv2.IMREAD_COLOR).astype(int)
         return int((image.max(axis=2) - image.min(axis=2) > 80).sum())
 
-    assert browser.find_elements("css selector", "#paths .gl-container canvas")
+    assert browser.find_elements("css selector", "#plot-trajectories_3d .gl-container canvas")
     assert coloured() > 500
-    for series in dict(visible(browser, "paths")):
-        click(browser, f"#paths .legend button[data-series='{series}']")
-    assert {shown for _, shown in visible(browser, "paths")} == {False}
+    for series in dict(visible(browser, "trajectories_3d")):
+        click(browser, f"#plot-trajectories_3d .legend button[data-series='{series}']")
+    assert {shown for _, shown in visible(browser, "trajectories_3d")} == {False}
     assert coloured() == 0
 
 
 def test_views_turn_the_camera(browser: Any, page: Path) -> None:
-    load(browser, page, "paths", width=600)
+    load(browser, page, "trajectories_3d", width=600)
     for view, axis in (("top", "z"), ("side", "y")):
-        click(browser, f"#paths [data-view={view}]")
-        seen = browser.execute_script("return document.querySelector('#paths .canvas').layout.scene.camera")
+        click(browser, f"#plot-trajectories_3d [data-view={view}]")
+        seen = browser.execute_script(
+            "return document.querySelector('#plot-trajectories_3d .canvas').layout.scene.camera"
+        )
         assert seen["projection"]["type"] == "orthographic"
         assert [key for key, value in seen["eye"].items() if value] == [axis]
-        pressed = browser.find_element("css selector", "#paths .views [aria-pressed=true]")
+        pressed = browser.find_element("css selector", "#plot-trajectories_3d .views [aria-pressed=true]")
         assert pressed.get_attribute("data-view") == view
 
 
 def test_legend_hides_one_series_of_one_plot(browser: Any, page: Path) -> None:
-    load(browser, page, "translation", "rotation")
-    before = visible(browser, "rotation")
-    first = "#translation .legend button"
+    load(browser, page, "translation_error_per_axis", "rotation_error")
+    before = visible(browser, "rotation_error")
+    first = "#plot-translation_error_per_axis .legend button"
     click(browser, first)
     hidden = browser.find_element("css selector", first).get_attribute("data-series")
-    assert {series for series, shown in visible(browser, "translation") if not shown} == {hidden}
-    assert {shown for series, shown in visible(browser, "translation") if series != hidden} == {True}
-    assert visible(browser, "rotation") == before
+    assert {series for series, shown in visible(browser, "translation_error_per_axis") if not shown} == {hidden}
+    assert {shown for series, shown in visible(browser, "translation_error_per_axis") if series != hidden} == {True}
+    assert visible(browser, "rotation_error") == before
     assert browser.find_element("css selector", first).get_attribute("aria-pressed") == "false"
 
 
 def test_filter_hides_a_detector_in_all_plots_and_tables(browser: Any, page: Path) -> None:
-    load(browser, page, "translation", "relative", "stages")
+    load(browser, page, "translation_error_per_axis", "relative_error", "timing")
     box = ".filters input[value=keypointnet]"
     click(browser, box)
-    for plot in ("translation", "relative"):
+    for plot in ("translation_error_per_axis", "relative_error"):
         assert {series.split(" · ")[0] for series, shown in visible(browser, plot) if not shown} == {"keypointnet"}
         assert {series.split(" · ")[0] for series, shown in visible(browser, plot) if shown} == {"shi_tomasi"}
-    bars = browser.execute_script("return document.querySelector('#stages .canvas').data.flatMap(trace => trace.y)")
+    bars = browser.execute_script(
+        "return document.querySelector('#plot-timing .canvas').data.flatMap(trace => trace.y)"
+    )
     assert {name.split(" · ")[0] for name in bars} == {"shi_tomasi"}
     every = "[...document.querySelectorAll('tr[data-detector]')]"
     rows = f"return {every}.map(row => [row.dataset.detector, row.checkVisibility()])"
     assert {tuple(row) for row in browser.execute_script(rows)} == {("keypointnet", False), ("shi_tomasi", True)}
     click(browser, box)
-    assert all(shown for _, shown in visible(browser, "translation"))
+    assert all(shown for _, shown in visible(browser, "translation_error_per_axis"))
     assert all(shown for _, shown in browser.execute_script(rows))
 
 
@@ -406,28 +443,29 @@ def test_tables_are_sorted_by_their_headers(browser: Any, page: Path, keyboard: 
 def test_what_is_missing_is_sorted_last_either_way(browser: Any, tried: Path) -> None:
     load(browser, tried)
     for expected in (["80.0", "250.0", "700.0"], ["700.0", "250.0", "80.0"]):
-        click(browser, "#table-detector_fps th:nth-of-type(4) button")
-        found = column(browser, "table-detector_fps", 3)
+        click(browser, "#table-detector_fps th:nth-of-type(2) button")
+        found = column(browser, "table-detector_fps", 1)
         assert found[:3] == expected
         assert set(found[3:]) == {"–"}
 
 
 def test_one_choice_of_flight_is_for_all_plots(browser: Any, stressed: Path) -> None:
-    load(browser, stressed, "translation", "stress-curves")
-    caption = "return document.querySelector('#translation .canvas').data[0].y.bdata"
+    load(browser, stressed, "translation_error_per_axis", "stress")
+    caption = "return document.querySelector('#plot-translation_error_per_axis .canvas').data[0].y.bdata"
     before = browser.execute_script(caption)
-    click(browser, "#paths select option:nth-child(3)")
+    click(browser, "#plot-trajectories_3d select option:nth-child(3)")
     chosen = [each.get_property("value") for each in browser.find_elements("css selector", "select.case")]
-    assert chosen == ["figure_eight, motion blur 1 (simulated)"] * 4
+    assert set(chosen) == {"figure_eight, motion blur 1 (simulated)"}
+    assert len(chosen) == 6
     assert browser.execute_script(caption) != before
     # A picture a condition.
-    assert len(browser.find_elements("css selector", "#stress-curves .canvas")) == 2
+    assert len(browser.find_elements("css selector", "#plot-stress .canvas")) == 2
 
 
 def test_dark_pages_have_their_own_colours(browser: Any, page: Path) -> None:
-    line = "return document.querySelector('#translation .canvas').data[0].line.color"
+    line = "return document.querySelector('#plot-translation_error_per_axis .canvas').data[0].line.color"
     background = "return getComputedStyle(document.body).backgroundColor"
-    load(browser, page, "translation")
+    load(browser, page, "translation_error_per_axis")
     assert browser.execute_script(line) == "#0072b2"
     assert browser.execute_script(background) == "rgb(255, 255, 255)"
     choose_colours(browser, "dark")
@@ -438,5 +476,5 @@ def test_dark_pages_have_their_own_colours(browser: Any, page: Path) -> None:
 
 @pytest.mark.parametrize("width", [360, 800, 1600])
 def test_nothing_reaches_beyond_the_screen(browser: Any, page: Path, width: int) -> None:
-    load(browser, page, "translation", "relative", "stages", width=width)
+    load(browser, page, "translation_error_per_axis", "relative_error", "timing", width=width)
     assert browser.execute_script("return document.documentElement.scrollWidth") <= width

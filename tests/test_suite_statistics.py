@@ -1,12 +1,12 @@
 """Statistics of a suite: nothing is dropped, nothing of different kinds is averaged."""
 
-import json
 import shutil
 import subprocess
 import sys
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -16,93 +16,90 @@ from trajectory_helpers import flight
 from vioframe.evaluation import evaluate
 from vioframe.geometry.trajectory import Trajectory
 from vioframe.io.trajectories import write_tum
-from vioframe.report.suite.flights import Flight, Outcome
-from vioframe.report.suite.pooled import BAND_M, inside_band, pool_relative
-from vioframe.report.suite.results import Data, Kind, SuiteResults
-from vioframe.report.suite.statistics import Spread, averages, expected_tasks, groups, unplaced
-from vioframe.report.suite.stress import baseline_of, curves, duels, wilson
-from vioframe.report.suite.tables_about import evo_command
+from vioframe.report.suite.statistics import (
+    Study,
+    averages,
+    curves,
+    data_caption,
+    duels,
+    groups,
+    inside_band,
+    median_flight,
+    records,
+    relative_errors,
+    seeds_text,
+    stage_means,
+    wilson,
+)
+from vioframe.report.suite.tables import tables
 from vioframe.runs.evaluated import write_matched_truth
 from vioframe.runs.folder import RunFolder
+from vioframe.runs.results import CELL, Data, task_count
 
 
 @pytest.fixture(scope="module")
-def compared(tmp_path_factory: pytest.TempPathFactory) -> SuiteResults:
-    return comparison(tmp_path_factory.mktemp("suite") / "results").load()
+def compared(tmp_path_factory: pytest.TempPathFactory) -> Study:
+    return comparison(tmp_path_factory.mktemp("suite") / "results").study()
 
 
 @pytest.fixture(scope="module")
-def stressed(tmp_path_factory: pytest.TempPathFactory) -> SuiteResults:
-    return stress(tmp_path_factory.mktemp("suite") / "results").load()
+def stressed(tmp_path_factory: pytest.TempPathFactory) -> Study:
+    return stress(tmp_path_factory.mktemp("suite") / "results").study()
+
+
+def only_group(made: MadeUp) -> pd.DataFrame:
+    ((_, own),) = groups(made.study().flights)
+    return own
 
 
 def test_groups_come_in_the_order_of_the_suite_with_every_flight_in_them(compared):
-    found = groups(compared)
-    assert [(g.cell.detector, g.cell.backend) for g in found] == [
+    found = list(groups(compared.flights))
+    assert [cell[4:] for cell, _ in found] == [
         ("shi_tomasi", "sliding_window"),
         ("shi_tomasi", "msckf"),
         ("keypointnet", "sliding_window"),
         ("keypointnet", "msckf"),
     ]
-    assert [g.seeds_text for g in found] == ["2", "1 of 2; 1 failed", "2", "1 of 2; 1 never initialised"]
-    assert [g.count for g in found] == [2, 2, 2, 2]
-    assert found[1].reasons == {"PluginError: it broke": 1}
-    assert found[3].reasons == {"never initialised; last: initialisation refused: not at rest": 1}
+    assert [seeds_text(own) for _, own in found] == ["2", "1 of 2; 1 failed", "2", "1 of 2; 1 never initialised"]
+    assert [own["seed"].tolist() for _, own in found] == [[0, 1]] * 4
+    assert list(found[1][1]["reason"]) == ["", "PluginError: it broke"]
+    assert list(found[3][1]["reason"]) == ["", "never initialised; last: initialisation refused: not at rest"]
 
 
-def test_figures_are_those_of_the_evaluation_with_mean_and_spread_over_the_seeds(compared):
-    results = compared
-    group = groups(results)[0]
-    own = [t.result["evaluation"] for t in results.tasks if t.labels.detector == "shi_tomasi" and "window" in t.key]
-    ate = np.array([e["ate_m"]["rmse"] for e in own])
-    spread = group.spread("ate_m")
-    assert spread.to_dict() == pytest.approx(
-        {"n": 2, "mean": ate.mean(), "std": ate.std(ddof=1), "median": ate.mean(), "min": ate.min(), "max": ate.max()}
-    )
-    assert group.mean("ate_percent") == pytest.approx(
-        100.0 * np.mean([e["ate_m"]["rmse"] / e["path_length_m"] for e in own])
-    )
-    assert group.mean("start_s") == 5.25
-    assert group.means("nees.").keys() == {"orientation", "position", "pose"}
-    assert group.mean("no such figure") is None
-    stages = group.means("stage_ms.")
+def test_errors_over_time_are_those_of_the_rows(compared):
+    for row in records(compared.flights):
+        errors = compared.errors(row)
+        assert (errors is None) == (not row["evaluated"])
+        if errors is not None:
+            assert errors.ate_m.rmse == pytest.approx(row["ate_m"])
+            assert row["ate_percent"] == pytest.approx(100.0 * row["ate_m"] / errors.truth.path_length_m)
+
+
+def test_stages_add_up_to_the_whole_and_leave_out_what_never_initialised(compared):
+    means = stage_means(compared.flights)
+    whole = compared.flights[compared.flights["evaluated"]]["frame_ms"].mean()
     # timings.csv keeps microseconds.
-    assert sum(stages.values()) == pytest.approx(group.mean("frame_ms"), abs=1e-3)
-
-
-def test_a_single_value_has_no_spread():
-    assert Spread((0.3,)).std is None
+    assert means.sum(axis="columns").to_numpy() == pytest.approx([whole] * 4, abs=1e-3)
 
 
 def test_a_flight_that_was_lost_for_long_or_cut_short_is_not_complete(tmp_path):
     made = MadeUp(tmp_path / "r")
     made.flight(labels(seed=0), completion=0.949)
     made.flight(labels(seed=1), completion=0.951)
-    cut = made.flight(labels(seed=2)).parent / "task.json"
-    tree = json.loads(cut.read_text())
-    tree["result"]["summary"]["finished"] = False
-    cut.write_text(json.dumps(tree))
-    (group,) = groups(made.load())
-    assert [f.outcome for f in group.flights] == [Outcome.INCOMPLETE, Outcome.COMPLETE, Outcome.INCOMPLETE]
-    assert [f.reason for f in group.flights] == ["tracked 94.9 % of its frames", "", "cut short"]
-    assert group.seeds_text == "3; 2 not complete"
-    assert [f.succeeded for f in group.flights] == [False, True, False]
+    made.flight(labels(seed=2), finished=False)
+    own = only_group(made)
+    assert list(own["outcome"]) == ["not complete", "complete", "not complete"]
+    assert list(own["reason"]) == ["tracked 94.9 % of its frames", "", "cut short"]
+    assert seeds_text(own) == "3; 2 not complete"
+    assert list(own["succeeded"]) == [False, True, False]
 
 
-@pytest.mark.parametrize(("after_s", "outcome"), [(5.9, Outcome.COMPLETE), (6.1, Outcome.INCOMPLETE)])
-def test_a_flight_that_is_initialised_in_its_second_half_is_not_complete(tmp_path, after_s, outcome):
+@pytest.mark.parametrize(("after_s", "reason"), [(5.9, ""), (6.1, "initialised only after 6.1 s")])
+def test_a_flight_that_is_initialised_in_its_second_half_is_not_complete(tmp_path, after_s, reason):
     made = MadeUp(tmp_path / "r")
-    task = made.flight(labels()).parent / "task.json"
-    tree = json.loads(task.read_text())
-    tree["result"]["summary"] |= {
-        "initialised_after_s": after_s,
-        "first_frame_t_ns": 10**18,
-        "last_frame_t_ns": 10**18 + 12 * 10**9,
-    }
-    task.write_text(json.dumps(tree))
-    ((flown,),) = [group.flights for group in groups(made.load())]
-    assert flown.outcome is outcome
-    assert flown.reason == ("" if flown.complete else "initialised only after 6.1 s")
+    made.flight(labels(), initialised_after_s=after_s, flown_s=12.0)
+    own = only_group(made)
+    assert (list(own["complete"]), list(own["reason"])) == ([not reason], [reason])
 
 
 def test_the_median_flight_is_one_that_was_flown(tmp_path):
@@ -110,11 +107,9 @@ def test_the_median_flight_is_one_that_was_flown(tmp_path):
     for seed, sigma_m in enumerate((0.3, 0.02, 0.1)):
         made.flight(labels(seed=seed), sigma_m=sigma_m)
     made.failed(labels(seed=3))
-    (group,) = groups(made.load())
-    assert group.median_flight().seed == 2
+    assert median_flight(only_group(made))["seed"] == 2
     made.failed(labels(seed=2))
-    (group,) = groups(made.load())
-    assert group.median_flight().seed == 0  # Of two, the worse.
+    assert median_flight(only_group(made))["seed"] == 0  # Of two, the worse.
 
 
 def test_a_failed_flight_that_does_not_know_its_data_stands_with_its_siblings(tmp_path):
@@ -122,11 +117,11 @@ def test_a_failed_flight_that_does_not_know_its_data_stands_with_its_siblings(tm
     made.flight(labels(seed=0), data=Data.REAL)
     made.failed(labels(seed=1), data=None)
     made.failed(labels("V1_01_easy"), "DatasetError: there is no V1_01_easy.bag", data=None)
-    results = made.load()
-    (group,) = groups(results)
-    assert group.cell.data is Data.REAL
-    assert group.seeds_text == "1 of 2; 1 failed"
-    assert [f.task.labels.sequence for f in unplaced(results)] == ["V1_01_easy"]
+    own = only_group(made)
+    assert set(own["data"]) == {Data.REAL}
+    assert seeds_text(own) == "1 of 2; 1 failed"
+    # What belongs to no group is told all the same.
+    assert len(next(t for t in tables(made.study()) if t.name == "failures").rows) == 2
 
 
 def test_averages_are_over_sequences_that_everyone_completed_and_never_mix_kinds_of_data(tmp_path):
@@ -139,86 +134,79 @@ def test_averages_are_over_sequences_that_everyone_completed_and_never_mix_kinds
                 made.failed(of, data=data)
             else:
                 made.flight(of, data=data, sigma_m=0.01 * (k + 1))
-    found = groups(made.load())
-    rows = averages(found)
-    assert [(r.data, r.detector, r.sequences, r.of) for r in rows] == [
-        (Data.REAL, "shi_tomasi", ("a", "b"), 3),
-        (Data.REAL, "orb", ("a", "b"), 3),
-        (Data.SIMULATED, "shi_tomasi", ("d", "e"), 2),
-        (Data.SIMULATED, "orb", ("d", "e"), 2),
+    flights = made.study().flights
+    rows = averages(flights)
+    assert [(r.data, r.detector, list(r.means.index), r.of) for r in rows] == [
+        (Data.REAL, "shi_tomasi", ["a", "b"], 3),
+        (Data.REAL, "orb", ["a", "b"], 3),
+        (Data.SIMULATED, "shi_tomasi", ["d", "e"], 2),
+        (Data.SIMULATED, "orb", ["d", "e"], 2),
     ]
-    of_a, of_b = (next(g for g in found if g.cell.sequence == s and g.cell.detector == "orb") for s in "ab")
-    assert rows[1].spreads["ate_m"].values == (of_a.mean("ate_m"), of_b.mean("ate_m"))
+    orb = flights[flights["detector"] == "orb"].set_index("sequence")["ate_m"]
+    assert list(rows[1].means["ate_m"]) == [orb["a"], orb["b"]]
 
 
-def test_a_loop_closed_flight_is_told_by_its_corrected_figures(tmp_path):
+def test_a_loop_closed_flight_is_told_by_its_corrected_trajectory(tmp_path):
     made = MadeUp(tmp_path / "r")
     run = made.flight(labels(), sigma_m=0.2)
     truth = RunFolder.open(run).ground_truth()
     write_tum(truth, run / "trajectory_loop.tum")
-    tree = json.loads((run.parent / "task.json").read_text())
-    tree["result"]["evaluation_loop"] = evaluate(truth, truth).to_dict()
-    (run.parent / "task.json").write_text(json.dumps(tree))
-    (task,) = made.load().of(Kind.FLIGHT)
-    one = Flight.of(task)
-    assert one.figures["ate_m"] == pytest.approx(0.0, abs=1e-9)
-    assert task.loop_closed
-    assert evo_command(one).endswith("run/trajectory_loop.tum --align")
+    made.change(key(labels()), loop_closed=True)
+    study = made.study()
+    assert study.errors(records(study.flights)[0]).ate_m.rmse == pytest.approx(0.0, abs=1e-9)
+    evo = next(t for t in tables(study) if t.name == "evo")
+    assert evo.values["command"][0].endswith("/trajectory_loop.tum --align")
 
 
-def test_the_band_counts_instants_and_prefers_what_the_metric_said(tmp_path):
-    made = MadeUp(tmp_path / "r")
-    made.flight(labels(seed=0), sigma_m=0.001, bias_m=(0.0, 1.0, 0.0))
-    told = {"inside_x_percent": 1.0, "inside_y_percent": 2.0, "inside_z_percent": 3.0, "inside_all_percent": 0.5}
-    made.flight(labels(seed=1), metrics={f"band:half_width_m={BAND_M:g}": told, "band:half_width_m=0.1": {}})
-    first, second = (Flight.of(task) for task in made.load().tasks)
-    within = np.abs(first.task.errors.position_m) <= BAND_M
-    assert within[:, 1].mean() < 0.5
-    assert inside_band(first) == pytest.approx(
-        {**dict(zip("xyz", 100.0 * within.mean(axis=0), strict=True)), "all": 100.0 * within.all(axis=1).mean()}
-    )
-    assert inside_band(second) == {"x": 1.0, "y": 2.0, "z": 3.0, "all": 0.5}
+def test_the_band_counts_instants():
+    truth = flight(100)
+    late = (np.arange(100) >= 40)[:, None] * np.array([0.0, 1.0, 0.0])
+    errors = evaluate(Trajectory(truth.t_ns, truth.R_WB, truth.p_WB + late), truth)
+    within = np.abs(errors.position_m) <= 0.2
+    share = inside_band(errors, 0.2)
+    assert share["y"] < 50.0
+    by_axis = dict(zip("xyz", 100.0 * within.mean(axis=0), strict=True))
+    assert share == {**by_axis, "all": 100.0 * within.all(axis=1).mean()}
 
 
-def test_relative_errors_are_pooled_over_the_flights_of_a_group(compared):
-    found = groups(compared)
-    pools = pool_relative(found)
-    assert [pool.flights for pool in pools] == [2, 1, 2, 1]
-    errors = [flight.task.errors for flight in found[0].flights]
+def test_relative_errors_are_pooled_over_the_flights_of_a_contender(compared):
+    pool = relative_errors(compared, compared.flights)
+    assert pool.groupby(["detector", "backend"], sort=False)["task"].nunique().tolist() == [2, 1, 2, 1]
+    _, own = next(iter(groups(compared.flights)))
+    errors = [compared.errors(row) for row in records(own)]
     at_8m = np.concatenate([e.relative[8.0].translation_percent for e in errors])
-    np.testing.assert_array_equal(pools[0].stretches[8.0].translation_percent, at_8m)
-    assert not pools[0].of_path
+    mine = pool[pool["task"].isin(own["task"]) & (pool["length"] == 8.0)]
+    np.testing.assert_array_equal(mine["translation_percent"], at_8m)
+    assert not pool["of_path"].any()
 
 
 def test_a_stress_curve_begins_in_the_clear_and_counts_failures_against_success(stressed):
-    found = groups(stressed)
-    by_name = {(c.condition, c.detector): c for c in curves(found)}
+    by_name = dict(groups(curves(stressed.flights), ("condition", "detector")))
     assert len(by_name) == 4
     fog = by_name["fog", "shi_tomasi"]
-    assert [p.level for p in fog.points] == [0.0, 0.5, 1.0]
-    assert [p.success for p in fog.points] == [1.0, 1.0, 0.5]
-    assert fog.points[2].group.seeds_text == "1 of 2; 1 failed"
-    assert fog.points[0].group is by_name["motion_blur", "shi_tomasi"].points[0].group
+    assert fog["level"].tolist() == [0.0, 0.5, 1.0]
+    assert fog["success"].tolist() == [1.0, 1.0, 0.5]
+    assert seeds_text(fog["flights"].iloc[2]) == "1 of 2; 1 failed"
+    assert set(fog["flights"].iloc[0]["condition"]) == {"clear"}
 
 
 def test_the_band_of_a_curve_is_students_t_with_the_spread_pooled_over_its_levels(stressed):
     from scipy import stats
 
-    curve = next(c for c in curves(groups(stressed)) if c.detector == "keypointnet")
-    logs = [np.log(p.group.spread("ate_m").values) for p in curve.points]
+    curve = dict(groups(curves(stressed.flights), ("condition", "detector")))["fog", "keypointnet"]
+    logs = [np.log(own["ate_m"]) for own in curve["flights"]]
     sigma = np.sqrt(np.mean([each.var(ddof=1) for each in logs]))  # equally many seeds a level
-    for point, each in zip(curve.points, logs, strict=True):
+    for point, each in zip(records(curve), logs, strict=True):
         low, high = stats.t.interval(0.95, df=3, loc=each.mean(), scale=sigma / np.sqrt(2))
-        assert point.ate_m == pytest.approx(np.exp(each.mean()), rel=1e-12)
-        assert (point.band.low, point.band.high) == pytest.approx((np.exp(low), np.exp(high)), rel=1e-9)
+        assert point["ate_m"] == pytest.approx(np.exp(each.mean()), rel=1e-12)
+        assert (point["low"], point["high"]) == pytest.approx((np.exp(low), np.exp(high)), rel=1e-9)
 
 
 def test_without_a_second_seed_there_is_no_band(tmp_path):
     made = MadeUp(tmp_path / "r")
     made.flight(labels())
     made.flight(labels(condition="fog", level=1.0))
-    (curve,) = curves(groups(made.load()))
-    assert [p.band for p in curve.points] == [None, None]
+    assert curves(made.study().flights)[["low", "high"]].isna().all(axis=None)
 
 
 @given(n=st.integers(1, 40), share=st.floats(0.0, 1.0))
@@ -227,17 +215,14 @@ def test_wilsons_interval_is_that_of_scipy(n, share):
 
     successes = round(share * n)
     expected = stats.binomtest(successes, n).proportion_ci(0.95, method="wilson")
-    found = wilson(successes, n)
-    assert (found.low, found.high) == pytest.approx((expected.low, expected.high), abs=1e-12)
+    assert wilson(successes, n) == pytest.approx((expected.low, expected.high), abs=1e-12)
 
 
 def test_duels_pair_flights_and_a_failure_loses(stressed):
     from scipy import stats
 
-    results = stressed
-    found = groups(results)
-    assert baseline_of(found) == "shi_tomasi"
-    rows = duels(found, "shi_tomasi")
+    assert stressed.baseline == "shi_tomasi"
+    rows = duels(stressed.flights, "shi_tomasi")
     assert [(r.condition, r.level, r.won, r.lost, r.tied, r.both) for r in rows] == [
         ("clear", 0.0, 2, 0, 0, 2),
         ("motion_blur", 0.5, 2, 0, 0, 2),
@@ -255,7 +240,7 @@ def test_two_failures_and_two_equal_flights_are_ties(tmp_path):
     for detector in ("shi_tomasi", "orb"):
         made.failed(labels(detector=detector, seed=0))
         made.flight(labels(detector=detector, seed=1))
-    (row,) = duels(groups(made.load()), "shi_tomasi")
+    (row,) = duels(made.study().flights, "shi_tomasi")
     assert (row.won, row.lost, row.tied, row.both, row.p_value) == (0, 0, 2, 1, 1.0)
 
 
@@ -265,25 +250,54 @@ def test_a_flight_that_was_lost_early_wins_no_duel_by_the_little_that_it_estimat
     made.flight(labels(detector="orb", seed=0), sigma_m=0.001, completion=0.3)
     made.failed(labels(detector="shi_tomasi", seed=1))
     made.flight(labels(detector="orb", seed=1), sigma_m=0.001, completion=0.3)
-    (row,) = duels(groups(made.load()), "shi_tomasi")
+    (row,) = duels(made.study().flights, "shi_tomasi")
     assert (row.won, row.lost, row.tied, row.both) == (1, 1, 0, 1)
 
 
-def test_a_lone_detector_has_no_baseline(tmp_path):
-    made = MadeUp(tmp_path / "r")
-    made.flight(labels())
-    results = made.load()
-    assert baseline_of(groups(results)) is None
+def test_the_baseline_is_the_first_of_the_suite_and_a_lone_detector_has_none(tmp_path):
+    made = MadeUp(tmp_path / "r", detectors=["orb", "fast"])
+    made.flight(labels(detector="fast"))
+    assert made.study().baseline is None
+    made.flight(labels(detector="orb"))
+    assert made.study().baseline == "orb"
+
+
+def test_nees_is_averaged_over_the_trials_that_have_one(tmp_path):
+    made = MadeUp(tmp_path / "r", kind="trials", backends=["msckf"], seeds=4)
+    for seed in range(3):
+        made.trial("msckf", seed, 1.0)
+    made.trial("msckf", 3, 1.0, "crashed")
+    study = made.study()
+    nees = study.nees(study.trials)["pose"]
+    tables_ = [pd.read_csv(made.path / folder / "nees.csv") for folder in study.trials["folder"][:3]]
+    assert nees.mean == pytest.approx(np.mean([each["pose"].mean() for each in tables_]))
+    assert set(nees.trials) == {3}
+    assert nees.verdict == "consistent"
 
 
 def test_how_many_tasks_a_finished_sweep_has(compared, stressed):
-    assert expected_tasks(stressed.suite) == 2 * 1 * 1 * 5 * 2
-    assert expected_tasks(compared.suite) == 8
-    assert expected_tasks({"kind": "trials", "backends": ["a", "b"], "seeds": 25}) == 50
-    assert expected_tasks({"kind": "detector_speed"}) == 1
+    assert task_count(stressed.results.suite) == 2 * 1 * 1 * 5 * 2
+    assert task_count(compared.results.suite) == 8
+    assert task_count({"kind": "trials", "backends": ["a", "b"], "seeds": 25}) == 50
+    assert task_count({"kind": "detector_speed"}) == 1
     grid = {"detectors": ["a"], "backends": ["b"], "sequences": ["c"]}
-    assert expected_tasks({"kind": "flights", **grid, "clear": False, "conditions": {"fog": [0.5, 1.0]}}) == 2
-    assert expected_tasks({}) is None
+    assert task_count({"kind": "flights", **grid, "clear": False, "conditions": {"fog": [0.5, 1.0]}}) == 2
+    assert task_count({}) is None
+
+
+def test_captions_list_many_recordings_by_kind(tmp_path):
+    made = MadeUp(tmp_path / "r", sequences=["a", "b", "c"])
+    for sequence, data in (("a", Data.REAL), ("b", Data.REAL), ("c", Data.SIMULATED)):
+        made.flight(labels(sequence), data=data)
+    caption = data_caption(made.study().flights)
+    assert "Data (real): a, b: real images and IMU." in caption
+    assert "Data (simulated): c: a simulated stand-in flight" in caption
+
+
+def test_what_a_group_has_in_common_is_all_but_the_seed(compared):
+    assert list(CELL) == ["data", "sequence", "condition", "level", "detector", "backend"]
+    for cell, own in groups(compared.flights):
+        assert all((own[column] == value).all() for column, value in zip(CELL, cell, strict=True))
 
 
 def test_matched_truth_is_paired_as_the_evaluation_pairs(tmp_path):
@@ -321,13 +335,10 @@ def test_evo_finds_the_se3_ate_by_the_command_that_the_report_prints(tmp_path):
     between = truth.at(off)
     noisy = between.p_WB + np.random.default_rng(1).normal(0.0, 0.05, (len(off), 3))
     made.flight(labels(), estimate=Trajectory(off, between.R_WB, noisy))
-    (task,) = made.load().tasks
-    command = evo_command(Flight.of(task)).split()
-    assert command[2:4] == [
-        f"tasks/{key(labels())}/run/ground_truth_matched.tum",
-        f"tasks/{key(labels())}/run/trajectory.tum",
-    ]
+    study = made.study()
+    command = next(t for t in tables(study) if t.name == "evo").values["command"][0].split()
+    assert command[2:4] == [f"runs/{key(labels())}/{file}.tum" for file in ("ground_truth_matched", "trajectory")]
     program = shutil.which("evo_ape") or str(Path(sys.executable).parent / "evo_ape")
     said = subprocess.run([program, *command[1:]], cwd=made.path, capture_output=True, text=True, check=True).stdout
     rmse = next(float(line.split()[1]) for line in said.splitlines() if line.split()[:1] == ["rmse"])
-    assert rmse == pytest.approx(task.evaluation["ate_se3_m"], abs=1e-6)
+    assert rmse == pytest.approx(study.flights["ate_se3_m"][0], abs=1e-6)

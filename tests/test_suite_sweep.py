@@ -1,6 +1,5 @@
 """Sweeps: whatever happens to a worker or to the sweep, what is done is kept, and all of it is done in the end."""
 
-import json
 import os
 import signal
 import subprocess
@@ -15,10 +14,12 @@ from suite_recordings import install_parts, record_toy
 from vioframe.bench.suites import suite as suites
 from vioframe.bench.suites.plan import plan
 from vioframe.bench.suites.store import Store
-from vioframe.bench.suites.sweep import Event, Outcome, agenda, sweep
+from vioframe.bench.suites.sweep import Event, Tally, agenda, sweep
 from vioframe.errors import RunError
 from vioframe.parts import registry
-from vioframe.report.suite.results import Data, Kind, SuiteResults, load_results
+from vioframe.report.suite.statistics import Study
+from vioframe.runs.folder import RunFolder
+from vioframe.runs.results import Data, Row, load_results, read_rows, write_rows
 
 pytest.importorskip("distributed", reason="sweeps need the extra bench")
 
@@ -50,9 +51,7 @@ def parts(tmp_path, monkeypatch):
     monkeypatch.setenv("OMP_NUM_THREADS", "1")
 
 
-def run(
-    folder: Path, text: str, data: Path | None, *, out: str = "results", **how
-) -> tuple[Outcome, list[Event], Path]:
+def run(folder: Path, text: str, data: Path | None, *, out: str = "results", **how) -> tuple[Tally, list[Event], Path]:
     file = folder / "toy.yaml"
     file.write_text(text)
     planned = plan(suites.read(file), [] if data is None else [data], registry.load())
@@ -64,12 +63,12 @@ def run(
     return outcome, events, store.path
 
 
-def found(path: Path) -> SuiteResults:
-    return load_results(path)
+def found(path: Path) -> list[Row]:
+    return list(load_results(path).rows)
 
 
 def estimates(path: Path) -> dict[str, bytes]:
-    return {task.key: (task.folder / "run" / "trajectory.tum").read_bytes() for task in found(path).tasks}
+    return {row["task"]: (path / row["folder"] / "trajectory.tum").read_bytes() for row in found(path)}
 
 
 def unreliable(folder: Path, how: str, times: int) -> str:
@@ -86,30 +85,34 @@ class TestSweep:
         outcome, events, path = run(tmp_path, GRID, toy)
         assert (outcome.done, outcome.reused, outcome.failed) == (4, 0, {})
         assert len(events) == 4
-        results = found(path)
+        results = load_results(path)
         assert results.suite["title"] == "toy"
-        for task in results.tasks:
-            assert (task.kind, task.data, task.ok, task.attempts) == (Kind.FLIGHT, Data.REAL, True, 1)
-            assert task.evaluation is not None
-            assert task.errors is not None
-            assert task.errors.ate_m.rmse == pytest.approx(task.evaluation["ate_m"]["rmse"])
-            assert set(task.result["metrics"]["band:half_width_m=0.2"]) >= {"inside_y_percent", "inside_z_percent"}
-            assert task.result["real_time_factor"] > 0.0
-            assert task.result["stage_ms"]["klt" if "klt" in task.result["stage_ms"] else "frontend.klt"] > 0.0
-            assert len(task.matched_truth()) == task.evaluation["poses"]
-            assert task.run.summary["start_s"] == 0.5 * task.labels.seed
-        assert {task.labels.detector for task in results.tasks} == {"shi_tomasi", "fast"}
+        study = Study(results)
+        for row in results.rows:
+            assert (row["kind"], row["data"], row["status"], row["attempts"]) == ("flight", Data.REAL, "ok", 1)
+            assert 0.0 <= row["metrics.band:half_width_m=0.2.inside_y_percent"] <= 100.0
+            assert row["real_time_factor"] > 0.0
+            assert row.get("stage_ms.klt", row.get("stage_ms.frontend.klt")) > 0.0
+            assert row["start_s"] == 0.5 * row["seed"]
+        for _, flight in study.flights.iterrows():
+            errors = study.errors(flight)
+            assert errors is not None
+            assert errors.ate_m.rmse == pytest.approx(flight["ate_m"])
+            matched = path / flight["folder"] / "ground_truth_matched.tum"
+            assert len(matched.read_text().splitlines()) - 1 == len(errors.estimate)
+            assert RunFolder.open(path / flight["folder"]).summary["start_s"] == flight["start_s"]
+        assert {row["detector"] for row in results.rows} == {"shi_tomasi", "fast"}
 
     def test_what_is_done_is_not_done_again_unless_something_changed(self, tmp_path, toy):
         _, _, path = run(tmp_path, GRID, toy)
-        before = {task.key: (task.folder / "task.json").stat().st_mtime_ns for task in found(path).tasks}
+        table = (path / "results.jsonl").read_bytes()
         outcome, events, _ = run(tmp_path, GRID, toy)
         assert (outcome.done, outcome.reused, events) == (0, 4, [])
-        assert before == {task.key: (task.folder / "task.json").stat().st_mtime_ns for task in found(path).tasks}
+        assert (path / "results.jsonl").read_bytes() == table
         # A result that does not say what it was made of is not trusted.
-        victim = found(path).tasks[0].folder / "task.json"
-        tree = json.loads(victim.read_text())
-        victim.write_text(json.dumps(tree | {"fingerprint": {**tree["fingerprint"], "code": "another"}}))
+        rows = read_rows(path)
+        victim = next(iter(rows))
+        write_rows(path, {**rows, victim: [{**rows[victim][0], "code": "another"}]})
         assert run(tmp_path, GRID, toy)[0].done == 1
 
     def test_another_suite_does_not_get_the_folder(self, tmp_path, toy):
@@ -132,24 +135,25 @@ class TestSweep:
     def test_a_task_that_fails_once_is_done_the_second_time(self, tmp_path, toy):
         outcome, _, path = run(tmp_path, unreliable(tmp_path, "fail", 1), toy)
         assert (outcome.done, outcome.failed) == (4, {})
-        assert sorted(task.attempts for task in found(path).tasks) == [1, 1, 1, 2]
+        assert sorted(row["attempts"] for row in found(path)) == [1, 1, 1, 2]
 
     def test_a_task_that_fails_twice_is_reported_and_the_others_go_on(self, tmp_path, toy):
         outcome, events, path = run(tmp_path, unreliable(tmp_path, "fail", 9), toy)
         assert outcome.done == 2
         assert len(outcome.failed) == 2
         assert sum(bool(event.error) for event in events) == 2
-        for task in found(path).tasks:
-            assert task.ok == (task.labels.backend == "counting")
-            assert ("fails as it was told to" in task.error) != task.ok
-            assert task.ok or task.attempts == 2
+        for row in found(path):
+            failed = row["status"] == "failed"
+            assert failed == (row["backend"] == "unreliable")
+            assert ("fails as it was told to" in (row["error"] or "")) == failed
+            assert not failed or row["attempts"] == 2
         # What failed is tried again by the next sweep, and nothing else.
         assert run(tmp_path, unreliable(tmp_path, "fail", 9), toy)[0].reused == 2
 
     def test_a_worker_that_is_killed_loses_nothing(self, tmp_path, toy):
         outcome, _, path = run(tmp_path, unreliable(tmp_path, "die", 1), toy)
         assert (outcome.done, outcome.failed) == (4, {})
-        assert sorted(task.attempts for task in found(path).tasks) == [1, 1, 1, 2]
+        assert sorted(row["attempts"] for row in found(path)) == [1, 1, 1, 2]
         undisturbed = run(tmp_path, unreliable(tmp_path, "die", 1), toy, out="again")[2]
         assert estimates(path) == estimates(undisturbed)
 
@@ -157,7 +161,7 @@ class TestSweep:
         outcome, _, path = run(tmp_path, unreliable(tmp_path, "die", 9), toy)
         assert outcome.done == 2
         assert len(outcome.failed) == 2
-        assert {task.error for task in found(path).tasks} == {"", "its worker died, killed or short of memory"}
+        assert {row["error"] for row in found(path)} == {None, "its worker died, killed or short of memory"}
 
     def test_workers_of_a_scheduler_elsewhere_do_it_as_well(self, tmp_path, toy, monkeypatch):
         from distributed import LocalCluster
@@ -172,7 +176,7 @@ class TestSweep:
         assert estimates(path) == estimates(run(tmp_path, GRID, toy, out="local")[2])
 
     def test_a_scheduler_that_is_not_there_is_an_error_in_a_line(self, tmp_path, toy, monkeypatch):
-        monkeypatch.setattr("vioframe.bench.suites.cluster.CONNECT_S", 1.0)
+        monkeypatch.setattr("vioframe.bench.suites.sweep.CONNECT_S", 1.0)
         with pytest.raises(RunError, match="no dask scheduler at tcp://127"):
             run(tmp_path, GRID, toy, scheduler="tcp://127.0.0.1:9")
 
@@ -184,7 +188,7 @@ def test_a_simulated_recording_is_made_once_and_goes_when_it_is_no_longer_needed
     assert (outcome.done, outcome.failed) == (8, {})
     assert sum(not event.is_task for event in events) == 2
     assert not (path / "recordings").exists()
-    assert {task.data for task in found(path).tasks} == {Data.SIMULATED}
+    assert {row["data"] for row in found(path)} == {Data.SIMULATED}
 
 
 @pytest.mark.usefixtures("parts")
@@ -230,9 +234,12 @@ def test_trials_leave_their_nees(tmp_path):
     text = "title: t\nkind: trials\nbackends: [msckf]\nseeds: 2\nsetup: {flight: figure_eight, duration_s: 10.0}\n"
     outcome, _, path = run(tmp_path, text, None)
     assert (outcome.done, outcome.failed) == (2, {})
-    for task in found(path).of(Kind.TRIAL):
-        assert len(task.result["t_s"]) == len(task.result["nees"]["pose"]) > 50
-        assert task.result["trial"]["failure"] is None
+    for row in found(path):
+        nees = (path / row["folder"] / "nees.csv").read_text().splitlines()
+        assert nees[0] == "t_ns,orientation,position,pose"
+        assert len(nees) > 50
+        assert row["failure"] is None
+        assert row["ate_m"] < 1.0
 
 
 @pytest.mark.usefixtures("parts")
@@ -240,12 +247,11 @@ def test_detectors_are_timed_in_turns_in_this_process(tmp_path, toy):
     text = "title: t\nkind: detector_speed\ndetectors: [fast, orb]\nrounds: 1\nimages: 2\n"
     outcome, _, path = run(tmp_path, text, None)
     assert outcome.done == 1
-    (task,) = found(path).of(Kind.DETECTOR_SPEED)
-    assert [row["detector"] for row in task.result["rows"]] == ["fast", "orb"]
-    assert task.result["settings"]["images"] == "drawn surfaces"
+    assert [row["detector"] for row in found(path)] == ["fast", "orb"]
+    assert {row["images"] for row in found(path)} == {"drawn surfaces"}
+    assert run(tmp_path, text, None)[0].reused == 1
     recorded = run(tmp_path, text + "sequences: [TOY]\n", toy, out="recorded")[2]
-    (task,) = found(recorded).of(Kind.DETECTOR_SPEED)
-    assert task.result["settings"]["images"] == "frames of TOY"
+    assert {row["images"] for row in found(recorded)} == {"frames of TOY"}
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no such signals there")
@@ -256,17 +262,16 @@ def test_interrupted_by_ctrl_c_and_called_again_it_gives_what_it_would_have_give
     command = [sys.executable, "-m", "vioframe", "bench", str(file), "--data", str(toy), "--no-report", "--quiet"]
     command += ["--workers", "1", "--out", str(tmp_path / "results")]
     process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, start_new_session=True)
-    tasks = tmp_path / "results" / "tasks"
-    deadline = monotonic() + 120.0
-    while len(list(tasks.glob("[!.]*"))) < 2 and monotonic() < deadline:
+    results, deadline = tmp_path / "results", monotonic() + 120.0
+    while len(read_rows(results)) < 2 and monotonic() < deadline:
         sleep(0.05)
     os.killpg(process.pid, signal.SIGINT)
     stderr = process.communicate(timeout=60)[1]
     assert process.returncode == 130, stderr
     assert stderr.strip().splitlines() == ["vioframe: interrupted"]
-    kept = len(list(tasks.glob("[!.]*")))
+    kept = len(read_rows(results))
     assert 2 <= kept < 8
     finished = subprocess.run(command, capture_output=True, text=True, check=True)
     assert f"{8 - kept} tasks done, {kept} done before" in finished.stdout
     whole = run(tmp_path, file.read_text(), toy, out="whole")[2]
-    assert estimates(tmp_path / "results") == estimates(whole)
+    assert estimates(results) == estimates(whole)

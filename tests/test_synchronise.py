@@ -8,12 +8,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from vioframe.incidents import Incidents
-from vioframe.io.synchronise import synchronise
-from vioframe.types import Frame, ImuSample, ImuSegment, Measurement, Unreadable
+from vioframe.io.synchronise import Packet, synchronise
+from vioframe.types import FrameSet, ImuSample, Measurement, Unreadable
 
 IMU_PERIOD_NS = 5_000_000
 CAMERA_PERIOD_NS = 50_000_000
-IMAGE = np.zeros((2, 2), np.uint8)
+IMAGES = (np.zeros((2, 2), np.uint8),)
 SLOPE = np.array([1.0, -2.0, 3.0])
 
 
@@ -25,17 +25,17 @@ def reading(t_ns: int) -> ImuSample:
 def recording(imu_count: int = 200, frame_count: int = 18, first_frame_ns: int = 12_345_678) -> list[Measurement]:
     """A flawless recording in order of time; frames fall between IMU samples."""
     imu: list[Measurement] = [reading(i * IMU_PERIOD_NS) for i in range(imu_count)]
-    frames: list[Measurement] = [Frame(first_frame_ns + i * CAMERA_PERIOD_NS, IMAGE) for i in range(frame_count)]
+    frames: list[Measurement] = [FrameSet(first_frame_ns + i * CAMERA_PERIOD_NS, IMAGES) for i in range(frame_count)]
     return sorted(imu + frames, key=lambda measurement: measurement.t_ns)
 
 
-def play(measurements: list[Measurement], **options: float) -> tuple[list[tuple[ImuSegment, Frame]], dict[str, int]]:
+def play(measurements: list[Measurement], **options: float) -> tuple[list[Packet], dict[str, int]]:
     incidents = Incidents()
     packets = list(synchronise(iter(measurements), incidents=incidents, **options))
     return packets, dict(incidents.counts)
 
 
-def assert_clean(packets: list[tuple[ImuSegment, Frame]]) -> None:
+def assert_clean(packets: list[Packet]) -> None:
     """What every back-end relies on."""
     if packets:
         imu, frame = packets[0]
@@ -49,7 +49,7 @@ def assert_clean(packets: list[tuple[ImuSegment, Frame]]) -> None:
         assert np.isfinite(imu.accel_B).all()
 
 
-def assert_same(packets: list[tuple[ImuSegment, Frame]], expected: list[tuple[ImuSegment, Frame]]) -> None:
+def assert_same(packets: list[Packet], expected: list[Packet]) -> None:
     assert [frame.t_ns for _, frame in packets] == [frame.t_ns for _, frame in expected]
     for (imu, _), (imu_expected, _) in zip(packets, expected, strict=True):
         np.testing.assert_array_equal(imu.t_ns, imu_expected.t_ns)
@@ -80,7 +80,7 @@ def test_frames_on_imu_stamps_use_those_samples_once() -> None:
 
 def test_camera_faster_than_imu() -> None:
     imu: list[Measurement] = [reading(i * 10_000_000) for i in range(30)]
-    frames: list[Measurement] = [Frame(1_000_000 + i * 3_000_000, IMAGE) for i in range(80)]
+    frames: list[Measurement] = [FrameSet(1_000_000 + i * 3_000_000, IMAGES) for i in range(80)]
     packets, counts = play(sorted(imu + frames, key=lambda measurement: measurement.t_ns))
     assert counts == {}
     assert len(packets) == 80
@@ -107,7 +107,7 @@ def test_start_and_duration_count_from_the_first_frame() -> None:
 
 def test_frames_outside_the_imu_are_dropped_and_counted() -> None:
     imu = [reading(i * IMU_PERIOD_NS) for i in range(20, 100)]
-    frames = [Frame(1_000_000 + i * CAMERA_PERIOD_NS, IMAGE) for i in range(12)]
+    frames = [FrameSet(1_000_000 + i * CAMERA_PERIOD_NS, IMAGES) for i in range(12)]
     packets, counts = play(sorted([*imu, *frames], key=lambda measurement: measurement.t_ns))
     # The IMU runs from 100 ms to 495 ms; frames come at 1, 51, ..., 551 ms.
     assert [frame.t_ns for _, frame in packets] == [1_000_000 + i * CAMERA_PERIOD_NS for i in range(2, 10)]
@@ -167,8 +167,8 @@ def test_one_wild_imu_stamp_harms_nothing_else(stamp_ns: int) -> None:
 
 def test_one_wild_frame_stamp_harms_nothing_else() -> None:
     measurements = recording()
-    measurements.insert(80, Frame(4 * 10**18, IMAGE))
-    measurements.insert(90, Frame(0, IMAGE))
+    measurements.insert(80, FrameSet(4 * 10**18, IMAGES))
+    measurements.insert(90, FrameSet(0, IMAGES))
     packets, counts = play(measurements)
     assert counts == {"frame_after_imu": 1, "frame_out_of_order": 2}
     assert_same(packets, play(recording())[0])
@@ -176,7 +176,7 @@ def test_one_wild_frame_stamp_harms_nothing_else() -> None:
 
 def test_an_imu_gap_is_counted_once_and_shown_in_each_segment() -> None:
     gap = range(60 * IMU_PERIOD_NS, 90 * IMU_PERIOD_NS)
-    measurements = [m for m in recording() if isinstance(m, Frame) or m.t_ns not in gap]
+    measurements = [m for m in recording() if isinstance(m, FrameSet) or m.t_ns not in gap]
     packets, counts = play(measurements)
     assert counts == {"imu_gap": 1}
     assert len(packets) == 18
@@ -188,7 +188,7 @@ def test_an_imu_gap_is_counted_once_and_shown_in_each_segment() -> None:
 
 
 def test_a_camera_gap_is_counted_and_its_segment_is_complete() -> None:
-    frames = [m for m in recording() if isinstance(m, Frame)]
+    frames = [m for m in recording() if isinstance(m, FrameSet)]
     packets, counts = play([m for m in recording() if m not in frames[8:12]])
     assert counts == {"camera_gap": 1}
     assert len(packets) == 14
@@ -198,7 +198,7 @@ def test_a_camera_gap_is_counted_and_its_segment_is_complete() -> None:
 
 def test_frames_do_not_pile_up_behind_a_silent_imu() -> None:
     imu = [reading(i * IMU_PERIOD_NS) for i in range(20)]
-    frames = [Frame(1_000_000 + i * CAMERA_PERIOD_NS, IMAGE) for i in range(302)]
+    frames = [FrameSet(1_000_000 + i * CAMERA_PERIOD_NS, IMAGES) for i in range(302)]
     packets, counts = play(sorted([*imu, *frames], key=lambda measurement: measurement.t_ns))
     assert len(packets) == 2
     assert counts == {"frame_without_imu": 100, "frame_after_imu": 200}
@@ -213,7 +213,7 @@ def test_what_the_reader_could_not_read_is_counted() -> None:
 
 
 def test_it_streams() -> None:
-    """A frame is released as soon as ten IMU samples follow it, not when the recording ends."""
+    """A frame is released by the second reading from 50 ms behind it, not when the recording ends."""
     measurements = recording()
     taken = 0
 
@@ -223,7 +223,7 @@ def test_it_streams() -> None:
             yield measurement
 
     next(synchronise(source(), incidents=Incidents()))
-    assert taken == 3 + 1 + 10
+    assert measurements[taken - 1].t_ns == 14 * IMU_PERIOD_NS  # the second from 62.3 ms on
 
 
 @st.composite
@@ -258,7 +258,7 @@ def test_any_input_gives_clean_segments_and_every_frame_is_accounted_for(stream:
     for t_ms, kind in stream:
         t_ns = t_ms * 1_000_000
         if kind == "frame":
-            measurements.append(Frame(t_ns, IMAGE))
+            measurements.append(FrameSet(t_ns, IMAGES))
         else:
             measurements.append(ImuSample(t_ns, np.full(3, np.nan), np.zeros(3)) if kind == "nan" else reading(t_ns))
     packets, counts = play(measurements)

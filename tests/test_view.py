@@ -51,7 +51,7 @@ def run(tmp_path_factory, landmarks):
     cov = np.tile(np.diag([1e-4] * 3 + [SIGMA_M**2] * 3), (len(truth), 1, 1))
     estimate = moved(truth, *YAW_M)
     write_run(folder, Trajectory(estimate.t_ns, estimate.R_WB, estimate.p_WB, cov), truth)
-    write_ply(folder / "map.ply", {10 * i: YAW_M[0] @ p + YAW_M[1] for i, p in enumerate(landmarks)})
+    write_ply(folder / "map.ply", 10 * np.arange(len(landmarks)), landmarks @ YAW_M[0].T + YAW_M[1])
     write_calibration(packaged_calibration("euroc"), folder / "calibration")
     return folder
 

@@ -1,14 +1,17 @@
 """Flights made up for the tests of trajectories, metrics and plots."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
+from vioframe.bench import BackendRun
 from vioframe.geometry import so3
 from vioframe.geometry.trajectory import Trajectory
 from vioframe.incidents import Incidents
 from vioframe.io.trajectories import write_tum
 from vioframe.runs.recorder import Recorder, new_run_folder
+from vioframe.simulation import TrackSequence
 from vioframe.types import Estimate, FrameSet, FrameTracks, NavState, Status, Step
 
 BEGIN_NS = 1_403_636_579_763_555_584
@@ -78,3 +81,9 @@ def _state(estimate: Trajectory, k: int) -> NavState:
         cov[:6, :6] = estimate.cov_pose[k]
     zero = np.zeros(3)
     return NavState(int(estimate.t_ns[k]), estimate.R_WB[k], estimate.p_WB[k], zero, zero, zero, cov)
+
+
+def run_of(sequence: TrackSequence, estimates: Sequence[Estimate]) -> BackendRun:
+    """The run of a back-end that says ``estimates``, one a packet, and takes a second for each."""
+    t_ns = tuple(tracks.t_ns for _, tracks in sequence.packets[: len(estimates)])
+    return BackendRun(t_ns, tuple(estimates), np.ones(len(t_ns)), np.ones(len(t_ns)))

@@ -94,26 +94,32 @@ class Odometry:
         return [self._step(imu, frames) for imu, frames in self._synchroniser.add(measurement)]
 
     def add_imu(self, t_ns: ArrayLike, gyro_B: ArrayLike, accel_B: ArrayLike) -> list[Step]:
-        """Take readings at ``t_ns`` (N,) of the IMU's clock: (N, 3) rad/s and (N, 3) m/s^2; or a single one."""
+        """Take readings at ``t_ns`` (N,) of the IMU's clock: (N, 3) rad/s and (N, 3) m/s^2; or a single one.
+
+        They are copied: the arrays may be filled anew.
+        """
         stamps = np.atleast_1d(np.asarray(t_ns, np.int64))
-        gyro, accel = (np.asarray(a, np.float64).reshape(-1, 3) for a in (gyro_B, accel_B))
+        gyro, accel = (np.array(a, np.float64).reshape(-1, 3) for a in (gyro_B, accel_B))
         if not len(stamps) == len(gyro) == len(accel):
             raise DatasetError(f"{len(stamps)} stamps came with {len(gyro)} and {len(accel)} readings; give one each")
         samples = (ImuSample(*reading) for reading in zip(stamps.tolist(), gyro, accel, strict=True))
         return [step for sample in samples for step in self.add(sample)]
 
     def add_images(self, t_ns: int, *images: Image | None) -> list[Step]:
-        """Take the images of one exposure at ``t_ns`` of the camera's clock, (H, W) uint8, in the order of the rig."""
+        """Take the images of one exposure at ``t_ns`` of the camera's clock, (H, W) uint8, in the order of the rig.
+
+        They are copied: a camera may fill its buffer anew while its frame waits for readings.
+        """
         if len(images) != len(self.calibration.cameras) or all(image is None for image in images):
             raise DatasetError(f"{len(images)} images came for a rig of {len(self.calibration.cameras)} cameras")
-        return self.add(FrameSet(int(t_ns), images))
+        return self.add(FrameSet(int(t_ns), tuple(None if image is None else _own(image) for image in images)))
 
     def add_tracks(self, tracks: FrameTracks, images: tuple[Image | None, ...] = ()) -> list[Step]:
         """Take a frame whose points somebody else has tracked, in the place of its images; detector and tracker rest.
 
         ``images`` are passed on to the consumers of the step, such as a loop closer.
         """
-        self._waiting_tracks[tracks.t_ns] = tracks
+        self._waiting_tracks.setdefault(tracks.t_ns, tracks)  # of two frames of one stamp the first counts
         return self.add(FrameSet(tracks.t_ns, images))
 
     def finish(self) -> list[Step]:
@@ -129,6 +135,8 @@ class Odometry:
     def _step(self, imu: ImuSegment, frames: FrameSet) -> Step:
         with limited_threads(), self._registry.blaming():
             tracks = self._waiting_tracks.pop(frames.t_ns, None)
+            # Those before it belong to frames that were dropped.
+            self._waiting_tracks = {t_ns: kept for t_ns, kept in self._waiting_tracks.items() if t_ns > frames.t_ns}
             seconds: Mapping[str, float] = {}
             if tracks is None:
                 tracks = self._frontend.track(imu, frames, self.calibration)
@@ -140,6 +148,12 @@ class Odometry:
             self.calibration = estimate.calibration.calibration
         within = {f"backend.{stage}": seconds for stage, seconds in estimate.stage_seconds.items()}
         return Step(frames, tracks, estimate, {**seconds, "backend": backend_s, **within})
+
+
+def _own(image: Image) -> Image:
+    copy = np.array(image)
+    copy.flags.writeable = False
+    return copy
 
 
 @contextmanager

@@ -17,7 +17,6 @@ def superpoint(
         Path, "superpoint_v1.pth; github.com/magicleap/SuperPointPretrainedNetwork has it, under its own licence"
     ],
     threshold: Annotated[float, "smallest probability of a keypoint kept; lower finds more"] = 0.015,
-    nms_radius_px: Annotated[NonNegativeInt, "no two keypoints are this near or nearer, in both x and y"] = 4,
     border_px: Annotated[NonNegativeInt, "width of the border without keypoints"] = 4,
     device: Annotated[Literal["auto", "cpu", "cuda"], "auto: a GPU where there is one"] = "auto",
     descriptors: Annotated[bool, "also compute the 256-vectors, which tracking does not use"] = False,
@@ -34,7 +33,6 @@ def superpoint(
     return SuperPoint(
         weights,
         threshold=threshold,
-        nms_radius_px=nms_radius_px,
         border_px=border_px,
         device=device,
         descriptors=descriptors,

@@ -14,13 +14,14 @@ from vioframe.types import Image, Keypoints
 from vioframe_superpoint.network import CELL_PX, load
 from vioframe_superpoint.suppression import local_maxima
 
+_NMS_RADIUS_PX = 4
+"""No two keypoints are this near or nearer, in both x and y: as in the authors' demo."""
+
 
 class SuperPoint:
     """See :func:`vioframe_superpoint.superpoint` for the options."""
 
-    def __init__(
-        self, weights: Path, *, threshold: float, nms_radius_px: int, border_px: int, device: str, descriptors: bool
-    ) -> None:
+    def __init__(self, weights: Path, *, threshold: float, border_px: int, device: str, descriptors: bool) -> None:
         if device == "auto":
             device = "cuda" if torch.cuda.is_available() else "cpu"
         elif device == "cuda" and not torch.cuda.is_available():
@@ -29,7 +30,6 @@ class SuperPoint:
         network = load(weights).to(self._device)
         self._network = network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         self._threshold = threshold
-        self._nms_radius_px = nms_radius_px
         self._border_px = border_px
         self._descriptors = descriptors
 
@@ -39,7 +39,7 @@ class SuperPoint:
         height, width = image.shape
         encoded = self._network.encode(self._to_input(image))
         probability = self._network.probability(encoded)[0, :height, :width].cpu().numpy()
-        xy, score = local_maxima(probability, self._threshold, self._nms_radius_px, self._border_px, max_points)
+        xy, score = local_maxima(probability, self._threshold, _NMS_RADIUS_PX, self._border_px, max_points)
         descriptors = None
         if self._descriptors:
             places = torch.from_numpy(xy)[None].to(self._device)

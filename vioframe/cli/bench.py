@@ -8,8 +8,8 @@ from vioframe.cli.lazy import LazyGroup
 
 _COMMANDS = {
     "detectors": "Detectors by speed, by quality, or by the tracks made of them.",
-    "detector_fps": "Suite: frames a second of all detectors (Table 3.2).",
-    "mh05_comparison": "Suite: KeypointNet and Shi-Tomasi on MH_05_difficult (Figures 3.9-3.14).",
+    "detector_fps": "Suite: frames a second of all detectors.",
+    "mh05_comparison": "Suite: KeypointNet and Shi-Tomasi on MH_05_difficult.",
     "euroc": "Suite: all eleven sequences, beside what is published.",
     "stress": "Suite: detectors and back-ends under hard conditions.",
     "consistency": "Suite: NEES of the back-ends.",

@@ -9,7 +9,7 @@ import click
 
 if TYPE_CHECKING:
     from vioframe.bench.suites.suite import Suite
-    from vioframe.bench.suites.sweep import Agenda, Event, Outcome
+    from vioframe.bench.suites.sweep import Agenda, Event, Tally
 
 EXIT_FAILED = 1
 """Some task came to nothing; the others, and the report, are there."""
@@ -78,13 +78,13 @@ def _run(
         if left.stale:
             click.echo(f"note: {left.stale} results are of other code or data, and are made again", err=True)
         with _Watch(left, quiet) as watch:
-            outcome = sweep(left, store, workers=_workers(suite, workers), scheduler=scheduler, on_event=watch)
-    _say(outcome, store.path)
+            tally = sweep(left, store, workers=_workers(suite, workers), scheduler=scheduler, on_event=watch)
+    _say(tally, store.path)
     if not no_report:
         from vioframe.cli.report import write_and_say
 
         write_and_say(store.path)
-    if outcome.failed:
+    if tally.failed:
         click.get_current_context().exit(EXIT_FAILED)
 
 
@@ -118,7 +118,7 @@ class _Watch:
         self._progress = Progress(
             *columns, TimeRemainingColumn(elapsed_when_finished=True), console=Console(stderr=True), disable=quiet
         )
-        self._tasks, self._done, self._failed = len(left.jobs), 0, 0
+        self._tasks, self._done, self._failed = len(left.tasks), 0, 0
         reused = f", {left.reused} done before" if left.reused else ""
         self._bar = self._progress.add_task("", total=left.cost_s, what=f"{self._tasks} tasks{reused}")
 
@@ -138,9 +138,9 @@ class _Watch:
         self._progress.update(self._bar, advance=event.cost_s, what=what)
 
 
-def _say(outcome: Outcome, path: Path) -> None:
-    before = f", {outcome.reused} done before" if outcome.reused else ""
-    failed = f", {len(outcome.failed)} failed" if outcome.failed else ""
-    click.echo(f"{outcome.done} tasks done{before}{failed}; results in {path}")
-    for key, error in outcome.failed.items():
+def _say(tally: Tally, path: Path) -> None:
+    before = f", {tally.reused} done before" if tally.reused else ""
+    failed = f", {len(tally.failed)} failed" if tally.failed else ""
+    click.echo(f"{tally.done} tasks done{before}{failed}; results in {path}")
+    for key, error in tally.failed.items():
         click.echo(f"failed: {key}: {error}", err=True)

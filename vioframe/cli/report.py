@@ -13,7 +13,7 @@ _FILE = click.Path(path_type=Path)
 @click.command("report")
 @click.argument("results", type=_FILE)
 @click.option("--out", type=_FILE, help="Folder for the report; an older one is replaced.  [default: RESULTS/report]")
-@click.option("--no-page", is_flag=True, help="Tables and figures alone, which need no extra.")
+@click.option("--no-page", is_flag=True, help="Tables and figures alone.")
 def command(results: Path, out: Path | None, no_page: bool) -> None:
     """Write what RESULTS, the folder of a `vioframe bench SUITE`, amounts to.
 
@@ -26,7 +26,7 @@ def command(results: Path, out: Path | None, no_page: bool) -> None:
 def write_and_say(results: Path, out: Path | None = None, *, page: bool = True) -> None:
     """Write the report, and say what was written."""
     from vioframe.report.suite.report import write_report
-    from vioframe.report.suite.results import load_results
+    from vioframe.runs.results import load_results
 
     written = write_report(load_results(results), out, page=page)
     counts = Counter((path.parent.as_posix(), path.suffix[1:]) for path in written.files if path.parent != Path())

@@ -5,6 +5,7 @@ A back-end is its mathematics and nothing else: how it begins from a state, and 
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
@@ -67,6 +68,7 @@ class LifeCycle:
         self._last: NavState | None = None
         self._corrected_ns = 0
         self._known = CalibrationEstimate(calibration, (_prior(None),))
+        self._imu_noise = calibration.imu
 
     def process(self, imu: ImuSegment, tracks: FrameTracks) -> Estimate:
         """Begin, or follow one frame; where that fails it says so, and begins anew from where it was."""
@@ -81,14 +83,17 @@ class LifeCycle:
             self._check(estimate, tracks.t_ns)
         except (DivergedError, np.linalg.LinAlgError) as error:
             return self._lose(str(error))
-        self._last = estimate.state
-        if estimate.calibration is None:
-            return replace(estimate, calibration=self._known)
-        return estimate
+        if estimate.status is Status.LOST:
+            self._begin_anew()
+        if estimate.state is not None:
+            self._last = estimate.state
+        return replace(estimate, calibration=self._learned(estimate.calibration or self._known))
 
     def _begin(self, imu: ImuSegment, tracks: FrameTracks) -> Estimate:
         if self._initial_state is not None:
             state, self._initial_state = self._initial_state, None
+            if state.t_ns != tracks.t_ns:
+                raise ConfigError(f"the initial state is of {state.t_ns} ns, the first frame of {tracks.t_ns} ns")
             return self._begun(self._start(state, imu, tracks), Stopwatch(), "state given")
         watch = Stopwatch()
         initial = self._initializer.add(imu, tracks)
@@ -112,7 +117,7 @@ class LifeCycle:
         return Estimate(
             Status.TRACKING,
             start.state,
-            calibration=start.calibration,
+            calibration=self._learned(start.calibration),
             events=tuple(events),
             stage_seconds=watch.seconds,
         )
@@ -135,10 +140,17 @@ class LifeCycle:
         if blind_s > self._options.max_blind_s:
             raise DivergedError(f"nothing usable was seen for {blind_s:.1f} s")
 
+    def _learned(self, estimate: CalibrationEstimate) -> CalibrationEstimate:
+        """``estimate`` with the IMU's noise as it was given: what is assumed in flight was not learned."""
+        return replace(estimate, calibration=replace(estimate.calibration, imu=self._imu_noise))
+
     def _lose(self, why: str) -> Estimate:
+        self._begin_anew()
+        return Estimate(Status.LOST, events=(f"lost: {why}",))
+
+    def _begin_anew(self) -> None:
         self._following = False
         self._initializer.reset()
-        return Estimate(Status.LOST, events=(f"lost: {why}",))
 
 
 def _prior(rotation_cov: Float | None) -> CameraSigma:
@@ -152,9 +164,16 @@ def warm_up(backend: Backend, calibration: Calibration) -> None:
     """Fly ``backend``, which is of no use afterwards, sideways along a wall of points that come and go.
 
     Long enough to come through every step of a window of some ten frames once, so that all compiled code is there, or
-    loaded from the cache, before the first frame of a flight.
+    loaded from the cache, before the first frame of a flight. A back-end may find this flight too odd to follow.
     """
     initialization.warm_up(calibration)
+    if not calibration.cameras[0].rotation_known:
+        calibration = calibration.with_camera(0, R_BC=np.eye(3), rotation_known=True)
+    with suppress(DivergedError, np.linalg.LinAlgError):
+        _fly_along_a_wall(backend, calibration)
+
+
+def _fly_along_a_wall(backend: Backend, calibration: Calibration) -> None:
     camera = calibration.cameras[0]
     right_W = camera.R_BC[:, 0]
     rng = np.random.default_rng(0)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from vioframe.types import Estimate, NavState, Status
+from vioframe.types import CalibrationEstimate, Estimate, NavState, Status
 
 _ORTHONORMAL = 1e-9
 _RELATIVE_SYMMETRY = 1e-9
@@ -17,42 +17,52 @@ def defect_of(estimate: object, t_ns: int) -> str | None:
         return f"it returned a {type(estimate).__name__}, not an Estimate"
     if not isinstance(estimate.status, Status):
         return f"its status is {estimate.status!r}, not a Status"
-    m = len(estimate.landmark_ids)
-    if estimate.p_WF.shape != (m, 3):
-        return f"p_WF has the shape {estimate.p_WF.shape} for {m} landmarks"
-    if len(set(estimate.landmark_ids.tolist())) != m:
+    ids = estimate.landmark_ids
+    if not isinstance(ids, np.ndarray) or ids.ndim != 1 or ids.dtype.kind not in "iu":
+        return "landmark_ids are not an array (M,) of integers"
+    if len(set(ids.tolist())) != len(ids):
         return "landmark_ids repeat"
-    if not np.isfinite(estimate.p_WF).all():
-        return "p_WF is not finite"
+    if (defect := _defect_of_array("p_WF", estimate.p_WF, (len(ids), 3))) is not None:
+        return defect
     if any(seconds < 0.0 for seconds in estimate.stage_seconds.values()):
         return "stage_seconds are negative"
+    if not isinstance(estimate.calibration, CalibrationEstimate | None):
+        return f"its calibration is a {type(estimate.calibration).__name__}, not a CalibrationEstimate"
     if estimate.state is None:
         return "it tracks without a state" if estimate.status is Status.TRACKING else None
     return _defect_of_state(estimate.state, t_ns)
 
 
-def _defect_of_state(state: NavState, t_ns: int) -> str | None:
+def _defect_of_state(state: object, t_ns: int) -> str | None:
+    if not isinstance(state, NavState):
+        return f"its state is a {type(state).__name__}, not a NavState"
     if state.t_ns != t_ns:
         return f"its state is of {state.t_ns} ns, the frame of {t_ns} ns"
     for name, shape in _SHAPES.items():
-        array = getattr(state, name)
-        if array.shape != shape:
-            return f"{name} has the shape {array.shape}, expected {shape}"
-        if not np.isfinite(array).all():
-            return f"{name} is not finite"
+        if (defect := _defect_of_array(name, getattr(state, name), shape)) is not None:
+            return defect
     R_WB = state.R_WB
     if np.abs(R_WB @ R_WB.T - np.eye(3)).max() > _ORTHONORMAL or np.linalg.det(R_WB) < 0.0:
         return "R_WB is not a rotation"
-    if state.cov is None:
-        return None
-    if state.cov.shape != (15, 15):
-        return f"cov has the shape {state.cov.shape}, expected (15, 15)"
-    if not np.isfinite(state.cov).all():
-        return "cov is not finite"
-    tolerance = _RELATIVE_SYMMETRY * np.abs(state.cov).max()
-    if np.abs(state.cov - state.cov.T).max() > tolerance:
+    return None if state.cov is None else _defect_of_covariance(state.cov)
+
+
+def _defect_of_covariance(cov: object) -> str | None:
+    if (defect := _defect_of_array("cov", cov, (15, 15))) is not None:
+        return defect
+    assert isinstance(cov, np.ndarray)
+    tolerance = _RELATIVE_SYMMETRY * np.abs(cov).max()
+    if np.abs(cov - cov.T).max() > tolerance:
         return "cov is not symmetric"
-    smallest = np.linalg.eigvalsh(state.cov)[0]
+    smallest = np.linalg.eigvalsh(cov)[0]
     if smallest < -tolerance:
         return f"cov has the eigenvalue {smallest:.2e}"
     return None
+
+
+def _defect_of_array(name: str, array: object, shape: tuple[int, ...]) -> str | None:
+    if not isinstance(array, np.ndarray) or array.dtype.kind not in "fiu":
+        return f"{name} is no array of numbers"
+    if array.shape != shape:
+        return f"{name} has the shape {array.shape}, expected {shape}"
+    return None if np.isfinite(array).all() else f"{name} is not finite"

@@ -62,7 +62,7 @@ class Frontend:
         assert raw is not None  # a camera that brings nothing comes in no set of its own
         self._check(raw)
         watch = Stopwatch()
-        image = equalise(raw, self._options.equalisation)
+        image = equalise(raw, self._options.equalisation).view()
         image.flags.writeable = False  # the detector is anybody's code
         watch.lap("equalise")
         if np.std(raw[::4, ::4]) < _FEATURELESS:

@@ -12,7 +12,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict
 from io import StringIO
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, get_args
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from pydantic_core import to_jsonable_python
@@ -274,7 +274,9 @@ def _parse_value(option: Option, text: str) -> Any:
 
 def _keys_beside(model: Any, location: tuple[int | str, ...]) -> list[str]:
     for key in location[:-1]:
-        model = model.model_fields[key].annotation
+        if key in model.model_fields:  # else it is a place in a list or table of the model
+            found = model.model_fields[key].annotation
+            model = next((each for each in (found, *get_args(found)) if hasattr(each, "model_fields")), model)
     return list(model.model_fields)
 
 

@@ -20,7 +20,7 @@ class TrainingOptions:
     width: PositiveFloat = 1.0
     """Factor on the channels of every layer."""
     dropout: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.2
-    """Of whole channels; small networks, which have none to spare, do better with 0."""
+    """Of whole channels, as published; the weights that ship were trained with 0: small networks have none to spare."""
     seed: NonNegativeInt = 0
     """Of the initial weights, the views and their order."""
     size: tuple[int, int] = (320, 240)
@@ -35,10 +35,12 @@ class TrainingOptions:
     """Leave the detector as it is and train what only descriptors need; with --finetune."""
     halve_at: tuple[int, ...] = (40,)
     """Epochs after which the learning rate is halved."""
-    epoch_samples: PositiveInt | None = None
+    epoch_samples: int | None = None
     """Pairs an epoch; null: each image once."""
     learning_rate: PositiveFloat = 1e-3
     """Of Adam; 1e-4 is usual for fine-tuning."""
+    photometric_probability: Annotated[float, Field(ge=0.0, le=1.0)] = 0.5
+    """Of each effect of light, lens and sensor on a view; the weights that ship were trained with 0.25."""
     frames_per_recording: PositiveInt = 200
     """Images taken, evenly, from each recording."""
     device: Literal["auto", "cpu", "cuda"] = "auto"

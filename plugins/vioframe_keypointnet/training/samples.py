@@ -39,8 +39,6 @@ _PERSPECTIVE = 0.2
 _ROTATION_DEG = 45.0
 _SCALE = (0.9, 1.1)
 
-_DISTURBED = 0.5
-"""Probability of each of the effects that follow."""
 _EXPOSURE = (0.3, 2.0)
 """Factor, after which the image saturates."""
 _GAMMA = (0.5, 2.0)
@@ -196,8 +194,8 @@ def pair(picture: Picture, options: TrainingOptions, number: int, *, corners_tau
     between = second @ np.linalg.inv(first)
     points = corners(grey_of(shrunk)) if corners_taught else np.empty((0, 3))
     return Pair(
-        disturbed(_view(shrunk, first, options.size), rng),
-        disturbed(_view(shrunk, second, options.size), rng),
+        disturbed(_view(shrunk, first, options.size), rng, options.photometric_probability),
+        disturbed(_view(shrunk, second, options.size), rng, options.photometric_probability),
         between / between[2, 2],
         lesson(points, first, options.size),
         lesson(points, second, options.size),
@@ -237,12 +235,12 @@ def _rotation(rng: np.random.Generator, most_deg: float) -> Float:
     return np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
 
 
-def disturbed(view: View, rng: np.random.Generator) -> View:
-    """A copy of ``view`` in other light: exposure, gamma, contrast, brightness, blur and noise, at random."""
+def disturbed(view: View, rng: np.random.Generator, probability: float) -> View:
+    """A copy of ``view`` in other light: exposure, gamma, contrast, brightness, blur and noise, each at times."""
     import cv2
 
     def happens() -> bool:
-        return bool(rng.random() < _DISTURBED)
+        return bool(rng.random() < probability)
 
     out = view.astype(np.float32)
     if happens():

@@ -60,7 +60,7 @@ def everyone(installed: Registry, question: str) -> list[str]:
 def parse_entrants(specs: Sequence[str], assignments: Sequence[str], installed: Registry) -> list[Entrant]:
     """An entrant for each of ``specs``.
 
-    A spec is a name, or a name with options of its own: ``sift:contrast_threshold=0.01,edge_threshold=12``.
+    A spec is a name, or a name with options of its own: ``orb:levels=4,fast_threshold=10``.
     ``assignments``, texts such as ``sift.contrast_threshold=0.01``, go to every entrant of that name; the name may be
     left out where only one has such an option. Raises :class:`ConfigError` or :class:`PluginError`.
     """

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
@@ -11,30 +9,26 @@ from pathlib import Path
 from typing import Any
 
 from vioframe.bench.montecarlo import Setup
-from vioframe.bench.suites import sources
-from vioframe.bench.suites.code import code_version
-from vioframe.bench.suites.sources import Flown
-from vioframe.bench.suites.suite import SEED_SHIFT_S, BackendContender, Contender, Suite, montecarlo_setup
+from vioframe.bench.suites import fingerprints, sources
+from vioframe.bench.suites.suite import SEED_SHIFT_S, NamedPart, Suite, montecarlo_setup
 from vioframe.errors import ConfigError, DatasetError
 from vioframe.estimation.lifecycle import warm_up
 from vioframe.io.calibration import packaged_calibration
 from vioframe.parts import config as configuration
 from vioframe.parts.config import Config, DatasetConfig, PartConfig
 from vioframe.parts.registry import BACKEND, DETECTOR, Registry
-from vioframe.report.suite.results import Data, Kind, Labels
 from vioframe.runs.metrics import create_metrics
+from vioframe.runs.results import CLEAR, Data
 from vioframe.simulation.config import SimulationConfig
 from vioframe.simulation.flights import flight as named_flight
-
-CLEAR = "clear"
 
 # About how long things take on one core, for the time that is left: a frame to render, to fly, and a second of a trial.
 _RENDER_S, _FLY_S, _TRIAL_S = 0.2, 0.02, 0.35
 
 
 @dataclass(frozen=True, slots=True)
-class RecordingJob:
-    """A recording to be simulated, at ``name`` in the folder of recordings."""
+class Recording:
+    """A recording to be simulated, called ``name`` in the folder of recordings."""
 
     name: str
     config: SimulationConfig
@@ -42,47 +36,45 @@ class RecordingJob:
 
 
 @dataclass(frozen=True, slots=True)
-class Job:
-    """A task. ``fingerprint`` says what its result depends on: code, config and data."""
+class Task:
+    """``about`` are the columns of its rows that are known beforehand, the fingerprint among them."""
 
-    key: str
-    kind: Kind
-    labels: Labels | None
-    data: Data | None
-    note: str
-    fingerprint: Mapping[str, str]
+    about: Mapping[str, Any]
     cost_s: float
+
+    @property
+    def name(self) -> str:
+        return str(self.about["task"])
 
 
 @dataclass(frozen=True, slots=True)
-class FlightJob(Job):
-    """A flight; its data set's path is that of ``recording`` where there is one."""
+class FlightTask(Task):
+    """A detector and a back-end on a data set, whose path is that of ``recording`` where there is one."""
 
     config: Config
-    recording: RecordingJob | None
+    recording: Recording | None
     metrics: tuple[str, ...]
 
 
 @dataclass(frozen=True, slots=True)
-class TrialJob(Job):
+class TrialTask(Task):
     """A back-end on simulated tracks."""
 
     setup: Setup
-    contender: PartConfig
-    seed: int
+    backend: PartConfig
 
 
 @dataclass(frozen=True, slots=True)
-class SpeedJob(Job):
+class SpeedTask(Task):
     """All detectors timed in turns, on so many ``images`` of ``recording``, or on drawn surfaces."""
 
-    detectors: tuple[Contender, ...]
+    detectors: tuple[NamedPart, ...]
     rounds: int
     images: int
     recording: Path | None
 
 
-AnyJob = FlightJob | TrialJob | SpeedJob
+AnyTask = FlightTask | TrialTask | SpeedTask
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,25 +82,22 @@ class Plan:
     """All tasks of ``suite``."""
 
     suite: Suite
-    jobs: tuple[AnyJob, ...]
+    tasks: tuple[AnyTask, ...]
 
 
 def plan(suite: Suite, folders: Sequence[Path], installed: Registry) -> Plan:
     """Raises :class:`vioframe.errors.VioframeError` for all that can be told before the first task."""
-    jobs: Iterable[AnyJob]
-    if suite.kind == "flights":
-        _create(suite, installed)
-        jobs = _flights(suite, folders, installed)
-    elif suite.kind == "trials":
-        _create(suite, installed)
-        jobs = _trials(suite, installed)
+    tasks: Iterable[AnyTask]
+    if suite.kind == "detector_speed":
+        tasks = [_speed(suite, folders, installed)]
     else:
-        jobs = [_speed(suite, folders, installed)]
-    by_key: dict[str, AnyJob] = {}
-    for job in jobs:
-        if by_key.setdefault(job.key, job) is not job:
-            raise ConfigError(f"two tasks of {suite.name} would be called {job.key}; give their parts other labels")
-    return Plan(suite, tuple(by_key.values()))
+        _create(suite, installed)
+        tasks = _flights(suite, folders, installed) if suite.kind == "flights" else _trials(suite, installed)
+    by_name: dict[str, AnyTask] = {}
+    for task in tasks:
+        if by_name.setdefault(task.name, task) is not task:
+            raise ConfigError(f"two tasks of {suite.name} would be called {task.name}; give their parts other labels")
+    return Plan(suite, tuple(by_name.values()))
 
 
 def _create(suite: Suite, installed: Registry) -> None:
@@ -118,19 +107,17 @@ def _create(suite: Suite, installed: Registry) -> None:
         installed.create_detector(detector.name, detector.options)
     for backend in suite.backends:
         warm_up(installed.create_backend(backend.name, backend.options), calibration)
-        if backend.loop_closure is not None:
-            closer = backend.loop_closure
+        if (closer := backend.loop_closure) is not None:
             installed.create_loop_closer(closer.name, calibration, closer.options)
 
 
-def _flights(suite: Suite, folders: Sequence[Path], installed: Registry) -> Iterator[FlightJob]:
-    code = code_version(installed)
+def _flights(suite: Suite, folders: Sequence[Path], installed: Registry) -> Iterator[FlightTask]:
+    code = fingerprints.of_code(installed)
     conditions = [(CLEAR, 0.0)] if suite.clear else []
     conditions += [(name, level) for name, levels in suite.conditions.items() for level in levels]
     found = {each.name: sources.find_source(each.name, folders, installed) for each in suite.sequences}
     create_metrics(suite.metrics, installed)  # says what is wrong with one before anything is flown
     for sequence, (condition, level), seed in product(suite.sequences, conditions, range(suite.seeds)):
-        shift_s = SEED_SHIFT_S * seed if suite.seeds_vary == "start" else 0.0
         flown = sources.flown(
             found[sequence.name],
             start_s=sequence.start_s,
@@ -140,124 +127,98 @@ def _flights(suite: Suite, folders: Sequence[Path], installed: Registry) -> Iter
             seed=seed if suite.seeds_vary == "recording" else 0,
             installed=installed,
         )
-        if flown.simulated is None and suite.seeds_vary == "recording":
-            shift_s = SEED_SHIFT_S * seed  # what was recorded stays as it is
-        data = sources.fingerprint(flown)
-        recording = None if flown.simulated is None else _recording(sequence.name, flown.simulated, data, code)
+        # What was recorded stays as it is, so that it can only be started later.
+        later = suite.seeds_vary == "start" or flown.simulated is None
+        recording = None if flown.simulated is None else _recording(sequence.name, flown.simulated, flown.digest, code)
         seconds = sequence.duration_s or (flown.simulated.duration_s if flown.simulated else None) or 100.0
         for detector, backend in product(suite.detectors, suite.backends):
-            config = _config(suite, detector, backend, flown, shift_s, sequence.duration_s, installed)
-            labels = Labels(sequence.name, condition, level, detector.called, backend.called, seed)
-            yield FlightJob(
-                _key(labels),
-                Kind.FLIGHT,
-                labels,
-                flown.data,
-                flown.note,
-                {"code": code, "config": _config_digest(config, suite.metrics), "data": data},
-                _FLY_S * 20.0 * seconds,
-                config,
-                recording,
-                suite.metrics,
+            config = Config(
+                dataset=DatasetConfig(path=flown.recording),
+                detector=PartConfig(name=detector.name, options=detector.options),
+                backend=PartConfig(name=backend.name, options=backend.options),
+                loop_closure=backend.loop_closure,
+                frontend=suite.frontend,
+                ground_truth=flown.ground_truth,
+                start_s=flown.start_s + (SEED_SHIFT_S * seed if later else 0.0),
+                duration_s=sequence.duration_s,
             )
+            config = configuration.complete(config, installed)
+            nowhere = config.dataset.model_copy(update={"path": None})  # where the data lie says nothing about them
+            plain = config.model_copy(update={"dataset": nowhere, "ground_truth": None}).model_dump(mode="json")
+            about = _about(
+                *("flight", flown.data, sequence.name, condition, level, detector.called, backend.called, seed),
+                note=flown.note,
+                code=code,
+                config=fingerprints.of_values(plain, list(suite.metrics)),
+                inputs=flown.digest,
+            )
+            yield FlightTask(about, _FLY_S * 20.0 * seconds, config, recording, suite.metrics)
 
 
-def _config(
-    suite: Suite,
-    detector: Contender,
-    backend: BackendContender,
-    flown: Flown,
-    shift_s: float,
-    duration_s: float | None,
-    installed: Registry,
-) -> Config:
-    config = Config(
-        dataset=DatasetConfig(path=flown.recording),
-        detector=PartConfig(name=detector.name, options=detector.options),
-        backend=PartConfig(name=backend.name, options=backend.options),
-        loop_closure=backend.loop_closure,
-        frontend=suite.frontend,
-        ground_truth=flown.ground_truth,
-        start_s=flown.start_s + shift_s,
-        duration_s=duration_s,
-    )
-    return configuration.complete(config, installed)
-
-
-def _recording(sequence: str, config: SimulationConfig, data: str, code: str) -> RecordingJob:
+def _recording(sequence: str, config: SimulationConfig, digest: str, code: str) -> Recording:
     frames = config.frame_rate_hz * (config.duration_s or 100.0)
     # A blurred frame is the mean of many.
     effort = 1.0 + 8.0 * max(config.conditions.get(name, 0.0) for name in ("motion_blur", "rolling_shutter"))
-    name = f"{sequence}.{_digest(data, code)}.bag"
-    return RecordingJob(name, config, _RENDER_S * effort * frames)
+    name = f"{sequence}.{fingerprints.of_values(digest, code)}.bag"
+    return Recording(name, config, _RENDER_S * effort * frames)
 
 
-def _trials(suite: Suite, installed: Registry) -> Iterator[TrialJob]:
-    code, setup = code_version(installed), montecarlo_setup(suite)
-    named_flight(
-        setup.flight, setup.duration_s, packaged_calibration("euroc").cameras[0].R_BC
-    )  # says so where there is none
+def _trials(suite: Suite, installed: Registry) -> Iterator[TrialTask]:
+    code, setup = fingerprints.of_code(installed), montecarlo_setup(suite)
+    R_BC = packaged_calibration("euroc").cameras[0].R_BC
+    named_flight(setup.flight, setup.duration_s, R_BC)  # says so where there is none
     for backend, seed in product(suite.backends, range(suite.seeds)):
         options = installed.find(BACKEND, backend.name).validate(backend.options)
-        labels = Labels(setup.flight, CLEAR, 0.0, "simulated tracks", backend.called, seed)
-        yield TrialJob(
-            _key(labels),
-            Kind.TRIAL,
-            labels,
-            Data.SIMULATED,
-            f"simulated tracks of the flight {setup.flight}, {setup.pixel_sigma:g} px noise; no images",
-            {"code": code, "config": _digest(backend.name, options), "data": _digest(suite.setup, seed)},
-            _TRIAL_S * setup.duration_s,
-            setup,
-            PartConfig(name=backend.name, options=options),
-            seed,
+        about = _about(
+            *("trial", Data.SIMULATED, setup.flight, CLEAR, 0.0, "simulated tracks", backend.called, seed),
+            note=f"simulated tracks of the flight {setup.flight}, {setup.pixel_sigma:g} px noise; no images",
+            code=code,
+            config=fingerprints.of_values(backend.name, options),
+            inputs=fingerprints.of_values(suite.setup, seed),
         )
+        part = PartConfig(name=backend.name, options=options)
+        yield TrialTask(about, _TRIAL_S * setup.duration_s, setup, part)
 
 
-def _speed(suite: Suite, folders: Sequence[Path], installed: Registry) -> SpeedJob:
+def _speed(suite: Suite, folders: Sequence[Path], installed: Registry) -> SpeedTask:
     for detector in suite.detectors:
         installed.find(DETECTOR, detector.name).validate(detector.options)
-    about = [each.model_dump() for each in suite.detectors]
     found = [sources.find_source(each.name, folders, installed) for each in suite.sequences] if folders else []
-    source = next((each for each in found if each.recording is not None), None)
-    if folders and source is None:
+    source = next((each for each in found if each.recording is not None), sources.Source("drawn surfaces"))
+    if folders and source.recording is None:
         names = ", ".join(each.name for each in suite.sequences) or "no sequence"
         raise DatasetError(f"--data holds no images of {names}; leave it out to time detectors on drawn surfaces")
-    images = "drawn surfaces" if source is None else f"frames of {source.name}"
-    data = "drawn" if source is None or source.recording is None else sources.fingerprint_of([source.recording])
-    return SpeedJob(
-        "detector_speed",
-        Kind.DETECTOR_SPEED,
-        None,
-        None if source is None else source.kind,
-        f"{images}, 640 x 480, 300 keypoints, one image at a time",
-        {"code": code_version(installed), "config": _digest(about, suite.rounds, suite.images), "data": data},
-        60.0,
-        suite.detectors,
-        suite.rounds,
-        suite.images,
-        None if source is None else source.recording,
-    )
+    parts = [each.model_dump() for each in suite.detectors]
+    images = source.name if source.recording is None else f"frames of {source.name}"
+    about = {
+        "task": "detector_speed",
+        "kind": "speed",
+        "data": None if source.recording is None else source.kind,
+        "data_note": f"{images}, 640 x 480, 300 keypoints, one image at a time",
+        "code": fingerprints.of_code(installed),
+        "config": fingerprints.of_values(parts, suite.rounds, suite.images),
+        "inputs": "drawn" if source.recording is None else fingerprints.of_recordings([source.recording]),
+    }
+    return SpeedTask(about, 60.0, suite.detectors, suite.rounds, suite.images, source.recording)
 
 
-def _key(labels: Labels) -> str:
-    """A name that says what it is and can be a folder's."""
-    condition = labels.condition if not labels.level else f"{labels.condition}_{labels.level:g}"
-    parts = [labels.sequence, condition, labels.detector, labels.backend, f"seed{labels.seed}"]
-    return ".".join("".join(c if c.isalnum() or c in "_-+" else "_" for c in part.replace(" ", "_")) for part in parts)
-
-
-def _config_digest(config: Config, metrics: Sequence[str]) -> str:
-    """Of all that a run depends on but its data, wherever that lies."""
-    plain = config.model_copy(update={"dataset": at(config.dataset, None), "ground_truth": None})
-    return _digest(plain.model_dump(mode="json"), list(metrics))
-
-
-def at(dataset: DatasetConfig, path: Path | None) -> DatasetConfig:
-    """``dataset`` at another place."""
-    return dataset.model_copy(update={"path": path})
-
-
-def _digest(*values: Any) -> str:
-    """Tells values from other values."""
-    return hashlib.sha256(json.dumps(values, sort_keys=True, default=str).encode()).hexdigest()[:16]
+def _about(
+    kind: str,
+    data: Data,
+    sequence: str,
+    condition: str,
+    level: float,
+    detector: str,
+    backend: str,
+    seed: int,
+    *,
+    note: str,
+    **fingerprint: str,
+) -> dict[str, Any]:
+    """The columns of a flight's or a trial's row; its task has a name that says what it is and can be a folder's."""
+    how = f"{condition}_{level:g}" if level else condition
+    parts = (sequence, how, detector, backend, f"seed{seed}")
+    name = ".".join("".join(c if c.isalnum() or c in "_-+" else "_" for c in part) for part in parts)
+    where = {"data": data.value, "sequence": sequence, "condition": condition, "level": level}
+    who = {"detector": detector, "backend": backend, "seed": seed}
+    return {"task": name, "kind": kind, **where, **who, "data_note": note, **fingerprint}

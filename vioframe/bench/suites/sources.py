@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, NamedTuple
 
-from vioframe.bench.suites.euroc import EUROC
+from vioframe.bench.suites import fingerprints
 from vioframe.errors import ConfigError, DatasetError
-from vioframe.io.calibration import sidecar_folder
 from vioframe.parts.config import PartConfig
 from vioframe.parts.options import did_you_mean
 from vioframe.parts.registry import FLIGHT, Registry
-from vioframe.report.suite.results import Data
+from vioframe.runs.results import Data
 from vioframe.simulation import config as simulation
 from vioframe.simulation.config import MANIFEST, SimulationConfig, simulation_folder
 from vioframe.simulation.scenario import GROUND_TRUTH_FILES, find_file, motion_files, sensor_folder
@@ -21,7 +20,41 @@ from vioframe.simulation.scenario import GROUND_TRUTH_FILES, find_file, motion_f
 DEFAULT_STAND_IN_S = 30.0
 # EuRoC's own site has MACHINE/SEQUENCE/SEQUENCE.bag.
 _DEPTH = 3
-_SAMPLE_BYTES = 1 << 20
+
+
+class Euroc(NamedTuple):
+    """What is known of a sequence of EuRoC (Burri et al., IJRR 2016) without having it.
+
+    ``start_s`` skips the shaking and resting before the take-off, as OpenVINS' evaluations do. The rest is of a
+    simulated tour in its place, with the length of the sequence, its path and turning within a few per cent, and the
+    light of its hall. It is not that flight, and what is measured on it says nothing about EuRoC's images.
+    """
+
+    start_s: float
+    duration_s: float
+    mean_speed_m_s: float
+    width_m: float
+    height_m: float
+    conditions: Mapping[str, float]
+
+    def tour(self, route: int) -> PartConfig:
+        options: dict[str, Any] = {"route": route, "mean_speed_m_s": self.mean_speed_m_s}
+        return PartConfig(name="tour", options={**options, "width_m": self.width_m, "height_m": self.height_m})
+
+
+EUROC = {
+    "MH_01_easy": Euroc(40.0, 142.0, 0.6, 10.0, 3.0, {}),
+    "MH_02_easy": Euroc(35.0, 115.0, 0.64, 10.0, 3.0, {}),
+    "MH_03_medium": Euroc(5.0, 127.0, 1.03, 12.0, 3.0, {}),
+    "MH_04_difficult": Euroc(10.0, 89.0, 1.03, 15.0, 3.0, {"low_light": 0.3}),
+    "MH_05_difficult": Euroc(5.0, 106.0, 0.92, 15.0, 3.0, {"low_light": 0.3}),
+    "V1_01_easy": Euroc(0.0, 144.0, 0.41, 5.0, 1.5, {}),
+    "V1_02_medium": Euroc(0.0, 84.0, 0.91, 5.0, 1.5, {}),
+    "V1_03_difficult": Euroc(0.0, 105.0, 0.75, 4.0, 1.5, {"motion_blur": 0.3}),
+    "V2_01_easy": Euroc(0.0, 112.0, 0.33, 4.0, 1.5, {}),
+    "V2_02_medium": Euroc(0.0, 115.0, 0.72, 5.0, 1.5, {}),
+    "V2_03_difficult": Euroc(0.0, 115.0, 0.75, 5.0, 1.5, {"motion_blur": 0.3}),
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,11 +73,12 @@ class Source:
 
 @dataclass(frozen=True, slots=True)
 class Flown:
-    """What a task runs on: a recording that exists, or one to be simulated first."""
+    """What a task runs on: a recording that exists, or one to be simulated first. ``digest`` tells it from others."""
 
     data: Data
     note: str
     start_s: float
+    digest: str
     recording: Path | None = None
     ground_truth: Path | None = None
     simulated: SimulationConfig | None = None
@@ -52,21 +86,17 @@ class Flown:
 
 def find_source(name: str, folders: Sequence[Path], installed: Registry) -> Source:
     """What ``folders`` hold of the sequence ``name``; raises :class:`DatasetError` for one that nothing is known of."""
-    recording, kind, motion = None, Data.REAL, None
-    for path in _candidates(name, folders):
-        if recording is None and _has_images(path):
-            recording, kind = path, _kind_of(path, installed)
-        if motion is None and _is_motion(path):
-            motion = path
-    known = name in EUROC or name in installed.names(FLIGHT)
-    if recording is None and motion is None and not known:
-        where = f" in {', '.join(map(str, folders))}" if folders else "; --data DIR says where recordings are"
-        hint = did_you_mean(name, [*EUROC, *installed.names(FLIGHT)])
-        raise DatasetError(f"there is no {name}.bag or {name}/mav0{where}{hint}, and no simulated flight for it")
-    truth = None
+    candidates = list(_candidates(name, folders))
+    recording = next(filter(_has_images, candidates), None)
+    motion = next(filter(_is_motion, candidates), None)
     if recording is not None:
-        truth = _truth_of(recording, motion, installed)
-    return Source(name, recording, kind, truth, motion)
+        kind, truth = _kind_of(recording, installed), _truth_of(recording, motion, installed)
+        return Source(name, recording, kind, truth, motion)
+    if motion is None and name not in (known := [*EUROC, *installed.names(FLIGHT)]):
+        where = f" in {', '.join(map(str, folders))}" if folders else "; --data DIR says where recordings are"
+        hint = did_you_mean(name, known)
+        raise DatasetError(f"there is no {name}.bag or {name}/mav0{where}{hint}, and no simulated flight for it")
+    return Source(name, motion=motion)
 
 
 def flown(
@@ -79,58 +109,44 @@ def flown(
     installed: Registry,
 ) -> Flown:
     """What to fly ``source`` on. Under ``conditions`` images are rendered; the seed is that of what is simulated."""
-    known = EUROC.get(source.name)
+    name, known = source.name, EUROC.get(source.name)
     begin_s = start_s if start_s is not None else known.start_s if known else 0.0
     if source.recording is not None and (not conditions or source.kind is not Data.REAL):
         if conditions:
             raise ConfigError(f"{source.recording} is a simulation already: conditions need the real recording")
-        note = {
-            Data.REAL: f"{source.name}: recorded images and IMU",
-            Data.RENDERED: f"{source.name}: recorded IMU and motion, images rendered",
-            Data.SIMULATED: f"{source.name}: simulated motion, IMU and images",
-        }[source.kind]
-        return Flown(source.kind, note, begin_s, source.recording, source.ground_truth)
+        made_of = {
+            Data.REAL: "recorded images and IMU",
+            Data.RENDERED: "recorded IMU and motion, images rendered",
+            Data.SIMULATED: "simulated motion, IMU and images",
+        }
+        files = [source.recording] if source.ground_truth is None else [source.recording, source.ground_truth]
+        digest = fingerprints.of_recordings(files)
+        note = f"{name}: {made_of[source.kind]}"
+        return Flown(source.kind, note, begin_s, digest, source.recording, source.ground_truth)
+    settings: dict[str, Any] = {"seed": seed, "conditions": dict(conditions)}
     if source.motion is not None:
-        config = SimulationConfig(
-            recorded=source.motion,
-            duration_s=None if duration_s is None else begin_s + duration_s,
-            seed=seed,
-            conditions=dict(conditions),
+        data, note = (
+            Data.RENDERED,
+            f"{name}: its recorded IMU and motion, images rendered along them; not its own images",
         )
-        note = f"{source.name}: its recorded IMU and motion, images rendered along them; not EuRoC's images"
-        return Flown(Data.RENDERED, note, begin_s, simulated=simulation.complete(config, installed))
-    flight = known.stand_in.flight if known else PartConfig(name=source.name)
-    usual_s = known.stand_in.duration_s if known else DEFAULT_STAND_IN_S
-    # A stand-in begins at its beginning: there is no shaking before the take-off to be skipped.
-    start_s = 0.0 if known or start_s is None else start_s
-    config = SimulationConfig(
-        flight=flight,
-        duration_s=min(usual_s, duration_s or usual_s) if known else start_s + (duration_s or usual_s),
-        seed=seed,
-        conditions={**(known.stand_in.conditions if known else {}), **conditions},
-    )
-    stands_in = f"a simulated flight stands in for {source.name}: its speed and light, not its path"
-    note = stands_in if known else f"simulated flight {source.name}"
-    return Flown(Data.SIMULATED, note, start_s, simulated=simulation.complete(config, installed))
-
-
-def fingerprint(flown: Flown) -> str:
-    """Tells data from other data: of a recording its files' names, sizes and samples of their bytes."""
-    if flown.simulated is not None:
-        # Where the motion lies says nothing about it.
-        motion = flown.simulated.recorded
-        plain = flown.simulated.model_copy(update={"recorded": None, "made": {}}).model_dump_json()
-        return fingerprint_of([] if motion is None else motion_files(sensor_folder(motion)), plain)
-    assert flown.recording is not None
-    return fingerprint_of([flown.recording] if flown.ground_truth is None else [flown.recording, flown.ground_truth])
-
-
-def fingerprint_of(paths: Iterable[Path], text: str = "") -> str:
-    """Of recordings with the calibration beside them, of other files, and of a text."""
-    digest = hashlib.sha256(text.encode())
-    for path in paths:
-        _add_files(digest, [*_files_of(path), *_files_of(sidecar_folder(path))])
-    return digest.hexdigest()[:16]
+        settings |= {"recorded": source.motion, "duration_s": None if duration_s is None else begin_s + duration_s}
+    elif known is not None:
+        data, note = Data.SIMULATED, f"a simulated flight stands in for {name}: its speed and light, not its path"
+        # It begins at its beginning: there is no shaking before the take-off to be skipped.
+        begin_s = 0.0
+        settings |= {
+            "flight": known.tour(1 + list(EUROC).index(name)),
+            "duration_s": min(known.duration_s, duration_s or known.duration_s),
+            "conditions": {**known.conditions, **conditions},
+        }
+    else:
+        data, note = Data.SIMULATED, f"simulated flight {name}"
+        settings |= {"flight": PartConfig(name=name), "duration_s": begin_s + (duration_s or DEFAULT_STAND_IN_S)}
+    config = simulation.complete(SimulationConfig(**settings), installed)
+    # Where the motion lies says nothing about it.
+    plain = config.model_copy(update={"recorded": None, "made": {}}).model_dump(mode="json")
+    files = [] if config.recorded is None else [*motion_files(sensor_folder(config.recorded))]
+    return Flown(data, note, begin_s, fingerprints.of_recordings(files, plain), simulated=config)
 
 
 def _candidates(name: str, folders: Iterable[Path]) -> Iterator[Path]:
@@ -165,14 +181,14 @@ def _is_motion(path: Path) -> bool:
 def _kind_of(recording: Path, installed: Registry) -> Data:
     """A recording of vioframe's simulator says so itself, by what lies beside it."""
     manifest = simulation_folder(recording) / MANIFEST
-    if not manifest.is_file():
-        if recording.is_file() and installed.open_dataset(recording).ground_truth is not None:
-            raise DatasetError(
-                f"{recording} holds ground truth, so the simulator wrote it, but {manifest.parent.name} with what it "
-                "was made of is not beside it; copy that too"
-            )
-        return Data.REAL
-    return Data.RENDERED if simulation.read(manifest).recorded is not None else Data.SIMULATED
+    if manifest.is_file():
+        return Data.RENDERED if simulation.read(manifest).recorded is not None else Data.SIMULATED
+    if recording.is_file() and installed.open_dataset(recording).ground_truth is not None:
+        raise DatasetError(
+            f"{recording} holds ground truth, so the simulator wrote it, but {manifest.parent.name} with what it "
+            "was made of is not beside it; copy that too"
+        )
+    return Data.REAL
 
 
 def _truth_of(recording: Path, motion: Path | None, installed: Registry) -> Path | None:
@@ -185,22 +201,3 @@ def _truth_of(recording: Path, motion: Path | None, installed: Registry) -> Path
         f"{recording} comes without ground truth, as EuRoC's bags do; put the sequence's ASL folder "
         f"{recording.stem}/mav0/state_groundtruth_estimate0 beside it"
     )
-
-
-def _files_of(recording: Path) -> list[Path]:
-    """The files that tell a recording; none where there is nothing."""
-    if recording.is_file():
-        return [recording]
-    # Thousands of images: the list of their stamps, and the readings, tell the sequence as well.
-    images = [path for path in recording.rglob("*") if path.is_file() and path.suffix not in (".png", ".jpg")]
-    return sorted(images)
-
-
-def _add_files(digest: hashlib._Hash, paths: Iterable[Path]) -> None:
-    for path in paths:
-        size = path.stat().st_size
-        digest.update(f"{path.name} {size}\n".encode())
-        with path.open("rb") as file:
-            for at in (0, size // 2, max(size - _SAMPLE_BYTES, 0)):
-                file.seek(at)
-                digest.update(file.read(_SAMPLE_BYTES))

@@ -1,31 +1,24 @@
-"""The results folder: what is done stays done, however a sweep ends. Read by :mod:`vioframe.report.suite.results`."""
+"""The results folder of a sweep, as :mod:`vioframe.runs.results` has it: what is done stays done, however it ends."""
 
 from __future__ import annotations
 
-import json
 import shutil
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
-from time import perf_counter
 from typing import Any
 
 from pydantic_core import to_jsonable_python
 
-from vioframe.bench.suites.plan import AnyJob, Plan, RecordingJob
-from vioframe.bench.suites.suite import Suite, render
+from vioframe.bench.suites.plan import AnyTask, Plan, Recording, Task
+from vioframe.bench.suites.suite import render
 from vioframe.errors import RunError
 from vioframe.io.calibration import sidecar_folder
-from vioframe.io.convert import appearing
 from vioframe.parts.config import read_tree
-from vioframe.parts.registry import describe
-from vioframe.report.suite.results import SUITE_FILE, TASK_FILE, TASKS_FOLDER
-from vioframe.runs import machine
-from vioframe.runs.recorder import write_json, write_whole
+from vioframe.runs.recorder import write_whole
+from vioframe.runs.results import FINGERPRINT, RUNS_FOLDER, SUITE_FILE, Row, read_rows, write_rows
 from vioframe.simulation.config import simulation_folder
-
-Result = Mapping[str, Any]
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,17 +48,17 @@ class Store:
                 )
             if file.read_text(encoding="utf-8") != text:
                 if not overwrite:
-                    differing = ", ".join(_differing(read_tree(file), plan.suite)) or "what it says"
+                    before, now = read_tree(file), to_jsonable_python(plan.suite.model_dump())
+                    differing = ", ".join(key for key in now if before.get(key) != now[key]) or "what it says"
                     raise RunError(
                         f"{self.path} holds another suite's results, which differs in {differing}; choose another "
                         "--out, or --overwrite to begin anew"
                     )
                 shutil.rmtree(self.path)
         try:
-            (self.path / TASKS_FOLDER).mkdir(parents=True, exist_ok=True)
-            self.recordings.mkdir(parents=True, exist_ok=True)
-            if not file.is_file():
-                write_whole(file, text)
+            for folder in (self.path / RUNS_FOLDER, self.recordings):
+                folder.mkdir(parents=True, exist_ok=True)
+            write_whole(file, text)
         except OSError as error:
             raise RunError(f"cannot write to {self.path}: {error.strerror}; choose another --out") from error
 
@@ -79,7 +72,7 @@ class Store:
             for folder in {self.path, self.recordings}:
                 stack.enter_context(_locked(folder))
             # What a sweep left that was killed.
-            for unfinished in (self.path / TASKS_FOLDER).glob(".*.unfinished"):
+            for unfinished in (self.path / RUNS_FOLDER).glob(".*.unfinished"):
                 shutil.rmtree(unfinished, ignore_errors=True)
             try:
                 yield
@@ -87,60 +80,38 @@ class Store:
                 if not self.keep_recordings:
                     shutil.rmtree(self.recordings, ignore_errors=True)
 
-    def done(self, job: AnyJob) -> bool:
-        """Whether there is a result of ``job`` that the same code made of the same data."""
-        task = self._task(job)
-        return bool(task.get("status") == "ok" and task.get("fingerprint") == dict(job.fingerprint))
+    def left(self, tasks: Sequence[AnyTask]) -> tuple[list[AnyTask], int]:
+        """Those of ``tasks`` without a result by the same code of the same data, and how many have one of others."""
+        kept = read_rows(self.path)
+        left = [task for task in tasks if not _done(task, kept.get(task.name, ()))]
+        return left, sum(not _same(task, row) for task in left for row in kept.get(task.name, ())[:1])
 
-    def stale(self, job: AnyJob) -> bool:
-        """Whether there is a result of ``job`` that other code, or other data, made."""
-        task = self._task(job)
-        return bool(task.get("fingerprint", dict(job.fingerprint)) != dict(job.fingerprint))
+    def keep(self, task: Task, rows: Sequence[Mapping[str, Any]]) -> None:
+        """Put down the ``rows`` of a task in place of any that it had."""
+        write_rows(self.path, {**read_rows(self.path), task.name: [{**task.about, **row} for row in rows]})
 
-    def _task(self, job: AnyJob) -> dict[str, Any]:
-        try:
-            tree = json.loads((self._folder(job) / TASK_FILE).read_text(encoding="utf-8"))
-        except (OSError, ValueError):
-            return {}
-        return tree if isinstance(tree, dict) else {}
+    def run_folder(self, task: Task) -> Path:
+        return self.path / RUNS_FOLDER / task.name
 
-    def keep(self, job: AnyJob, attempts: int, work: Callable[[Path], Result]) -> Result:
-        """Have ``work`` done in a folder that becomes the task's once it has returned its figures."""
-        begin_s = perf_counter()
-        with appearing(self._folder(job), replace=True) as folder:
-            folder.mkdir()
-            try:
-                result = work(folder)
-            except OSError as error:
-                raise RunError(describe(error)) from error  # its own words, before the folder has others for it
-            _write(folder, job, attempts, perf_counter() - begin_s, "", result)
-        return result
+    def recording(self, recording: Recording) -> Path:
+        return self.recordings / recording.name
 
-    def failed(self, job: AnyJob, attempts: int, error: str) -> None:
-        """Write down that ``job`` came to nothing, and why."""
-        with appearing(self._folder(job), replace=True) as folder:
-            folder.mkdir()
-            _write(folder, job, attempts, 0.0, error, {})
-
-    def recording(self, job: RecordingJob) -> Path:
-        return self.recordings / job.name
-
-    def drop(self, job: RecordingJob) -> None:
+    def drop(self, recording: Recording) -> None:
         """Nothing needs this recording any more."""
         if not self.keep_recordings:
-            path = self.recording(job)
+            path = self.recording(recording)
             path.unlink(missing_ok=True)
             for folder in (simulation_folder(path), sidecar_folder(path)):
                 shutil.rmtree(folder, ignore_errors=True)
 
-    def _folder(self, job: AnyJob) -> Path:
-        return self.path / TASKS_FOLDER / job.key
+
+def _done(task: Task, rows: Sequence[Row]) -> bool:
+    return bool(rows) and all(row["status"] != "failed" and _same(task, row) for row in rows)
 
 
-def _differing(before: Mapping[str, Any], suite: Suite) -> list[str]:
-    """The keys in which the tree of a suite differs from ``suite``."""
-    now = to_jsonable_python(suite.model_dump())
-    return [key for key in now if before.get(key) != now[key]]
+def _same(task: Task, row: Row) -> bool:
+    """Whether the row was made by the same code of the same data as the task would be."""
+    return all(row[column] == task.about[column] for column in FINGERPRINT)
 
 
 @contextmanager
@@ -158,21 +129,3 @@ def _locked(folder: Path) -> Iterator[None]:
         except BlockingIOError:
             raise RunError(f"another sweep is at work in {folder}; wait for it, or choose another --out") from None
         yield
-
-
-def _write(folder: Path, job: AnyJob, attempts: int, seconds: float, error: str, result: Result) -> None:
-    tree = {
-        "key": job.key,
-        "kind": job.kind.value,
-        "labels": None if job.labels is None else asdict(job.labels),
-        "data": None if job.data is None else job.data.value,
-        "data_note": job.note,
-        "fingerprint": dict(job.fingerprint),
-        "status": "failed" if error else "ok",
-        "error": error,
-        "attempts": attempts,
-        "seconds": seconds,
-        "machine": machine.describe(),
-        "result": result,
-    }
-    write_json(folder / TASK_FILE, tree)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from importlib.resources import files
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
@@ -14,10 +14,10 @@ from vioframe.errors import ConfigError
 from vioframe.frontend import FrontendOptions
 from vioframe.parts.config import PartConfig, Section, read_tree, to_yaml, validate
 from vioframe.parts.options import did_you_mean, validate_options
+from vioframe.runs.results import Reference
 from vioframe.simulation.conditions import Conditions
 
 Kind = Literal["flights", "detector_speed", "trials"]
-Names = Iterable[str]
 Level = Annotated[float, Field(gt=0.0, le=1.0)]
 
 
@@ -37,7 +37,7 @@ class Named(Section):
         return self.name
 
 
-class Contender(Named):
+class NamedPart(Named):
     """A part by name with its options, to be called ``label``."""
 
     options: dict[str, Any] = Field(default_factory=dict)
@@ -48,7 +48,7 @@ class Contender(Named):
         return self.label or self.name
 
 
-class BackendContender(Contender):
+class NamedBackend(NamedPart):
     """A back-end, and the loop closer behind it, if any."""
 
     loop_closure: PartConfig | None = None
@@ -57,7 +57,6 @@ class BackendContender(Contender):
 class Sequence(Named):
     """A sequence by name. ``start_s`` and ``duration_s`` None are those usual for it."""
 
-    name: str
     start_s: Annotated[float | None, Field(ge=0.0, allow_inf_nan=False)] = None
     duration_s: Annotated[float | None, Field(gt=0.0, allow_inf_nan=False)] = None
 
@@ -77,15 +76,16 @@ class Suite(Section):
     ``flights`` runs every detector with every back-end on every sequence, as it is and under each of ``conditions`` at
     each level, ``seeds`` times; ``detector_speed`` times detectors; ``trials`` flies back-ends on simulated tracks.
     ``seeds_vary`` says what another seed changes: the ``start`` of the flight, by ``SEED_SHIFT_S``, or the simulated
-    ``recording`` itself. ``workers`` is for sweeps that must have it so, as one that measures time.
+    ``recording`` itself. ``workers`` is for sweeps that must have it so, as one that measures time. ``reference`` is
+    for the report: what somebody claims, quotes and shows; a suite's file may name another that holds it.
     """
 
     name: str
     title: str
     description: str = ""
     kind: Kind = "flights"
-    detectors: tuple[Contender, ...] = ()
-    backends: tuple[BackendContender, ...] = ()
+    detectors: tuple[NamedPart, ...] = ()
+    backends: tuple[NamedBackend, ...] = ()
     sequences: tuple[Sequence, ...] = ()
     conditions: dict[str, tuple[Level, ...]] = Field(default_factory=dict)
     clear: bool = True
@@ -98,6 +98,7 @@ class Suite(Section):
     rounds: Annotated[int, Field(ge=1)] = 10
     images: Annotated[int, Field(ge=1)] = 8
     published: tuple[Published, ...] = ()
+    reference: Reference = Field(default_factory=Reference)
 
     @model_validator(mode="after")
     def _makes_sense(self) -> Self:
@@ -122,24 +123,19 @@ class Suite(Section):
 SEED_SHIFT_S = 0.5
 """How much later a flight starts with each seed, where seeds vary the start."""
 
-_USES: Mapping[Kind, frozenset[str]] = {
-    "flights": frozenset(
-        ("detectors", "backends", "sequences", "conditions", "clear", "seeds", "seeds_vary", "metrics", "frontend")
-    )
-    | {"workers", "published"},
-    "detector_speed": frozenset(("detectors", "sequences", "rounds", "images")),
-    "trials": frozenset(("backends", "seeds", "setup", "workers")),
+_USES: dict[Kind, str] = {
+    "flights": "detectors backends sequences conditions clear seeds seeds_vary metrics frontend workers published",
+    "detector_speed": "detectors sequences rounds images",
+    "trials": "backends seeds setup workers",
 }
-_ALWAYS = frozenset(("name", "title", "description", "kind"))
+_ALWAYS = {"name", "title", "description", "kind", "reference"}
 
 
 def _check_unused(suite: Suite) -> None:
     """Raise ValueError for a key that a suite of its kind has no use for."""
-    fields = Suite.model_fields
-    unused = sorted(suite.model_fields_set - _USES[suite.kind] - _ALWAYS)
-    changed = [key for key in unused if getattr(suite, key) != fields[key].get_default(call_default_factory=True)]
-    if changed:
-        raise ValueError(f"{changed[0]} does nothing in a suite of kind {suite.kind}")
+    for key in sorted(suite.model_fields_set - _ALWAYS - set(_USES[suite.kind].split())):
+        if getattr(suite, key) != Suite.model_fields[key].get_default(call_default_factory=True):
+            raise ValueError(f"{key} does nothing in a suite of kind {suite.kind}")
 
 
 def shipped() -> dict[str, Path]:
@@ -164,6 +160,8 @@ def find(name: str) -> Path:
 def read(path: Path) -> Suite:
     """Raises :class:`ConfigError` naming the key that is wrong."""
     tree = {"name": path.stem} | read_tree(path)
+    if isinstance(tree.get("reference"), str):
+        tree["reference"] = read_tree(path.parent / tree["reference"])
     suite = validate(Suite, tree, str(path))
     if suite.kind == "trials":
         montecarlo_setup(suite)
@@ -171,15 +169,16 @@ def read(path: Path) -> Suite:
     return suite
 
 
-def narrowed(
-    suite: Suite, *, detectors: Names = (), backends: Names = (), sequences: Names = (), seeds: int | None = None
-) -> Suite:
-    """``suite`` with only what is named, or all where nothing is; raises :class:`ConfigError` for what it lacks."""
+def narrowed(suite: Suite, *, seeds: int | None = None, **only: Iterable[str]) -> Suite:
+    """``suite`` with ``only`` those detectors, backends and sequences, or all where none is named.
+
+    Raises :class:`ConfigError` for what it lacks.
+    """
     changes: dict[str, Any] = {} if seeds is None else {"seeds": seeds}
-    for kind, names in (("detectors", detectors), ("backends", backends), ("sequences", sequences)):
+    for kind, names in only.items():
         have = {each.called: each for each in getattr(suite, kind)}
         if not have and suite.kind == "detector_speed":
-            have = {name: Contender(name=name) for name in names}  # it names none and means all
+            have = {name: NamedPart(name=name) for name in names}  # it names none and means all
         for name in names:
             if name not in have:
                 there = f"; it has {', '.join(have)}" if have else ""

@@ -1,28 +1,44 @@
 """Gets the tasks of a plan done by the workers of a dask cluster, whatever happens to a worker or to the sweep.
 
-What is done is kept by the worker that did it, at once: a sweep that was stopped goes on where it was. A task that
-fails, or whose worker dies, is tried once more; if that fails too it is written down with its error, and the others go
-on. Not more tasks are handed out than there are workers, so that one that dies takes only its own task with it.
+A run folder is left by the worker that made it, and the table of results grows with every task that is done: a sweep
+that was stopped goes on where it was. A task that fails, or whose worker dies, is tried once more; if that fails too it
+is written down with its error, and the others go on. Not more tasks are handed out than there are workers, so that one
+that dies takes only its own task with it.
 """
 
 from __future__ import annotations
 
-from collections import Counter, deque
-from collections.abc import Callable, Sequence
+import signal
+from collections import Counter, defaultdict, deque
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
+from multiprocessing import resource_tracker
 from typing import TYPE_CHECKING, Any
 
+from vioframe.bench.processes import usable_cores
 from vioframe.bench.suites import tasks
-from vioframe.bench.suites.cluster import connected
-from vioframe.bench.suites.plan import AnyJob, FlightJob, Plan, RecordingJob, SpeedJob
+from vioframe.bench.suites.plan import AnyTask, FlightTask, Plan, Recording, SpeedTask
 from vioframe.bench.suites.store import Store
-from vioframe.errors import RunError, VioframeError
+from vioframe.errors import PluginError, RunError, VioframeError
 from vioframe.parts.registry import describe
 
 if TYPE_CHECKING:
     from distributed import Client, Future
 
 ATTEMPTS = 2
+CONNECT_S = 10.0
+
+_SETTINGS = {
+    # A worker that dies is the sweep's business: it counts the attempts.
+    "distributed.scheduler.allowed-failures": 0,
+    # A worker that renders has helpers of its own, which daemons may not have.
+    "distributed.worker.daemon": False,
+    "distributed.scheduler.worker-saturation": 1.0,
+    # Compiled code that holds the interpreter for seconds is no reason for complaints.
+    "distributed.admin.tick.limit": "1h",
+}
+_SILENT = 100
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,7 +52,7 @@ class Event:
 
 
 @dataclass
-class Outcome:
+class Tally:
     """What a sweep came to: tasks that had been done before, that were done, and that failed, with the error."""
 
     reused: int = 0
@@ -46,27 +62,26 @@ class Outcome:
 
 @dataclass(frozen=True, slots=True)
 class Agenda:
-    """What is left to do: tasks, and the recordings that must be simulated first, with the tasks that wait for each."""
+    """What is left to do: tasks, and the recordings that must be simulated first."""
 
-    jobs: tuple[AnyJob, ...]
+    tasks: tuple[AnyTask, ...]
     reused: int
     stale: int
     """Results there are that other code or data made, and that are made again."""
 
     @property
-    def recordings(self) -> dict[str, RecordingJob]:
-        found = (job.recording for job in self.jobs if isinstance(job, FlightJob))
-        return {recording.name: recording for recording in found if recording is not None}
+    def recordings(self) -> dict[str, Recording]:
+        return {r.name: r for task in self.tasks if isinstance(task, FlightTask) and (r := task.recording)}
 
     @property
     def cost_s(self) -> float:
-        return sum(job.cost_s for job in self.jobs) + sum(job.cost_s for job in self.recordings.values())
+        return sum(task.cost_s for task in self.tasks) + sum(each.cost_s for each in self.recordings.values())
 
 
 def agenda(plan: Plan, store: Store) -> Agenda:
     """Every task of ``plan`` that ``store`` has no result of, by the same code on the same data."""
-    left = tuple(job for job in plan.jobs if not store.done(job))
-    return Agenda(left, len(plan.jobs) - len(left), sum(store.stale(job) for job in left))
+    left, stale = store.left(plan.tasks)
+    return Agenda(tuple(left), len(plan.tasks) - len(left), stale)
 
 
 def sweep(
@@ -76,24 +91,21 @@ def sweep(
     workers: int | None = None,
     scheduler: str | None = None,
     on_event: Callable[[Event], None] = lambda event: None,
-) -> Outcome:
+) -> Tally:
     """Do all that is ``left``, by ``workers`` local processes (by default one a core) or by those of ``scheduler``.
 
     The workers of a scheduler must reach the store's folders under the same paths. Raises :class:`RunError` where there
     is no scheduler, and :class:`PluginError` where dask is missing.
     """
-    outcome = Outcome(reused=left.reused)
-    flown = [job for job in left.jobs if not isinstance(job, SpeedJob)]
-    for job in left.jobs:
-        if isinstance(job, SpeedJob):
-            # Time is measured on the whole machine, with nothing beside.
-            _report(outcome, on_event, job, _attempt_here(store, job))
-    if flown:
-        with connected(workers, scheduler) as client:
+    drive = _Drive(store, left, on_event)
+    # Time is measured on the whole machine, with nothing beside.
+    drive.here([task for task in left.tasks if isinstance(task, SpeedTask)])
+    if flown := [task for task in left.tasks if not isinstance(task, SpeedTask)]:
+        with _connected(workers, scheduler) as client:
             if scheduler is not None:
-                _check_code(client, planned=flown[0].fingerprint["code"])
-            _Drive(client, store, flown, left, outcome, on_event, helpers=scheduler is None).run()
-    return outcome
+                _check_code(client, planned=flown[0].about["code"])
+            drive.by_workers(client, flown, renderers_may_help=scheduler is None)
+    return drive.tally
 
 
 def _check_code(client: Client, planned: str) -> None:
@@ -106,123 +118,90 @@ def _check_code(client: Client, planned: str) -> None:
 class _Drive:
     """Hands out tasks one by one as workers become free."""
 
-    def __init__(
-        self,
-        client: Client,
-        store: Store,
-        jobs: Sequence[AnyJob],
-        left: Agenda,
-        outcome: Outcome,
-        on_event: Callable[[Event], None],
-        *,
-        helpers: bool,
-    ) -> None:
-        self._client, self._store, self._outcome, self._on_event = client, store, outcome, on_event
-        self._helpers = helpers
-        self._ready: deque[AnyJob] = deque()
-        self._waiting: dict[str, list[FlightJob]] = {name: [] for name in left.recordings}
-        self._needed: Counter[str] = Counter()
-        self._to_record = deque(left.recordings.values())
+    def __init__(self, store: Store, left: Agenda, on_event: Callable[[Event], None]) -> None:
+        self.tally = Tally(reused=left.reused)
+        self._store, self._on_event = store, on_event
         self._attempts: Counter[str] = Counter()
-        self._running: dict[Future[Any], AnyJob | RecordingJob] = {}
-        for job in jobs:
-            if isinstance(job, FlightJob) and job.recording is not None:
-                self._waiting[job.recording.name].append(job)
-                self._needed[job.recording.name] += 1
-            else:
-                self._ready.append(job)
+        self._ready: deque[AnyTask] = deque()
+        self._to_record = deque(left.recordings.values())
+        self._needed: dict[str, list[FlightTask]] = defaultdict(list)
+        """Flights that are not done yet, by recording."""
 
-    def run(self) -> None:
+    def here(self, speeds: list[SpeedTask]) -> None:
+        for task in speeds:
+            for attempt in range(1, ATTEMPTS + 1):
+                self._attempts[task.name] = attempt
+                try:
+                    rows, error = tasks.perform(task, self._store, attempt), ""
+                    break
+                except Exception as failure:
+                    rows, error = [], _one_line(failure)
+            self._ended(task, rows, error)
+
+    def by_workers(self, client: Client, flown: Sequence[AnyTask], *, renderers_may_help: bool) -> None:
         from concurrent.futures import CancelledError
 
         from distributed import wait
 
-        while self._ready or self._to_record or self._running:
-            self._hand_out()
+        for task in flown:
+            if isinstance(task, FlightTask) and task.recording is not None:
+                self._needed[task.recording.name].append(task)
+            else:
+                self._ready.append(task)
+        running: dict[Future[Any], AnyTask | Recording] = {}
+        while self._ready or self._to_record or running:
+            capacity = max(1, len(client.nthreads()))
+            while len(running) < capacity and (self._ready or self._to_record):
+                # Flights first: a recording that nobody needs any more can go.
+                job = self._ready.popleft() if self._ready else self._to_record.popleft()
+                self._attempts[job.name] += 1
+                # Where there are fewer recordings than workers, the idle ones help.
+                rendering = 1 + len(self._to_record) + sum(isinstance(each, Recording) for each in running.values())
+                helpers = max(1, capacity // rendering) if renderers_may_help else 1
+                work = tasks.simulate if isinstance(job, Recording) else tasks.perform
+                how = helpers if isinstance(job, Recording) else self._attempts[job.name]
+                key = f"{job.name}-{self._attempts[job.name]}"
+                running[client.submit(work, job, self._store, how, key=key, pure=False)] = job
             try:
-                done = wait(list(self._running), return_when="FIRST_COMPLETED").done
+                done = wait(list(running), return_when="FIRST_COMPLETED").done
             except (CancelledError, OSError) as error:
                 raise RunError("the scheduler is gone; the same command goes on where it was") from error
             for future in done:
-                self._take_in(self._running.pop(future), future)
+                self._take_in(running.pop(future), future)
 
-    def _hand_out(self) -> None:
-        while len(self._running) < self._capacity() and (self._ready or self._to_record):
-            # Flights first: a recording that nobody needs any more can go.
-            job = self._ready.popleft() if self._ready else self._to_record.popleft()
-            name = _name(job)
-            self._attempts[name] += 1
-            key = f"{name}-{self._attempts[name]}"
-            if isinstance(job, RecordingJob):
-                work: tuple[Any, ...] = (tasks.simulate, self._store, job, self._rendering_processes())
-            else:
-                work = (tasks.perform, self._store, job, self._attempts[name])
-            self._running[self._client.submit(*work, key=key, pure=False)] = job
-
-    def _capacity(self) -> int:
-        return max(1, len(self._client.nthreads()))
-
-    def _rendering_processes(self) -> int:
-        """Where there are fewer recordings than workers, the idle ones help."""
-        if not self._helpers:
-            return 1
-        rendering = 1 + len(self._to_record) + sum(isinstance(job, RecordingJob) for job in self._running.values())
-        return max(1, self._capacity() // rendering)
-
-    def _take_in(self, job: AnyJob | RecordingJob, future: Future[Any]) -> None:
+    def _take_in(self, job: AnyTask | Recording, future: Future[Any]) -> None:
         error = "" if future.status == "finished" else _why(future)
+        rows = [] if error or isinstance(job, Recording) else future.result()
         future.release()
-        if error and self._attempts[_name(job)] < ATTEMPTS:
-            (self._to_record if isinstance(job, RecordingJob) else self._ready).append(job)  # type: ignore[arg-type]
-        elif isinstance(job, RecordingJob):
-            self._recorded(job, error)
+        again = bool(error) and self._attempts[job.name] < ATTEMPTS
+        if not isinstance(job, Recording):
+            if again:
+                self._ready.append(job)
+            else:
+                self._ended(job, rows, error)
+        elif again:
+            self._to_record.append(job)
         else:
-            if error:
-                self._store.failed(job, self._attempts[job.key], error)
-            self._ended(job, error)
+            self._on_event(Event(f"{job.name} simulated", job.cost_s, is_task=False, error=error))
+            if not error:
+                self._ready.extend(self._needed[job.name])
+            else:
+                for flight in tuple(self._needed[job.name]):
+                    self._ended(flight, [], f"its recording could not be simulated: {error}")
 
-    def _recorded(self, job: RecordingJob, error: str) -> None:
-        waiting = self._waiting.pop(job.name)
-        self._on_event(Event(f"{job.name} simulated", job.cost_s, is_task=False, error=error))
-        if not error:
-            self._ready.extend(waiting)
-            return
-        for flight in waiting:
-            text = f"its recording could not be simulated: {error}"
-            self._store.failed(flight, self._attempts[job.name], text)
-            self._ended(flight, text)
-
-    def _ended(self, job: AnyJob, error: str) -> None:
-        _report(self._outcome, self._on_event, job, error)
-        if isinstance(job, FlightJob) and job.recording is not None:
-            self._needed[job.recording.name] -= 1
-            if not self._needed[job.recording.name]:
-                self._store.drop(job.recording)
-
-
-def _attempt_here(store: Store, job: AnyJob) -> str:
-    """Do ``job`` in this process; the error of the last attempt, or nothing."""
-    error = ""
-    for attempt in range(1, ATTEMPTS + 1):
-        try:
-            store.keep(job, attempt, lambda folder: tasks.speed(job))  # type: ignore[arg-type]
-            return ""
-        except Exception as failure:
-            error = _one_line(failure)
-    store.failed(job, ATTEMPTS, error)
-    return error
-
-
-def _report(outcome: Outcome, on_event: Callable[[Event], None], job: AnyJob, error: str) -> None:
-    if error:
-        outcome.failed[job.key] = error
-    else:
-        outcome.done += 1
-    on_event(Event(job.key, job.cost_s, is_task=True, error=error))
-
-
-def _name(job: AnyJob | RecordingJob) -> str:
-    return job.name if isinstance(job, RecordingJob) else job.key
+    def _ended(self, task: AnyTask, rows: list[tasks.Figures], error: str) -> None:
+        if error:
+            rows = [tasks.failure(max(1, self._attempts[task.name]), error)]
+            self.tally.failed[task.name] = error
+        else:
+            self.tally.done += 1
+        self._store.keep(task, rows)
+        self._on_event(Event(task.name, task.cost_s, is_task=True, error=error))
+        if isinstance(task, FlightTask) and task.recording is not None:
+            waiting = self._needed[task.recording.name]
+            waiting.remove(task)
+            if not waiting:
+                self._store.drop(task.recording)
 
 
 def _why(future: Future[Any]) -> str:
@@ -236,3 +215,51 @@ def _why(future: Future[Any]) -> str:
 
 def _one_line(error: BaseException) -> str:
     return " ".join(str(error).split()) if isinstance(error, VioframeError) else describe(error)
+
+
+@contextmanager
+def _connected(workers: int | None, scheduler: str | None) -> Iterator[Client]:
+    """A client of ``workers`` local processes, one a core where None, or of the ``scheduler`` at an address.
+
+    Local workers have one thread each, for BLAS and OpenMP too.
+    """
+    try:
+        import dask
+        from distributed import Client, LocalCluster
+    except ImportError as error:
+        raise PluginError('sweeps need dask.distributed: pip install "vioframe[bench]"') from error
+    with dask.config.set(_SETTINGS):
+        if scheduler is None:
+            count = usable_cores() if workers is None else workers
+            quiet: dict[str, Any] = {"dashboard_address": None, "memory_limit": 0, "silence_logs": _SILENT}
+            with _deaf_to_ctrl_c():
+                cluster = LocalCluster(n_workers=count, threads_per_worker=1, **quiet)
+            with cluster, Client(cluster) as client:
+                yield client
+            return
+        try:
+            client = Client(scheduler, timeout=CONNECT_S)
+        except (OSError, ValueError, TimeoutError) as error:
+            raise RunError(f"there is no dask scheduler at {scheduler}; start one by `dask scheduler`") from error
+        with client:
+            if not client.nthreads():
+                raise RunError(f"the scheduler at {scheduler} has no workers; start some by `dask worker`")
+            yield client
+
+
+@contextmanager
+def _deaf_to_ctrl_c() -> Iterator[None]:
+    """Ctrl-C goes to every process of a terminal; it is for this one to end the others, which begin without an ear.
+
+    Threads and processes inherit what is blocked when they begin. What came meanwhile arrives here at the end.
+    """
+    if not hasattr(signal, "pthread_sigmask"):
+        yield
+        return
+    # Begun later, it would unblock the signal in the thread that begins it, and so in the worker that comes next.
+    resource_tracker.ensure_running()
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)

@@ -1,120 +1,162 @@
-"""What a worker does: a flight, a trial, the timing of detectors, or the simulation of a recording."""
+"""What a worker does: a flight, a trial, the timing of detectors, or the simulation of a recording.
+
+A task comes back as rows of the table of results (:mod:`vioframe.runs.results`).
+"""
 
 from __future__ import annotations
 
+import csv
 from collections.abc import Mapping
 from pathlib import Path
+from time import perf_counter
 from typing import Any
 
-from vioframe import experiment
+import numpy as np
+
+from vioframe import pipeline
 from vioframe.bench.montecarlo import fly
 from vioframe.bench.processes import installed, single_threaded
-from vioframe.bench.suites.code import code_version
-from vioframe.bench.suites.plan import AnyJob, FlightJob, RecordingJob, SpeedJob, TrialJob, at
+from vioframe.bench.suites import fingerprints
+from vioframe.bench.suites.plan import AnyTask, FlightTask, Recording, SpeedTask, TrialTask
 from vioframe.bench.suites.store import Store
-from vioframe.errors import TrajectoryError
-from vioframe.evaluation import Comparison
-from vioframe.report.suite.results import RUN_FOLDER
-from vioframe.runs.evaluated import Evaluated, evaluate_path, with_loop_closure, write_matched_truth
+from vioframe.errors import RunError, TrajectoryError
+from vioframe.evaluation import Comparison, TrajectoryErrors
+from vioframe.io.convert import appearing
+from vioframe.parts.registry import describe
+from vioframe.runs import machine
+from vioframe.runs.evaluated import evaluate_path, with_loop_closure, write_matched_truth
 from vioframe.runs.folder import RunFolder
 from vioframe.runs.metrics import create_metrics, measure
+from vioframe.runs.results import NEES_FILE, RUNS_FOLDER
 from vioframe.simulation.record import record
 from vioframe.simulation.recording import SimulatedRecording
 from vioframe.types import NS_PER_S
 
-Figures = Mapping[str, Any]
+Figures = dict[str, Any]
 
 
-def perform(store: Store, job: AnyJob, attempts: int) -> None:
-    """Do ``job`` on one core, and keep what comes of it; raises what it raises."""
-    with single_threaded():
-        store.keep(job, attempts, lambda folder: _do(job, store, folder))
+def perform(task: AnyTask, store: Store, attempt: int) -> list[Figures]:
+    """Do ``task``; its run folder appears once it is complete. Raises what the task raises."""
+    begin_s = perf_counter()
+    if isinstance(task, SpeedTask):
+        rows = speed(task)  # on the whole machine
+    else:
+        with single_threaded(), appearing(store.run_folder(task), replace=True) as folder:
+            try:
+                rows = [_trial(task, folder) if isinstance(task, TrialTask) else _flight(task, store, folder)]
+            except OSError as error:
+                raise RunError(describe(error)) from error  # its own words, before the folder has others for it
+        rows[0]["folder"] = f"{RUNS_FOLDER}/{task.name}"
+    done = {"status": "ok", "attempts": attempt, "seconds": perf_counter() - begin_s, "machine": machine.describe()}
+    return [{**done, **row} for row in rows]
 
 
-def simulate(store: Store, job: RecordingJob, workers: int) -> None:
-    """Make a recording by ``workers`` processes, unless it is there already."""
-    path = store.recording(job)
-    if path.exists():
-        return
-    with single_threaded():
-        record(SimulatedRecording(job.config, installed(), workers), [path])
+def failure(attempts: int, error: str) -> Figures:
+    """The row of a task that came to nothing."""
+    return {"status": "failed", "error": error, "attempts": attempts, "machine": machine.describe()}
+
+
+def simulate(recording: Recording, store: Store, processes: int) -> None:
+    """Make a recording by so many ``processes``, unless it is there already."""
+    if not (path := store.recording(recording)).exists():
+        with single_threaded():
+            record(SimulatedRecording(recording.config, installed(), processes), [path])
 
 
 def code() -> str:
     """The version of the code in this process."""
-    return code_version(installed())
+    return fingerprints.of_code(installed())
 
 
-def _do(job: AnyJob, store: Store, folder: Path) -> Figures:
-    if isinstance(job, FlightJob):
-        return _flight(job, store, folder)
-    if isinstance(job, TrialJob):
-        return _trial(job)
-    return speed(job)
-
-
-def _flight(job: FlightJob, store: Store, folder: Path) -> Figures:
-    config = job.config
-    if job.recording is not None:
-        config = config.model_copy(update={"dataset": at(config.dataset, store.recording(job.recording))})
-    run = folder / RUN_FOLDER
-    summary = experiment.record(experiment.prepare(config, installed()), run)
-    figures: dict[str, Any] = {"summary": summary, "evaluation": None, "evaluation_loop": None, "metrics": {}}
-    figures |= _timing(run)
+def _flight(task: FlightTask, store: Store, folder: Path) -> Figures:
+    config = task.config
+    if task.recording is not None:
+        dataset = config.dataset.model_copy(update={"path": store.recording(task.recording)})
+        config = config.model_copy(update={"dataset": dataset})
+    summary = pipeline.record(pipeline.prepare(config, installed()), folder)
+    figures = {**_of_summary(summary), **_of_timings(RunFolder.open(folder))}
     try:
-        evaluated = evaluate_path(run, None)
+        evaluated = evaluate_path(folder, None)
         closed = with_loop_closure(evaluated)
-        write_matched_truth(run)
+        write_matched_truth(folder)
     except TrajectoryError as error:
         # As where a handful of poses is all there is: the run went through, and there is nothing to measure.
         return figures | {"not_evaluated": " ".join(str(error).split())}
-    figures["evaluation"] = _errors(evaluated)
-    figures["evaluation_loop"] = _errors(closed)
     last = closed or evaluated
-    if last.estimate is not None and last.ground_truth is not None and last.errors is not None:
-        asked = create_metrics(job.metrics, installed())
-        comparison = Comparison(last.estimate, last.ground_truth, last.errors)
-        figures |= measure(asked, comparison).to_dict()
+    if last.estimate is None or last.ground_truth is None or last.errors is None:
+        return figures
+    figures |= {"loop_closed": closed is not None, **of_errors(last.errors)}
+    measured = measure(
+        create_metrics(task.metrics, installed()), Comparison(last.estimate, last.ground_truth, last.errors)
+    )
+    for metric, values in measured.figures.items():
+        figures |= {f"metrics.{metric}.{name}": value for name, value in values.items()}
+    return figures | ({"metrics_left_out": dict(measured.left_out)} if measured.left_out else {})
+
+
+def _of_summary(summary: Mapping[str, Any]) -> Figures:
+    names = ("completion", "resets", "start_s", "initialised_after_s", "frames", "finished")
+    figures = {name: summary.get(name) for name in names} | {"frame_ms": summary.get("mean_frame_ms")}
+    if {"first_frame_t_ns", "last_frame_t_ns"} <= summary.keys():
+        figures["flown_s"] = (summary["last_frame_t_ns"] - summary["first_frame_t_ns"]) / NS_PER_S
+    events = summary.get("events") or [{"event": None}]
+    return figures | {"last_event": events[-1]["event"]}
+
+
+def _of_timings(run: RunFolder) -> Figures:
+    """Milliseconds a frame by stage, and seconds of flight for a second of computing."""
+    if (timings := run.timings()) is None:
+        return {}
+    stage_ms = timings.mean_ms()
+    computing_s = 1e-3 * sum(stage_ms.values()) * len(timings.t_ns)
+    figures = {f"stage_ms.{stage}": ms for stage, ms in stage_ms.items()}
+    return figures | {"real_time_factor": float(np.ptp(timings.t_ns)) / NS_PER_S / computing_s if computing_s else None}
+
+
+def of_errors(errors: TrajectoryErrors) -> Figures:
+    """The columns of a flight's errors."""
+    path_m = errors.truth.path_length_m
+    figures: Figures = {key: getattr(errors, key) for key in ("ate_se3_m", "scale", "coverage")}
+    figures |= {key: getattr(errors, key).rmse for key in ("ate_m", "orientation_deg", "yaw_deg")}
+    figures |= {"path_length_m": path_m, "ate_percent": 100.0 * errors.ate_m.rmse / path_m if path_m > 0.0 else None}
+    figures |= {f"nees.{each.part}": each.mean for each in errors.nees}
+    for length, relative in errors.relative.items():
+        figures[f"relative.{length:g}m.translation_percent"] = float(np.mean(relative.translation_percent))
+        figures[f"relative.{length:g}m.yaw_deg"] = float(np.mean(relative.yaw_deg))
     return figures
 
 
-def _errors(run: Evaluated | None) -> Figures | None:
-    return None if run is None or run.errors is None else run.errors.to_dict()
+def _trial(task: TrialTask, folder: Path) -> Figures:
+    trial = fly(task.setup, task.backend, task.about["seed"])
+    folder.mkdir()
+    if len(trial.t_ns):
+        with (folder / NEES_FILE).open("w", encoding="utf-8", newline="") as file:
+            writer = csv.writer(file, lineterminator="\n")
+            writer.writerow(["t_ns", *trial.nees])
+            writer.writerows(zip(trial.t_ns.tolist(), *(each.tolist() for each in trial.nees.values()), strict=True))
+    means = {f"nees.{part}": float(values.mean()) for part, values in trial.nees.items() if len(values)}
+    return {"failure": trial.failure, "detail": trial.detail, **trial.figures, **means}
 
 
-def _timing(run: Path) -> Figures:
-    """Milliseconds a frame by stage, and seconds of flight for a second of computing."""
-    timings = RunFolder.open(run).timings()
-    if timings is None:
-        return {"stage_ms": {}, "real_time_factor": None}
-    stage_ms = timings.mean_ms()
-    seconds = float(timings.t_ns[-1] - timings.t_ns[0]) / NS_PER_S
-    computing = 1e-3 * sum(stage_ms.values()) * len(timings.t_ns)
-    return {"stage_ms": stage_ms, "real_time_factor": seconds / computing if computing else None}
-
-
-def _trial(job: TrialJob) -> Figures:
-    trial = fly(job.setup, job.contender, job.seed)
-    t_s = trial.t_ns / NS_PER_S
-    return {"trial": trial.to_dict(), "t_s": t_s.tolist(), "nees": {k: v.tolist() for k, v in trial.nees.items()}}
-
-
-def speed(job: SpeedJob) -> Figures:
-    """Frames a second of each detector; those that lack something are absent, with the reason."""
+def speed(task: SpeedTask) -> list[Figures]:
+    """Frames a second, a row a detector; those that lack something are absent, with the reason as their error."""
     from vioframe.bench.detectors.entrants import Entrant, everyone, line_up, parse_entrants
     from vioframe.bench.detectors.images import fit, frames_of, procedural_images
     from vioframe.bench.detectors.speed import RESOLUTION, speed_settings, time_detectors
 
-    entrants = [Entrant(each.called, each.name, each.options) for each in job.detectors]
+    entrants = [Entrant(each.called, each.name, each.options) for each in task.detectors]
     if not entrants:
         entrants = parse_entrants(everyone(installed(), "speed"), (), installed())
     lined_up = line_up(entrants, installed())
-    if job.recording is None:
-        images, source = procedural_images(job.images, RESOLUTION, 0), "drawn surfaces"
+    if task.recording is None:
+        images, source = procedural_images(task.images, RESOLUTION, 0), "drawn surfaces"
     else:
-        taken = frames_of(installed().open_dataset(job.recording), job.images)
+        taken = frames_of(installed().open_dataset(task.recording), task.images)
         images = [fit(image, RESOLUTION) for _, frames in taken if (image := frames.images[0]) is not None]
-        source = f"frames of {job.recording.stem}"
-    rows = time_detectors(lined_up.ready, images, job.rounds)
-    settings = speed_settings(source, len(images), job.rounds)
-    return {"rows": rows, "absent": dict(lined_up.absent), "settings": settings}
+        source = f"frames of {task.recording.stem}"
+    timed = time_detectors(lined_up.ready, images, task.rounds)
+    settings = speed_settings(source, len(images), task.rounds)
+    settings["width"], settings["height"] = settings.pop("resolution")
+    rows = [{**row, **settings} for row in timed]
+    absent = [{"detector": name, "status": "absent", "error": why} for name, why in lined_up.absent.items()]
+    return rows + absent

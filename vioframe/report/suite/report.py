@@ -9,16 +9,12 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from vioframe.errors import RunError
-from vioframe.report.suite.figures import write_figures
-from vioframe.report.suite.results import SuiteResults
-from vioframe.report.suite.statistics import expected_tasks
-from vioframe.report.suite.tables import tables, write_tables
+from vioframe.errors import PluginError, RunError
+from vioframe.runs.results import Results, task_count
 
 REPORT_FOLDER = "report"
 MARKERS = ("index.html", "tables/provenance.csv")
 """Either tells a report from other folders."""
-_TABLES, _FIGURES = "tables", "figures"
 
 
 @dataclass(frozen=True)
@@ -30,24 +26,34 @@ class Written:
     notes: tuple[str, ...]
 
 
-def write_report(results: SuiteResults, out: Path | None = None, *, page: bool = True) -> Written:
+def write_report(results: Results, out: Path | None = None, *, page: bool = True) -> Written:
     """Write everything to ``out``, by default ``report`` in the results; what was there before is replaced as a whole.
 
-    Without ``page`` it is tables and figures alone, which need no extra. Raises :class:`RunError` where ``out`` is some
-    other folder, or cannot be written.
+    Without ``page`` it is tables and figures alone. Raises :class:`RunError` where ``out`` is some other folder, or
+    cannot be written, and :class:`PluginError` where the extra that it needs is not installed.
     """
+    try:
+        from vioframe.report.suite.drawing import write_figures
+        from vioframe.report.suite.figures import figures
+        from vioframe.report.suite.page import write_page
+        from vioframe.report.suite.statistics import Study
+        from vioframe.report.suite.tables import tables, write_tables
+    except ModuleNotFoundError as error:
+        raise PluginError(f'reports need {error.name}: pip install "vioframe[bench]"') from None
+
     out = (results.path / REPORT_FOLDER if out is None else out).absolute()
     if out.exists() and not _replaceable(out):
         raise RunError(f"{out} is there and is no report, so it stays; choose another --out")
-    to_results = Path(os.path.relpath(results.path.absolute(), out / _TABLES)).as_posix()
+    to_results = Path(os.path.relpath(results.path.absolute(), out)).as_posix()
+    study = Study(results)
+    made, drawn = tables(study), figures(study)
+    quoted = {name: figure.file for name, figure in results.reference.figures.items()}
     try:
         with _appearing(out) as folder:
-            files = write_tables(tables(results), folder / _TABLES, to_results)
-            files += write_figures(results, folder / _FIGURES)
+            files = write_tables(made, folder / "tables", f"../{to_results}")
+            files += write_figures(drawn, folder / "figures", quoted)
             if page:
-                from vioframe.report.suite.page import write_page
-
-                files.append(write_page(results, folder))
+                files.append(write_page(study, made, drawn, folder / "index.html", to_results))
             relative = tuple(file.relative_to(folder) for file in files)
     except OSError as error:
         raise RunError(f"cannot write the report to {out}: {error.strerror}; choose another --out") from error
@@ -73,10 +79,11 @@ def _appearing(out: Path) -> Iterator[Path]:
         shutil.rmtree(unfinished, ignore_errors=True)
 
 
-def _notes(results: SuiteResults) -> Iterator[str]:
-    done, expected = len(results.tasks), expected_tasks(results.suite)
-    if expected is not None and done < expected:
-        yield f"the sweep is unfinished: {done} of {expected} tasks; `vioframe bench` goes on where it was stopped"
-    failed = sum(not task.ok for task in results.tasks)
-    if failed:
-        yield f"{failed} of {done} tasks failed; tables/failures.md has their errors"
+def _notes(results: Results) -> Iterator[str]:
+    tasks = {row["task"]: row["status"] for row in results.rows}
+    expected = task_count(results.suite)
+    if expected is not None and len(tasks) < expected:
+        done = f"{len(tasks)} of {expected} tasks"
+        yield f"the sweep is unfinished: {done}; `vioframe bench` goes on where it was stopped"
+    if failed := sum(status == "failed" for status in tasks.values()):
+        yield f"{failed} of {len(tasks)} tasks failed; tables/failures.md has their errors"

@@ -1,289 +1,410 @@
-"""What the flights of a suite say together: counts, means and spreads over the seeds, with nothing dropped.
+"""What the rows of a results table say together: counts, means and spreads over the seeds, with nothing dropped.
 
-A flight that failed stays in its group and is counted; it only has no error to average. Figures of real, rendered and
-simulated recordings never meet in one average. How the statistics are meant: ``docs/report.md``.
+A flight that failed stays where it belongs and is counted; it only has no error to average. Figures of real, rendered
+and simulated recordings never meet in one average. How the statistics are meant: ``docs/report.md``.
 """
 
 from __future__ import annotations
 
-from collections import Counter, defaultdict
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any, TypeVar
+from math import comb
+from typing import Any, NamedTuple
 
 import numpy as np
+import pandas as pd
 
-from vioframe.report.suite.flights import Flight, Outcome
-from vioframe.report.suite.results import Data, Kind, SuiteResults, TaskResult
+from vioframe.evaluation import TrajectoryErrors, evaluate
+from vioframe.evaluation.alignment import align_sim3
+from vioframe.evaluation.consistency import PARTS, AverageNees, Trial, Trials
+from vioframe.evaluation.metrics import position_error_W
+from vioframe.runs.folder import RunFolder
+from vioframe.runs.results import CELL, CLEAR, NEES_FILE, Data, Results
 
-_Key = TypeVar("_Key")
+COMPLETE_FROM = 0.95
+"""A flight is complete where at least this part of its frames is tracked, from initialisation on."""
+BEGUN_BY = 0.5
+"""... and it was initialised before this part of its time was over."""
+SUCCESS_PERCENT = 5.0
+"""A complete flight succeeded where its ATE is below this part of its path."""
+CONFIDENCE = 0.95
 
-CLEAR = "clear"
-"""The condition without any degradation, at level 0."""
+COURSE = list(CELL[:4])
+"""What contenders, a detector with a back-end, are compared on: data, sequence, condition, level."""
+CONTENDER = list(CELL[4:])
+COMPLETE, INCOMPLETE = "complete", "not complete"
+"""Incomplete is what was begun late, lost for more than a twentieth of the frames, or cut short."""
+NOT_EVALUATED, NEVER_INITIALISED, FAILED = "not evaluated", "never initialised", "failed"
 
-
-@dataclass(frozen=True, slots=True, order=True)
-class Cell:
-    """What the flights of a group share: all of their labels but the seed, and what they were made on."""
-
-    data: Data
-    sequence: str
-    condition: str
-    level: float
-    detector: str
-    backend: str
-
-    @property
-    def contender(self) -> tuple[str, str]:
-        return self.detector, self.backend
-
-    @property
-    def course(self) -> tuple[Data, str, str, float]:
-        """All but the contender: what contenders are compared on."""
-        return self.data, self.sequence, self.condition, self.level
-
-
-@dataclass(frozen=True, slots=True)
-class Spread:
-    """Some values of one figure. ``std`` is the sample's (n - 1), None for a single value."""
-
-    values: tuple[float, ...]
-
-    @property
-    def n(self) -> int:
-        return len(self.values)
-
-    @property
-    def mean(self) -> float:
-        return float(np.mean(self.values))
-
-    @property
-    def std(self) -> float | None:
-        return float(np.std(self.values, ddof=1)) if self.n > 1 else None
-
-    @property
-    def median(self) -> float:
-        return float(np.median(self.values))
-
-    @property
-    def min(self) -> float:
-        return min(self.values)
-
-    @property
-    def max(self) -> float:
-        return max(self.values)
-
-    def to_dict(self) -> dict[str, Any]:
-        return {"n": self.n, **{key: getattr(self, key) for key in ("mean", "std", "median", "min", "max")}}
+_Z = 1.959963984540054
+_SAME_M = 1e-9
+"""ATEs closer than this are of one and the same estimate."""
+_ALWAYS = (
+    *("ate_m", "ate_percent", "ate_se3_m", "scale", "orientation_deg", "yaw_deg", "completion", "resets", "start_s"),
+    *("initialised_after_s", "flown_s", "finished", "loop_closed", "frame_ms", "real_time_factor", "not_evaluated"),
+    *("last_event", "metrics_left_out", "failure"),
+)
+"""Columns that are there, if empty, in every table."""
 
 
 @dataclass(frozen=True)
-class Group:
-    """All seeds of one cell, in their order."""
+class Study:
+    """The tables behind a report, each in the order of the suite's own lists, and what is looked up for them."""
 
-    cell: Cell
-    flights: tuple[Flight, ...]
-
-    @property
-    def count(self) -> int:
-        return len(self.flights)
-
-    @property
-    def evaluated(self) -> int:
-        return sum(flight.evaluated for flight in self.flights)
-
-    @property
-    def all_complete(self) -> bool:
-        return all(flight.complete for flight in self.flights)
-
-    @property
-    def succeeded(self) -> int:
-        return sum(flight.succeeded for flight in self.flights)
+    results: Results
+    _errors: dict[str, TrajectoryErrors | None] = field(default_factory=dict)
 
     @cached_property
-    def outcomes(self) -> Counter[Outcome]:
-        return Counter(flight.outcome for flight in self.flights)
+    def flights(self) -> pd.DataFrame:
+        """A row a flight, with its ``outcome`` and the ``reason`` for it in a line, empty where nothing went wrong."""
+        frame = self._rows("flight")
+        # One that failed early does not say what it was made on; its siblings do.
+        siblings = frame.groupby(["sequence", "condition"])["data"].transform("first")
+        frame["data"] = frame["data"].fillna(siblings)
+        judged = [_outcome(row) for row in records(frame)]
+        frame["outcome"], frame["reason"] = zip(*judged, strict=True) if judged else ((), ())
+        frame["evaluated"] = frame["outcome"].isin([COMPLETE, INCOMPLETE])
+        frame["complete"] = frame["outcome"] == COMPLETE
+        frame["succeeded"] = frame["complete"] & (frame["ate_percent"] < SUCCESS_PERCENT)
+        return frame
+
+    @cached_property
+    def trials(self) -> pd.DataFrame:
+        """A row a trial; a task that failed is one that crashed."""
+        frame = self._rows("trial")
+        frame["failure"] = frame["failure"].mask(frame["status"] == FAILED, "crashed")
+        return frame
+
+    @cached_property
+    def speeds(self) -> pd.DataFrame:
+        """A row a detector that was timed, the fastest first, and then those that were not."""
+        frame = self._rows("speed").reindex(columns=["detector", "status", "error", "folder", *_SPEED])
+        return frame[frame["status"] != FAILED].sort_values("fps", ascending=False, kind="stable")
 
     @property
-    def reasons(self) -> dict[str, int]:
-        """What went wrong, with how often."""
-        return dict(Counter(flight.reason for flight in self.flights if flight.reason))
+    def is_stress(self) -> bool:
+        """Whether anything was flown under a condition other than clear."""
+        return bool((self.flights["condition"] != CLEAR).any())
 
-    @property
-    def seeds_text(self) -> str:
-        """``3``, or ``2 of 3; 1 failed``: how many of the flights an error was measured of, and why not of the rest."""
-        missing = [
-            f"{number} {outcome}"
-            for outcome, number in sorted(self.outcomes.items())
-            if outcome is not Outcome.COMPLETE
-        ]
-        counted = str(self.count) if self.evaluated == self.count else f"{self.evaluated} of {self.count}"
-        return "; ".join([counted, *missing])
+    @cached_property
+    def baseline(self) -> str | None:
+        """The detector to compare the others with, which is the suite's first; None without others."""
+        names = self.flights["detector"].unique()
+        return str(names[0]) if len(names) > 1 else None
 
-    @property
-    def data_note(self) -> str:
-        return next((flight.task.data_note for flight in self.flights if flight.task.data_note), "")
+    def errors(self, flight: Mapping[str, Any]) -> TrajectoryErrors | None:
+        """Errors over time of a flight: of the loop-closed trajectory where it has one; None where there are none."""
+        name = flight["task"]
+        if name not in self._errors:
+            run = self.run(flight) if flight["evaluated"] else None
+            estimate = None if run is None else run.loop_closed() if flight["loop_closed"] is True else run.trajectory()
+            truth = None if run is None else run.ground_truth()
+            self._errors[name] = None if estimate is None or truth is None else evaluate(estimate, truth)
+        return self._errors[name]
 
-    def spread(self, figure: str) -> Spread | None:
-        """Of the flights that have ``figure``; None where none has."""
-        values = tuple(flight.figures[figure] for flight in self.flights if figure in flight.figures)
-        return Spread(values) if values else None
+    def run(self, flight: Mapping[str, Any]) -> RunFolder | None:
+        """The run folder of a flight; None where it never began."""
+        path = None if flight["folder"] is None else self.results.path / flight["folder"]
+        return None if path is None or not (path / "trajectory.tum").is_file() else RunFolder.open(path)
 
-    def mean(self, figure: str) -> float | None:
-        spread = self.spread(figure)
-        return None if spread is None else spread.mean
+    def nees(self, own: pd.DataFrame) -> dict[str, AverageNees]:
+        """NEES over time by part of the pose, averaged over trials; empty where no trial has a covariance."""
+        trials = []
+        for row in records(own[own["folder"].notna()]):
+            if (file := self.results.path / row["folder"] / NEES_FILE).is_file():
+                table = pd.read_csv(file)
+                values = {part: table[part].to_numpy() for part in PARTS}
+                about = (row["seed"], row["sequence"], row["backend"], row["failure"])
+                trials.append(Trial(*about, t_ns=table["t_ns"].to_numpy(), nees=values))
+        together = Trials("", "", {}, {}, tuple(trials))
+        return {part: nees for part in PARTS if (nees := together.nees(part)) is not None}
 
-    def means(self, prefix: str) -> dict[str, float]:
-        """Means of all figures below ``prefix``, by the rest of their name, as of ``stage_ms.``."""
-        names = dict.fromkeys(n for flight in self.flights for n in flight.figures if n.startswith(prefix))
-        return {name.removeprefix(prefix): mean for name in names if (mean := self.mean(name)) is not None}
+    def _rows(self, kind: str) -> pd.DataFrame:
+        rows = [row for row in self.results.rows if row["kind"] == kind]
+        frame = pd.DataFrame(rows, columns=None if rows else [*self.results.rows[0]])
+        frame = frame.reindex(columns=list(dict.fromkeys([*frame.columns, *_ALWAYS])))
+        frame = frame.astype(dict.fromkeys(("data", "folder", "failure", "loop_closed"), object))
+        frame = frame.where(frame.notna(), None) if frame.empty else frame
+        for column in ("folder", "failure"):
+            frame[column] = frame[column].where(frame[column].notna(), None)
+        places = pd.DataFrame({key: self._places(key, frame[key]) for key in (*CELL, "seed")}, index=frame.index)
+        return frame.loc[places.sort_values([*places], kind="stable").index].reset_index(drop=True)
 
-    def median_flight(self) -> Flight | None:
-        """The one to draw for the group: that of the median ATE, of two in the middle the worse."""
-        found = sorted((f for f in self.flights if f.evaluated), key=lambda f: f.figures["ate_m"])
-        return found[len(found) // 2] if found else None
-
-
-@dataclass(frozen=True)
-class Average:
-    """A contender's figures over sequences of one data kind; ``spreads`` are over the sequences' means.
-
-    ``sequences`` are those on which every contender's every flight was complete, ``of`` counts all of them: an average
-    over other sequences for each contender would compare their luck. ``groups`` are the contender's own of those.
-    """
-
-    data: Data
-    condition: str
-    level: float
-    detector: str
-    backend: str
-    sequences: tuple[str, ...]
-    of: int
-    groups: tuple[Group, ...]
-    spreads: Mapping[str, Spread]
-
-
-def flights(results: SuiteResults) -> list[Flight]:
-    return [Flight.of(task) for task in results.of(Kind.FLIGHT)]
+    def _places(self, key: str, values: pd.Series) -> pd.Series:
+        """By which to sort: as the suite lists things, and what it does not list after that, in alphabetical order."""
+        if key in ("level", "seed"):
+            return values.fillna(-1).astype(float)
+        listed = [CLEAR, *(data.value for data in Data), *listed_names(self.results.suite, f"{key.replace('_', '')}s")]
+        every = dict.fromkeys([*listed, *sorted(values.dropna().unique())])
+        return values.map({name: place for place, name in enumerate(every)}).fillna(len(every)).astype(int)
 
 
-def groups(results: SuiteResults) -> list[Group]:
-    """By cell, in the order of the suite's own lists."""
-    members: dict[Cell, list[Flight]] = defaultdict(list)
-    data_of = _data_kinds(results)
-    for flight in flights(results):
-        if (cell := _cell(flight.task, data_of)) is not None:
-            members[cell].append(flight)
-    made = [Group(cell, tuple(sorted(found, key=lambda flight: flight.seed))) for cell, found in members.items()]
-    return sorted(made, key=_suite_order(results.suite, [group.cell for group in made]))
-
-
-def averages(
-    found: Sequence[Group], figures: Iterable[str] = ("ate_m", "ate_se3_m", "orientation_deg")
-) -> list[Average]:
-    """A row a contender, for each data kind, condition and level that has more than one sequence."""
-    out = []
-    for shared, course in _by(found, lambda g: (g.cell.data, g.cell.condition, g.cell.level)):
-        by_sequence = _by(course, lambda g: g.cell.sequence)
-        contenders = list(dict.fromkeys(group.cell.contender for group in course))
-        common = [
-            name
-            for name, here in by_sequence
-            if len(here) == len(contenders) and all(group.all_complete for group in here)
-        ]
-        if len(by_sequence) < 2:
-            continue
-        for detector, backend in contenders:
-            own = tuple(g for g in course if g.cell.contender == (detector, backend) and g.cell.sequence in common)
-            means = {figure: [m for g in own if (m := g.mean(figure)) is not None] for figure in figures}
-            spreads = {figure: Spread(tuple(values)) for figure, values in means.items() if values}
-            out.append(Average(*shared, detector, backend, tuple(common), len(by_sequence), own, spreads))
-    return out
-
-
-def _data_kinds(results: SuiteResults) -> dict[tuple[str, str], Data]:
-    """By sequence and condition: what those flights were made on that came far enough to say so."""
-    return {
-        (task.labels.sequence, task.labels.condition): task.data for task in results.tasks if task.labels and task.data
-    }
-
-
-def _cell(task: TaskResult, data_of: Mapping[tuple[str, str], Data]) -> Cell | None:
-    """None where neither the task nor its siblings say what it was made on: :func:`unplaced` has those."""
-    if (labels := task.labels) is None:
-        return None
-    data = task.data or data_of.get((labels.sequence, labels.condition))
-    if data is None:
-        return None
-    return Cell(data, labels.sequence, labels.condition, labels.level, labels.detector, labels.backend)
-
-
-def expected_tasks(suite: Mapping[str, Any]) -> int | None:
-    """How many tasks a finished sweep has, or None where the suite does not say."""
-    seeds = suite.get("seeds", 1)
-    detectors, backends, sequences = (len(suite.get(key) or ()) for key in ("detectors", "backends", "sequences"))
-    match suite.get("kind"):
-        case "detector_speed":
-            return 1
-        case "trials":
-            return int(seeds * backends)
-        case "flights":
-            levels = sum(len(each) for each in (suite.get("conditions") or {}).values()) + bool(
-                suite.get("clear", True)
-            )
-            return int(seeds * backends * detectors * sequences * levels)
-    return None
-
-
-def unplaced(results: SuiteResults) -> list[Flight]:
-    """Flights that are in none of the :func:`groups`, as their recording could not even be found."""
-    data_of = _data_kinds(results)
-    return [flight for flight in flights(results) if _cell(flight.task, data_of) is None]
-
-
-def _suite_order(suite: Mapping[str, Any], cells: Sequence[Cell]) -> Callable[[Group], tuple[int | float | str, ...]]:
-    """A sorting key: as the suite lists things, and what it does not list after that, in alphabetical order."""
-
-    def places(key: str, own: Iterable[str]) -> dict[str, int]:
-        listed = listed_names(suite, key)
-        return {name: place for place, name in enumerate(dict.fromkeys([*listed, *sorted(own)]))}
-
-    data = list(Data)
-    sequences = places("sequences", {cell.sequence for cell in cells})
-    conditions = places("conditions", {cell.condition for cell in cells})
-    detectors = places("detectors", {cell.detector for cell in cells})
-    backends = places("backends", {cell.backend for cell in cells})
-
-    def key(group: Group) -> tuple[int | float | str, ...]:
-        cell = group.cell
-        clear_first = -1 if cell.condition == CLEAR else conditions[cell.condition]
-        return (
-            data.index(cell.data),
-            sequences[cell.sequence],
-            clear_first,
-            cell.level,
-            detectors[cell.detector],
-            backends[cell.backend],
-        )
-
-    return key
+_SPEED = (
+    *("fps", "fps_low", "fps_high", "ms", "keypoints", "calls", "on", "images", "image_count", "rounds"),
+    *("width", "height", "max_points", "devices"),
+)
 
 
 def listed_names(suite: Mapping[str, Any], key: str) -> list[str]:
-    """What the labels call the entries of one of the suite's lists."""
+    """What the table calls the entries of one of the suite's lists."""
     entries = suite.get(key) or ()
     return [str(each.get("label") or each["name"]) if isinstance(each, Mapping) else str(each) for each in entries]
 
 
-def _by(found: Iterable[Group], key: Callable[[Group], _Key]) -> list[tuple[_Key, list[Group]]]:
-    """Groups with equal keys together, in the order in which the keys come up."""
-    out: dict[_Key, list[Group]] = defaultdict(list)
-    for group in found:
-        out[key(group)].append(group)
-    return list(out.items())
+def _outcome(row: Mapping[str, Any]) -> tuple[str, str]:
+    if row["status"] == FAILED:
+        return FAILED, row["error"]
+    begun_s = row["initialised_after_s"]
+    if pd.isna(begun_s):
+        return NEVER_INITIALISED, "; last: ".join(filter(None, (NEVER_INITIALISED, row["last_event"])))
+    if pd.isna(row["ate_m"]):
+        why = row["not_evaluated"]
+        return NOT_EVALUATED, why if isinstance(why, str) else "there is no ground truth to compare with"
+    if row["finished"] is False:
+        return INCOMPLETE, "cut short"
+    if begun_s > BEGUN_BY * row["flown_s"]:
+        return INCOMPLETE, f"initialised only after {begun_s:.1f} s"
+    if not row["completion"] >= COMPLETE_FROM:
+        return INCOMPLETE, f"tracked {100 * row['completion']:.1f} % of its frames"
+    return COMPLETE, ""
 
 
-def by_course(found: Iterable[Group]) -> Iterator[tuple[tuple[Data, str, str, float], list[Group]]]:
-    """All contenders on the same recording and condition, together."""
-    yield from _by(found, lambda group: group.cell.course)
+def records(frame: pd.DataFrame) -> list[dict[str, Any]]:
+    """A mapping by column for each row."""
+    return [{str(column): value for column, value in row.items()} for row in frame.to_dict("records")]
+
+
+def groups(frame: pd.DataFrame, by: Iterable[str] = CELL) -> Iterator[tuple[Any, pd.DataFrame]]:
+    """Rows with equal keys together, in the order in which the keys come up; rows without some key are in none."""
+    yield from frame.groupby(list(by), sort=False)
+
+
+def seeds_text(own: pd.DataFrame) -> str:
+    """``3``, or ``2 of 3; 1 failed``: how many of the flights an error was measured of, and why not of the rest."""
+    missing = [
+        f"{n} {outcome}" for outcome, n in own["outcome"].value_counts().sort_index().items() if outcome != COMPLETE
+    ]
+    evaluated = own["evaluated"].sum()
+    return "; ".join([str(len(own)) if evaluated == len(own) else f"{evaluated} of {len(own)}", *missing])
+
+
+def median_flight(own: pd.DataFrame) -> Mapping[str, Any] | None:
+    """The one to draw for a group: that of the median ATE, of two in the middle the worse."""
+    found = records(own[own["evaluated"]].sort_values("ate_m", kind="stable"))
+    return found[len(found) // 2] if found else None
+
+
+class Average(NamedTuple):
+    """A contender over sequences of one data kind; ``means`` are its figures, a row a sequence.
+
+    Those are the sequences on which every flight of every contender was complete, ``of`` counts all of them: an average
+    over other sequences for each contender would compare their luck. ``flights`` are the contender's own of those.
+    """
+
+    data: str
+    condition: str
+    level: float
+    detector: str
+    backend: str
+    means: pd.DataFrame
+    of: int
+    flights: pd.DataFrame
+
+
+def averages(flights: pd.DataFrame) -> list[Average]:
+    """One for each contender, data kind, condition and level that has more than one sequence."""
+    out = []
+    for shared, here in groups(flights, ("data", "condition", "level")):
+        contenders = here.groupby(CONTENDER, sort=False).ngroups
+        by_sequence = here.groupby("sequence", sort=False)
+        whole = by_sequence["complete"].all() & (
+            by_sequence.apply(lambda s: s.groupby(CONTENDER).ngroups) == contenders
+        )
+        common = whole.index[whole]
+        for contender, own in groups(here, CONTENDER) if len(whole) > 1 else ():
+            own = own[own["sequence"].isin(common)]
+            means = own.groupby("sequence", sort=False)[["ate_m", "ate_se3_m", "orientation_deg"]].mean()
+            out.append(Average._make((*shared, *contender, means, len(whole), own)))
+    return out
+
+
+def curves(flights: pd.DataFrame) -> pd.DataFrame:
+    """How contenders hold up as a condition gets harder: a row a point, the flights without a degradation at level 0.
+
+    ``ate_m`` is the geometric mean of the flights that have an ATE, with its 95 % confidence interval ``low`` to
+    ``high``, whose spread is pooled over the levels of the curve, in the logarithm, where it is about the same; NaN
+    where no level has two flights to tell a spread from. ``success`` is the part of all flights, failed ones included,
+    that succeeded, within ``success_low`` to ``success_high`` (Wilson). ``flights`` are those of the point.
+    """
+    from scipy.special import stdtrit
+
+    line = ["data", "sequence", *CONTENDER]
+    clear = dict(groups(flights[flights["condition"] == CLEAR], line))
+    rows = []
+    for key, hard in groups(flights[flights["condition"] != CLEAR], [*line, "condition"]):
+        curve = pd.concat([clear[key[:4]], hard]) if key[:4] in clear else hard
+        log_ate = curve["ate_m"].astype(float).map(np.log).groupby(curve["level"])
+        freedom = int((log_ate.count() - 1).clip(lower=0).sum())
+        squares = float(((log_ate.count() - 1).clip(lower=0) * log_ate.var().fillna(0.0)).sum())
+        scatter = float(stdtrit(freedom, 0.5 + 0.5 * CONFIDENCE)) * np.sqrt(squares / freedom) if freedom else np.nan
+        for level, own in curve.groupby("level"):
+            middle, n = log_ate.mean()[level], log_ate.count()[level]
+            half = scatter / np.sqrt(n) if n else np.nan
+            success = wilson(int(own["succeeded"].sum()), len(own))
+            rows.append(
+                {**dict(zip([*line, "condition"], key, strict=True)), "level": level, "ate_m": np.exp(middle)}
+                | {"low": np.exp(middle - half), "high": np.exp(middle + half), "success": own["succeeded"].mean()}
+                | {"success_low": success[0], "success_high": success[1], "flights": own}
+            )
+    return pd.DataFrame(rows)
+
+
+def wilson(successes: int, n: int) -> tuple[float, float]:
+    """The 95 % score interval of a proportion (Wilson, 1927): never beyond 0 and 1."""
+    rate, shrink = successes / n, 1.0 + _Z**2 / n
+    middle = (rate + _Z**2 / (2 * n)) / shrink
+    half = _Z * np.sqrt(rate * (1.0 - rate) / n + _Z**2 / (4 * n**2)) / shrink
+    return max(0.0, float(middle - half)), min(1.0, float(middle + half))
+
+
+class Duel(NamedTuple):
+    """A detector against the baseline, flight by flight: same recording, condition, level, back-end and seed.
+
+    A complete flight wins against one that is not, an ATE against none, and otherwise the smaller one: whoever is lost
+    early has little time to be wrong in. Equal ones are ``tied``. ``ratio`` is the geometric mean of the ATE over the
+    baseline's, of the ``both`` pairs in which both have one. ``condition`` and ``level`` are None where it is over all
+    degraded flights. ``pairs`` has what is the baseline's in columns with the suffix ``_baseline``.
+    """
+
+    data: str
+    condition: str | None
+    level: float | None
+    detector: str
+    backend: str
+    won: int
+    lost: int
+    tied: int
+    both: int
+    ratio: float
+    pairs: pd.DataFrame
+
+    @property
+    def p_value(self) -> float:
+        """Of the two-sided sign test."""
+        n, k = self.won + self.lost, min(self.won, self.lost)
+        return min(1.0, sum(comb(n, i) for i in range(k + 1)) / 2.0 ** (n - 1))
+
+
+def duels(flights: pd.DataFrame, baseline: str) -> list[Duel]:
+    """By condition, level and contender, then over all degraded flights; recordings of one data kind together."""
+    theirs = flights["detector"] == baseline
+    pairs = flights[~theirs].merge(flights[theirs], on=[*COURSE, "backend", "seed"], suffixes=("", "_baseline")).copy()
+    standing, other = (2 * pairs[f"complete{s}"].astype(int) + pairs[f"evaluated{s}"] for s in ("", "_baseline"))
+    gap_m = (pairs["ate_m_baseline"] - pairs["ate_m"]).astype(float)
+    pairs["won"] = (standing > other) | ((standing == other) & (gap_m > _SAME_M))
+    pairs["lost"] = (standing < other) | ((standing == other) & (gap_m < -_SAME_M))
+    pairs["log_ratio"] = np.log((pairs["ate_m"] / pairs["ate_m_baseline"]).astype(float))
+    single = list(groups(pairs, ("data", "condition", "level", *CONTENDER)))
+    hard = groups(pairs[pairs["condition"] != CLEAR], ("data", *CONTENDER))
+    found = []
+    for key, own in [*single, *(((data, None, None, *who), own) for (data, *who), own in hard)]:
+        won, lost = int(own["won"].sum()), int(own["lost"].sum())
+        ratio = float(np.exp(own["log_ratio"].mean()))
+        found.append(Duel._make((*key, won, lost, len(own) - won - lost, int(own["log_ratio"].count()), ratio, own)))
+    return found
+
+
+def inside_band(errors: TrajectoryErrors, half_width_m: float) -> dict[str, float]:
+    """Percent of the instants at which |x|, |y|, |z| and all three are within ``half_width_m``."""
+    within = np.abs(errors.position_m) <= half_width_m
+    percent = dict(zip("xyz", (100.0 * within.mean(axis=0)).tolist(), strict=True))
+    return {**percent, "all": 100.0 * float(within.all(axis=1).mean())}
+
+
+def ate_sim3_m(errors: TrajectoryErrors | None) -> float:
+    """RMSE of the position after alignment by Sim(3), as many published figures have it; NaN where it is open."""
+    if errors is None or errors.scale is None:
+        return float("nan")
+    # Whatever the estimate was aligned by before, the best of all similarities leaves the same.
+    scaled = align_sim3(errors.estimate, errors.truth).apply(errors.estimate)
+    return float(np.sqrt(np.mean(np.sum(position_error_W(scaled, errors.truth) ** 2, axis=1))))
+
+
+def relative_errors(study: Study, flights: pd.DataFrame) -> pd.DataFrame:
+    """A row a stretch of the path, of all ``flights``: its contender, ``task``, ``length``, and its errors.
+
+    By length in metres where any flight's path is long enough, else by fraction of the path, which ``of_path`` says.
+    """
+    rows = records(flights[flights["evaluated"]])
+    found = [(row, errors) for row in rows if (errors := study.errors(row)) is not None]
+    by_length = any(errors.relative for _, errors in found)
+    tables = [
+        pd.DataFrame({"translation_percent": stretches.translation_percent, "yaw_deg": stretches.yaw_deg}).assign(
+            detector=row["detector"], backend=row["backend"], task=row["task"], length=length, of_path=not by_length
+        )
+        for row, errors in found
+        for length, stretches in (errors.relative if by_length else errors.relative_by_fraction).items()
+    ]
+    return pd.concat(tables, ignore_index=True) if tables else pd.DataFrame()
+
+
+def stage_means(flights: pd.DataFrame) -> pd.DataFrame:
+    """Mean milliseconds a frame by stage, a column each, over the timed ``flights`` of each data kind and contender."""
+    stages = [column for column in flights.columns if column.startswith("stage_ms.")]
+    # A stage that did not take place in a flight took 0 there.
+    means = timed(flights).fillna(dict.fromkeys(stages, 0.0)).groupby(["data", *CONTENDER], sort=False)[stages].mean()
+    means = means.loc[:, (means > 0.0).any()] if len(means) else means
+    return means.rename(columns=lambda column: str(column).removeprefix("stage_ms."))
+
+
+def timed(flights: pd.DataFrame) -> pd.DataFrame:
+    """Those whose times are those of whole estimating."""
+    return flights[flights["frame_ms"].notna() & flights["initialised_after_s"].notna()]
+
+
+# What is said of the data -------------------------------------------------------------------------------------------
+
+WHAT = {
+    Data.REAL: "real images and IMU",
+    Data.RENDERED: "rendered images with the real IMU",
+    Data.SIMULATED: "a simulated stand-in flight: images, IMU and motion",
+}
+_SPELT_OUT = 2
+"""More notes than this, of as many recordings, would be longer than the table."""
+
+
+def data_caption(flights: pd.DataFrame) -> str:
+    """Which sequences are of which kind of data, and what is known about them, in sentences."""
+    placed = flights[flights["data"].notna()]
+    notes = (
+        placed.sort_values("data_note", ascending=False).groupby(["data", "sequence"], sort=False)["data_note"].first()
+    )
+    spell_out = len(notes) <= _SPELT_OUT and bool(notes.fillna("").all())
+    parts = []
+    for data in (each for each in Data if each in set(placed["data"])):
+        own = placed[placed["data"] == data]["sequence"].unique()
+        told = "; ".join(str(notes[data, name]).rstrip(".") for name in own)
+        parts.append(f"Data ({data}): {told if spell_out else ', '.join(own) + ': ' + WHAT[data]}.")
+    return " ".join(parts)
+
+
+def count_caption(flights: pd.DataFrame) -> str:
+    """How many flights there are in all, and how many of them have no error to show."""
+    missing = len(flights) - flights["evaluated"].sum()
+    flown = f"{len(flights)} flight{'s' if len(flights) != 1 else ''}"
+    return (
+        f"{flown}; {missing} without an error to show." if missing else f"{flown}, all of them with an error to show."
+    )
+
+
+def machines(rows: pd.DataFrame) -> str:
+    """On what it was computed, in a sentence."""
+    names = dict.fromkeys(
+        f"{m.get('cpu', 'an unknown processor')} ({m.get('cpu_count', '?')} cores)" for m in rows["machine"]
+    )
+    return f"Measured on {' and on '.join(names)}."
+
+
+def condition_text(condition: str, level: float) -> str:
+    return condition if not level else f"{condition} {level:g}"

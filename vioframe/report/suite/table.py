@@ -2,33 +2,13 @@
 
 from __future__ import annotations
 
-import csv
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from io import StringIO
-from typing import TYPE_CHECKING
+from functools import cached_property
 
-if TYPE_CHECKING:
-    from vioframe.report.suite.statistics import Spread
+import pandas as pd
 
 UNKNOWN = "–"
-
-
-@dataclass(frozen=True, slots=True)
-class Column:
-    """``unit`` is empty for what has none; ``text`` columns are set flush left, numbers flush right.
-
-    ``code`` is text to copy as it stands.
-    """
-
-    title: str
-    unit: str = ""
-    text: bool = False
-    code: bool = False
-
-    @property
-    def heading(self) -> str:
-        return f"{self.title} [{self.unit}]" if self.unit else self.title
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,103 +20,113 @@ class Entry:
 
 
 @dataclass(frozen=True, slots=True)
-class Row:
-    """``links`` are the folders that the row's figures come from, by label, relative to the results folder."""
+class TableRow:
+    """Entries by heading, which ends with the unit in brackets.
 
-    entries: tuple[Entry, ...]
+    ``links`` are the folders that the row's figures come from, by label, relative to the results folder. ``detector``
+    and ``backend`` are whose it is.
+    """
+
+    entries: Mapping[str, Entry]
     links: tuple[tuple[str, str], ...] = ()
+    detector: str | None = None
+    backend: str | None = None
 
 
 @dataclass(frozen=True)
 class Table:
-    """``name`` is that of its files. The caption says what the data was."""
+    """``name`` is that of its files. The caption says what the data was. Columns without any value are left out.
+
+    ``code`` is the heading of a column that is text to copy as it stands.
+    """
 
     name: str
     title: str
     caption: str
-    columns: tuple[Column, ...]
-    rows: tuple[Row, ...]
+    rows: tuple[TableRow, ...]
+    code: str = ""
+
+    @cached_property
+    def values(self) -> pd.DataFrame:
+        """Exact values by heading."""
+        exact = [{heading: entry.value for heading, entry in row.entries.items()} for row in self.rows]
+        return pd.DataFrame(exact, dtype=object).dropna(axis="columns", how="all")
+
+    @property
+    def headings(self) -> list[str]:
+        return list(self.values.columns)
+
+    def is_text(self, heading: str) -> bool:
+        return bool(self.values[heading].dropna().map(lambda value: isinstance(value, str)).all())
 
     @property
     def has_links(self) -> bool:
         return any(row.links for row in self.rows)
 
+    def shown(self, row: TableRow) -> list[str]:
+        return [row.entries[heading].shown if heading in row.entries else UNKNOWN for heading in self.headings]
+
     def to_csv(self) -> str:
         """Exact values, empty where there is none, and the folders behind each row."""
-        out = StringIO()
-        writer = csv.writer(out, lineterminator="\n")
-        writer.writerow([*(column.heading for column in self.columns), *(["runs"] if self.has_links else [])])
-        for row in self.rows:
-            folders = [" ".join(path for _, path in row.links)] if self.has_links else []
-            writer.writerow(["" if entry.value is None else entry.value for entry in row.entries] + folders)
-        return out.getvalue()
+        links = {"runs": [" ".join(path for _, path in row.links) for row in self.rows]} if self.has_links else {}
+        return str(self.values.assign(**links).to_csv(index=False, lineterminator="\n"))
 
     def to_markdown(self, to_results: str) -> str:
         """``to_results`` leads from the folder of the Markdown file to the results, for the links."""
-        headings = [column.heading for column in self.columns] + (["runs"] if self.has_links else [])
-        rules = ["---" if column.text else "---:" for column in self.columns] + (["---"] if self.has_links else [])
-        lines = [f"**{_escape_markdown(self.title)}**", "", _markdown(headings), _markdown(rules, escape=False)]
+        runs = ["runs"] if self.has_links else []
+        rules = ["---" if self.is_text(heading) else "---:" for heading in self.headings] + ["---"] * len(runs)
+        lines = [_markdown(map(_escape_markdown, [*self.headings, *runs])), _markdown(rules)]
         for row in self.rows:
             cells = [
-                f"`{entry.shown}`" if column.code and entry.value is not None else _escape_markdown(entry.shown)
-                for column, entry in zip(self.columns, row.entries, strict=True)
+                f"`{shown}`" if heading == self.code and shown != UNKNOWN else _escape_markdown(shown)
+                for heading, shown in zip(self.headings, self.shown(row), strict=True)
             ]
-            if self.has_links:
-                cells.append(" ".join(f"[{_escape_markdown(label)}]({to_results}/{path})" for label, path in row.links))
-            lines.append(_markdown(cells, escape=False))
-        return "\n".join([*lines, "", _escape_markdown(self.caption), ""])
+            links = " ".join(f"[{_escape_markdown(label)}]({to_results}/{path})" for label, path in row.links)
+            lines.append(_markdown([*cells, links] if runs else cells))
+        return "\n".join([f"**{_escape_markdown(self.title)}**", "", *lines, "", _escape_markdown(self.caption), ""])
 
     def to_latex(self) -> str:
         """A float for the package booktabs; the links stay behind."""
-        spec = "".join("l" if column.text else "r" for column in self.columns)
+        rows = []
+        for row in self.rows:
+            cells = (_escape_latex(shown) for shown in self.shown(row))
+            pairs = zip(self.headings, cells, strict=True)
+            rows.append(_latex(f"\\texttt{{{cell}}}" if heading == self.code else cell for heading, cell in pairs))
         lines = [
             "% needs \\usepackage{booktabs}",
             "\\begin{table}",
             "  \\centering",
             f"  \\caption{{{_escape_latex(f'{self.title}. {self.caption}')}}}",
             f"  \\label{{tab:{self.name}}}",
-            f"  \\begin{{tabular}}{{{spec}}}",
+            f"  \\begin{{tabular}}{{{''.join('l' if self.is_text(heading) else 'r' for heading in self.headings)}}}",
             "    \\toprule",
-            _latex(_escape_latex(column.heading) for column in self.columns),
+            _latex(map(_escape_latex, self.headings)),
             "    \\midrule",
-            *(self._latex_row(row) for row in self.rows),
+            *rows,
             "    \\bottomrule",
             "  \\end{tabular}",
             "\\end{table}",
         ]
         return "\n".join(lines) + "\n"
 
-    def _latex_row(self, row: Row) -> str:
-        cells = (_escape_latex(entry.shown) for entry in row.entries)
-        return _latex(
-            f"\\texttt{{{cell}}}" if column.code else cell for column, cell in zip(self.columns, cells, strict=True)
-        )
 
-
-def text(value: str) -> Entry:
+def text(value: str | None) -> Entry:
     return Entry(value or UNKNOWN, value or None)
 
 
 def number(value: float | None, spec: str, suffix: str = "") -> Entry:
-    """Rounded by ``spec``; what is unknown is shown as a dash."""
-    return Entry(UNKNOWN, None) if value is None else Entry(f"{value:{spec}}{suffix}", value)
+    """Rounded by ``spec``; what is unknown, None or NaN, is shown as a dash."""
+    return Entry(UNKNOWN, None) if pd.isna(value) else Entry(f"{value:{spec}}{suffix}", value)
 
 
-def mean(spread: Spread | None, spec: str) -> Entry:
-    """The mean, shown with the standard deviation where there is one."""
-    if spread is None:
-        return number(None, spec)
-    return number(spread.mean, spec, "" if spread.std is None else f" ± {spread.std:{spec}}")
+def mean(values: pd.Series, spec: str, suffix: str = "") -> Entry:
+    """The mean of those that there are, shown with the sample's standard deviation where there are several."""
+    std = values.std()
+    return number(values.mean(), spec, suffix if pd.isna(std) else f" ± {std:{spec}}{suffix}")
 
 
-def without_empty(columns: Sequence[Column], rows: Sequence[Row]) -> tuple[tuple[Column, ...], tuple[Row, ...]]:
-    """Leave out the columns in which no row has a value."""
-    keep = [k for k in range(len(columns)) if any(row.entries[k].value is not None for row in rows)]
-    return tuple(columns[k] for k in keep), tuple(Row(tuple(row.entries[k] for k in keep), row.links) for row in rows)
-
-
-def _markdown(cells: Iterable[str], escape: bool = True) -> str:
-    return "| " + " | ".join(_escape_markdown(cell) if escape else cell for cell in cells) + " |"
+def _markdown(cells: Iterable[str]) -> str:
+    return "| " + " | ".join(cells) + " |"
 
 
 def _escape_markdown(value: str) -> str:

@@ -1,21 +1,49 @@
-"""The tables that a suite's results have data for, and writing them to files."""
+"""The tables that a suite's results have data for, in the order in which a reader asks."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+import json
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
+from shlex import quote
+from typing import Any
 
-from vioframe.report.suite import statistics, stress, tables_about, tables_accuracy, tables_cost, tables_stress
-from vioframe.report.suite.results import Kind, SuiteResults
-from vioframe.report.suite.table import Table
-from vioframe.report.suite.trials import campaigns
+import pandas as pd
 
-__all__ = ["Table", "tables", "write_tables"]
+from vioframe.evaluation import ALIGNED_BY
+from vioframe.evaluation.consistency import PARTS
+from vioframe.report.suite.statistics import (
+    COMPLETE,
+    CONTENDER,
+    SUCCESS_PERCENT,
+    Study,
+    ate_sim3_m,
+    averages,
+    condition_text,
+    count_caption,
+    curves,
+    data_caption,
+    duels,
+    groups,
+    inside_band,
+    machines,
+    records,
+    seeds_text,
+    stage_means,
+    timed,
+)
+from vioframe.report.suite.table import Entry, Table, TableRow, mean, number, text
+from vioframe.runs.evaluated import MATCHED_TRUTH
+from vioframe.runs.results import CLEAR, Data
+
+Entries = dict[str, Entry]
+_FACTS = ("vioframe", "commit", "python", "platform", "cpu", "cpu_count", "memory_gib", "threads")
 
 
-def tables(results: SuiteResults) -> list[Table]:
-    """In the order in which a reader asks: the figures, what went wrong, how to check, where from."""
-    return [table for table in _every(results) if table is not None]
+def tables(study: Study) -> list[Table]:
+    """All that have a row: the figures, what went wrong, how to check, where from."""
+    return [table for make in _TABLES if (table := make(study)) is not None and table.rows]
 
 
 def write_tables(every: Iterable[Table], folder: Path, to_results: str) -> list[Path]:
@@ -30,29 +58,439 @@ def write_tables(every: Iterable[Table], folder: Path, to_results: str) -> list[
     return written
 
 
-def _every(results: SuiteResults) -> Iterator[Table | None]:
-    for task in results.of(Kind.DETECTOR_SPEED):
-        if task.ok:
-            yield tables_cost.detector_speed(task)
-    groups, flights = statistics.groups(results), statistics.flights(results)
-    if groups:
-        if stress.is_stress(groups):
-            yield tables_stress.levels(stress.curves(groups), groups)
-            if (baseline := stress.baseline_of(groups)) is not None:
-                yield tables_stress.against_baseline(stress.duels(groups, baseline), baseline, groups)
-        yield tables_accuracy.accuracy(groups)
-        if averages := statistics.averages(groups):
-            yield tables_accuracy.averaged(averages)
-        if published := results.suite.get("published"):
-            yield tables_accuracy.beside_published(
-                [g for g in groups if g.cell.condition == statistics.CLEAR], published
-            )
-        yield tables_accuracy.band(groups)
-        yield tables_accuracy.metrics(groups)
-        yield tables_cost.timing(groups)
-        yield tables_about.flights_nees(groups)
-    if trials := campaigns(results):
-        yield tables_about.trials_nees(trials)
-    yield tables_about.failures(flights, [task for task in results.tasks if task.kind is not Kind.FLIGHT])
-    yield tables_about.evo_commands(flights)
-    yield tables_about.provenance(results)
+# Accuracy -----------------------------------------------------------------------------------------------------------
+
+
+def _accuracy(study: Study) -> Table:
+    """All that a reader needs to know of an ATE beside it."""
+
+    def entries(own: pd.DataFrame) -> Entries:
+        ate, closed = own["ate_m"], own.loc[own["evaluated"], "loop_closed"].eq(True)
+        return {
+            "seeds": text(seeds_text(own)),
+            "ATE, position + yaw [m]": number(ate.mean(), ".3f"),
+            **{f"{key} [m]": number(getattr(ate, key)(), ".3f") for key in ("std", "median", "min", "max")},
+            "ATE [% of path]": mean(own["ate_percent"], ".2f"),
+            "ATE, SE(3) [m]": mean(own["ate_se3_m"], ".3f"),
+            "orientation [deg]": mean(own["orientation_deg"], ".2f"),
+            "yaw [deg]": mean(own["yaw_deg"], ".2f"),
+            "scale by Sim(3)": mean(own["scale"], ".3f"),
+            **_circumstances(own),
+            "loop closure": text(("yes" if closed.all() else "some") if closed.any() else ""),
+        }
+
+    caption = (
+        "Mean over the seeds of each flight's RMSE, ± the sample standard deviation, and the range; aligned as the "
+        "column says, over the whole path. Failed flights are counted under seeds and have no error. "
+        f"{count_caption(study.flights)} {data_caption(study.flights)}"
+    )
+    return Table("accuracy", "Accuracy", caption, _by_cell(study, entries))
+
+
+def _averages(study: Study) -> Table:
+    rows, over = [], {}
+    for average in averages(study.flights):
+        names = list(average.means.index)
+        over[average.data, tuple(names)] = f"{average.data}: {', '.join(names) or 'none'}."
+        entries = {
+            "data": text(average.data),
+            "condition": text(condition_text(average.condition, average.level)),
+            **_contender(average.detector, average.backend),
+            "sequences": text(f"{len(names)} of {average.of}"),
+            "ATE, position + yaw [m]": number(average.means["ate_m"].mean(), ".3f"),
+            "std over sequences [m]": number(average.means["ate_m"].std(), ".3f"),
+            "ATE, SE(3) [m]": mean(average.means["ate_se3_m"], ".3f"),
+            "orientation [deg]": mean(average.means["orientation_deg"], ".2f"),
+        }
+        rows.append(TableRow(entries, links(average.flights, named=True), average.detector, average.backend))
+    caption = (
+        "Means over the sequences on which every flight of every contender was complete; real, rendered and simulated "
+        f"recordings are never averaged together. Start offsets and resets are in the table of accuracy. Averaged "
+        f"over: {' '.join(over.values())}"
+    )
+    return Table("averages", "Averages over sequences", caption, tuple(rows))
+
+
+def _published(study: Study) -> Table | None:
+    """ATE by sequence: what was published, then what was measured here; each row with its own alignment."""
+    published = study.results.suite.get("published") or ()
+    found = study.flights[study.flights["condition"] == CLEAR]
+    flown = [key for key, _ in groups(found, ("sequence", "data"))]
+    elsewhere = dict.fromkeys(name for system in published for name in system["ate_m"])
+    names = [*flown, *((name, None) for name in elsewhere if name not in dict(flown))]
+    headings = {at: f"{at[0]} [m]" if at[1] in (Data.REAL, None) else f"{at[0]} ({at[1]}) [m]" for at in names}
+
+    def about(system: str, alignment: str, source: str) -> Entries:
+        by = ALIGNED_BY.get(alignment, alignment)
+        return {"system": text(system), "alignment": text(by), "source": text(source)}
+
+    rows = []
+    for system in published:
+        values = {headings[at]: number(system["ate_m"].get(at[0]), ".3f") for at in names}
+        entries = about(system["system"], system["alignment"], f"published: {system['source']}")
+        rows.append(TableRow({**entries, **values}))
+    alignments = ["posyaw", "se3", *(["sim3"] if any(each["alignment"] == "sim3" for each in published) else [])]
+    for (detector, backend), own in groups(found, CONTENDER) if published else ():
+        for alignment in alignments:
+            values = {
+                headings[at]: _over_seeds(study, here, alignment) for at, here in groups(own, ("sequence", "data"))
+            }
+            entries = about(f"{detector} + {backend}", alignment, "measured here")
+            rows.append(TableRow({**entries, **values}, links(own, named=True), detector, backend))
+    caption = (
+        "Published ATE beside what was measured here, never averaged together. Alignments differ by row: compare only "
+        "rows of the same one. Published rows are of the real recordings; in a column marked rendered or simulated the "
+        "measured rows are of that stand-in, which is another recording. Measured: mean over the seeds, and of how "
+        "many where some have no error; start offsets, completion and resets are in the table of accuracy. "
+        f"{data_caption(found)}"
+    )
+    return Table("published", "ATE beside published systems", caption, tuple(rows))
+
+
+def _over_seeds(study: Study, own: pd.DataFrame, alignment: str) -> Entry:
+    if alignment == "sim3":
+        values = pd.Series([ate_sim3_m(study.errors(flight)) for flight in records(own)], dtype=float)
+    else:
+        values = own["ate_m" if alignment == "posyaw" else "ate_se3_m"]
+    if not values.count():
+        return text(seeds_text(own))
+    return mean(values, ".3f", "" if values.count() == len(own) else f" ({values.count()} of {len(own)})")
+
+
+def _band(study: Study) -> Table | None:
+    """Percent of the time inside the band that somebody claims, with the worst of the seeds."""
+    if (claimed := study.results.reference.band) is None:
+        return None
+    cm = f"{100 * claimed.half_width_m:g} cm"
+
+    def entries(own: pd.DataFrame) -> Entries | None:
+        errors = filter(None, map(study.errors, records(own)))
+        inside = pd.DataFrame([inside_band(each, claimed.half_width_m) for each in errors])
+        if inside.empty:
+            return None
+        return {
+            "seeds": text(seeds_text(own)),
+            **{f"|{axis}| within {cm} [% of time]": mean(inside[axis], ".1f") for axis in "xyz"},
+            f"all within {cm} [% of time]": mean(inside["all"], ".1f"),
+            **{f"{axis}, worst seed [% of time]": number(inside[axis].min(), ".1f") for axis in claimed.axes},
+        }
+
+    caption = (
+        f"Part of the estimated time in which the position error stays within {cm} along each axis of the truth's "
+        f"world (z is the altitude), after alignment by position and yaw; mean over the seeds. {claimed.claim} Time "
+        f"that was not estimated is not in it: see completion. {data_caption(study.flights)}"
+    )
+    return Table("band", f"Within ±{cm}", caption, _by_cell(study, entries))
+
+
+def _metrics(study: Study) -> Table:
+    """What the metrics that the suite asked for say, a column a figure."""
+    names = [str(name) for name in study.flights.columns if str(name).startswith("metrics.")]
+    left_out = Counter(
+        reason for told in study.flights["metrics_left_out"] if isinstance(told, Mapping) for reason in told.items()
+    )
+
+    def entries(own: pd.DataFrame) -> Entries | None:
+        figures = {name.removeprefix("metrics."): mean(own[name], ".4g") for name in names}
+        return {"seeds": text(seeds_text(own)), **figures} if names or left_out else None
+
+    why = "".join(f"No {name} ({n} of the flights): {reason}. " for (name, reason), n in left_out.items())
+    caption = (
+        "Mean over the seeds that have one, ± the standard deviation, of what the suite's metrics say of each flight. "
+        f"{why}{data_caption(study.flights)}"
+    )
+    return Table("metrics", "Metrics", caption, _by_cell(study, entries))
+
+
+# Hard conditions ----------------------------------------------------------------------------------------------------
+
+
+def _levels(study: Study) -> Table:
+    """A row for each point of each curve."""
+    rows = []
+    for point in records(curves(study.flights)):
+        own, percent = point["flights"], 100.0
+        entries = {
+            **{key: text(point[key]) for key in ("sequence", "data", "condition")},
+            "level": number(point["level"], "g"),
+            **_contender(point["detector"], point["backend"]),
+            "flights": text(seeds_text(own)),
+            "success [%]": number(percent * point["success"], ".0f"),
+            "95 % from [%]": number(percent * point["success_low"], ".0f"),
+            "to [%]": number(percent * point["success_high"], ".0f"),
+            "ATE, position + yaw, geometric mean [m]": number(point["ate_m"], ".3f"),
+            "95 % from [m]": number(point["low"], ".3f"),
+            "to [m]": number(point["high"], ".3f"),
+            "ATE, mean [m]": number(own["ate_m"].mean(), ".3f"),
+            "std [m]": number(own["ate_m"].std(), ".3f"),
+            **_circumstances(own),
+        }
+        rows.append(TableRow(entries, links(own), point["detector"], point["backend"]))
+    caption = (
+        f"Success: complete, with an ATE below {SUCCESS_PERCENT:g} % of the path, of all flights, failed ones too, "
+        "with Wilson's 95 % interval. ATE: of the flights that have one, so that it flatters where others failed, with "
+        "Student's 95 % interval in the logarithm, its spread pooled over the levels of the curve. Level 0 is the "
+        f"flight without degradation. {count_caption(study.flights)} {data_caption(study.flights)}"
+    )
+    return Table("stress", "Hard conditions by level", caption, tuple(rows))
+
+
+def _duels(study: Study) -> Table | None:
+    """Against the baseline: a row for each condition, level and contender; last, over all of them."""
+    if not study.is_stress or (baseline := study.baseline) is None:
+        return None
+    rows = []
+    for duel in duels(study.flights, baseline):
+        entries = {
+            "data": text(duel.data),
+            "condition": text(duel.condition or "all degraded"),
+            "level": number(duel.level, "g"),
+            **_contender(duel.detector, duel.backend),
+            **{key: number(getattr(duel, key), "d") for key in ("won", "lost", "tied")},
+            f"ATE over that of {baseline}, geometric mean": number(duel.ratio, ".2f"),
+            "of pairs": number(duel.both, "d"),
+            "p, sign test": number(duel.p_value, ".3f"),
+        }
+        # A row that is over others, which have them, has no links.
+        pairs = duel.pairs if duel.condition else duel.pairs[:0]
+        theirs = links(pairs.assign(folder=pairs["folder_baseline"]), whose=", baseline")
+        rows.append(TableRow(entries, links(pairs) + theirs, duel.detector, duel.backend))
+    caption = (
+        f"Flight by flight against {baseline}: same recording, condition, level, back-end and seed, "
+        f"{study.flights.groupby(['condition', 'level']).ngroups} conditions and levels. A complete flight wins "
+        "against one that is not, an ATE against none, else the smaller one; tied: equal, or neither has one. The "
+        f"ratio is of the pairs in which both have an ATE; below 1 is better than {baseline}. The two-sided sign test "
+        "takes the pairs for independent, which flights of one recording are not quite. All degraded: the rows above "
+        f"together, but for the clear ones. {data_caption(study.flights)}"
+    )
+    return Table("duels", f"Against {baseline}", caption, tuple(rows))
+
+
+# Speed --------------------------------------------------------------------------------------------------------------
+
+
+def _detector_fps(study: Study) -> Table | None:
+    """Frames a second as quoted and as measured here, apart; detectors that could not take part with the reason."""
+    timed = study.speeds
+    if timed.empty:
+        return None
+    quoted = study.results.reference.speed
+    speeds = quoted.detectors if quoted else {}
+    rows = []
+    known = [*records(timed)]
+    unknown = [name for name in speeds if name not in {row["detector"].partition(":")[0] for row in known}]
+    known += [{"detector": name, "status": "absent", "error": "no such detector is installed"} for name in unknown]
+    for row in known:
+        speed = speeds.get(row["detector"].partition(":")[0])
+        entries = {
+            "detector": text(row["detector"]),
+            "quoted [FPS]": number(speed.fps if speed else None, ".0f"),
+            "quoted from": text(speed.source if speed else ""),
+            "measured here [FPS]": number(row.get("fps"), ".1f"),
+        }
+        if row["status"] == "absent":
+            entries["quartiles [FPS]"] = text(f"not measured: {row['error']}")
+        else:
+            entries |= {
+                "quartiles [FPS]": text(f"{row['fps_low']:.1f} to {row['fps_high']:.1f}"),
+                "median [ms]": number(row["ms"], ".2f"),
+                "keypoints": number(row["keypoints"], ".0f"),
+                "calls": number(int(row["calls"]), "d"),
+                "on": text(row["on"]),
+            }
+        rows.append(TableRow(entries, (), row["detector"]))
+    about = f" Quoted: {quoted.title}, which compares with nothing that was measured here." if quoted else ""
+    title = f"Detector speed beside {quoted.title}" if quoted else "Detector speed"
+    return Table("detector_fps", title, f"{speed_caption(timed)}{about}", tuple(rows))
+
+
+def speed_caption(timed: pd.DataFrame) -> str:
+    """How detectors were timed."""
+    row = timed.iloc[0]
+    return (
+        f"At {row['width']:.0f} x {row['height']:.0f} pixels with {row['max_points']:.0f} keypoints asked for, one "
+        f"image at a time: median of {row['rounds']:.0f} rounds over {row['image_count']:.0f} images "
+        f"({row['images']}), on {'; '.join(row['devices'])}."
+    )
+
+
+def _timing(study: Study) -> Table:
+    """Milliseconds a frame by stage, a row a contender and data kind."""
+    rows = []
+    times = timed(study.flights)
+    for stages in records(stage_means(times).reset_index()):
+        data, detector, backend = who = [stages.pop(key) for key in ("data", *CONTENDER)]
+        own = times[(times[["data", *CONTENDER]] == who).all(axis="columns")]
+        entries = {
+            "data": text(data),
+            **_contender(detector, backend),
+            "flights": number(len(own), "d"),
+            "real-time factor": mean(own["real_time_factor"], ".2f"),
+            "real-time factor, min": number(own["real_time_factor"].min(), ".2f"),
+            "all [ms a frame]": number(own["frame_ms"].mean(), ".1f"),
+            "std [ms a frame]": number(own["frame_ms"].std(), ".1f"),
+            **{f"{stage} [ms]": number(ms if ms > 0.0 else None, ".2f") for stage, ms in stages.items()},
+        }
+        rows.append(TableRow(entries, links(own, named=True), detector, backend))
+    caption = (
+        "Mean over all flights of a contender that initialised; stages add up to the whole, without reading and "
+        "decoding images. Real-time factor: seconds of flight by seconds of computing, in each flight's own process. "
+        f"{machines(study.flights)} {data_caption(study.flights)}"
+    )
+    return Table("timing", "Time a frame", caption, tuple(rows))
+
+
+# What a reader needs to trust the others ----------------------------------------------------------------------------
+
+
+def _nees_of_flights(study: Study) -> Table:
+    """Mean NEES by part of the pose, where a back-end stated a covariance."""
+    parts = {f"nees.{part}": f"{part}, ideally {dof}" for part, dof in PARTS.items() if f"nees.{part}" in study.flights}
+
+    def entries(own: pd.DataFrame) -> Entries | None:
+        figures = {title: mean(own[column], ".2f") for column, title in parts.items()}
+        stated = any(entry.value is not None for entry in figures.values())
+        return {"seeds": text(seeds_text(own)), **figures} if stated else None
+
+    caption = (
+        "Normalised estimation error squared, position and yaw fixed at the first pose: mean over time, then over the "
+        "seeds. Above the ideal, the number of degrees of freedom, a filter is surer of itself than it should be. "
+        f"Errors within a flight hang together, so a few flights are no test at a level. {data_caption(study.flights)}"
+    )
+    return Table("nees_flights", "Consistency (NEES) of the flights", caption, _by_cell(study, entries))
+
+
+def _nees_of_trials(study: Study) -> Table:
+    """The same of simulated trials, with the bounds within which an honest filter's mean lies, and failures."""
+    rows = []
+    for (flight, backend), own in groups(study.trials, ("sequence", "backend")):
+        failures = [f"{n} {kind}" for kind, n in own["failure"].value_counts().items()]
+        entries = {
+            "flight": text(flight),
+            "back-end": text(backend),
+            "trials": number(len(own), "d"),
+            "failed": text(", ".join(failures) or "none"),
+        }
+        for part, nees in study.nees(own).items():
+            entries[f"{part} NEES, ideally {nees.dof}"] = number(nees.mean, ".2f")
+            low, high = nees.mean_band
+            entries[f"{part}, 95 % if honest"] = text(f"{low:.2f} to {high:.2f}")
+            entries[f"{part}, verdict"] = text(nees.verdict)
+        entries |= {
+            "ATE, position + yaw, RMS [m]": number((own["ate_m"] ** 2).mean() ** 0.5, ".3f"),
+            "worst [m]": number(own["ate_m"].max(), ".3f"),
+            "orientation, RMS [deg]": number((own["orientation_deg"] ** 2).mean() ** 0.5, ".2f"),
+            "completion [%]": number(100.0 * own["completion"].mean(), ".1f"),
+            "resets, all trials": number(own["resets"].sum(min_count=1), ".0f"),
+        }
+        rows.append(TableRow(entries, links(own), None, backend))
+    caption = (
+        "Simulated tracks and IMU with EuRoC's noise, true calibration, the back-end's own initialisation. NEES: mean "
+        "over time, then over the trials, beside the 95 % bounds for the mean of that many independent samples. Trials "
+        "that diverged are in the errors; those that never initialised or crashed have none, and are counted."
+    )
+    return Table("nees", "Consistency (NEES)", caption, tuple(rows))
+
+
+def _failures(study: Study) -> Table:
+    """A row for each flight that something went wrong in, and for each other task that failed."""
+    flown = records(study.flights[study.flights["outcome"] != COMPLETE])
+    others = [row for row in study.results.rows if row["kind"] != "flight" and row["status"] == "failed"]
+    rows = []
+    for row in (*flown, *({**row, "outcome": "failed", "reason": row["error"]} for row in others)):
+        about = {key: text(row[key]) for key in ("task", "outcome", "reason")}
+        folder = (("folder", row["folder"]),) if row["folder"] else ()
+        entries = {**about, "attempts": number(row["attempts"], ".0f")}
+        rows.append(TableRow(entries, folder, row["detector"], row["backend"]))
+    caption = (
+        "Every task that failed, never initialised, could not be evaluated or is not complete; all are counted in the "
+        "other tables."
+    )
+    return Table("failures", "What went wrong", caption, tuple(rows))
+
+
+def _evo(study: Study) -> Table:
+    """The commands that re-derive each ATE by SE(3), to be run in the results folder."""
+    rows = []
+    for flight in records(study.flights[study.flights["ate_se3_m"].notna()]):
+        estimate = "trajectory_loop.tum" if flight["loop_closed"] is True else "trajectory.tum"
+        truth, estimate = (quote(f"{flight['folder']}/{file}") for file in (MATCHED_TRUTH, estimate))
+        entries = {
+            "task": text(flight["task"]),
+            "ATE, SE(3) [m]": number(flight["ate_se3_m"], ".6f"),
+            "command": text(f"evo_ape tum {truth} {estimate} --align"),
+        }
+        rows.append(TableRow(entries, (("run", flight["folder"]),), flight["detector"], flight["backend"]))
+    caption = (
+        "Run in the results folder; rmse is the ATE after SE(3) alignment. ground_truth_matched.tum is the true pose "
+        "at every estimated stamp, as `vioframe evaluate` pairs them. evo has no alignment by position and yaw."
+    )
+    return Table("evo", "Check it with evo", caption, tuple(rows), code="command")
+
+
+def _provenance(study: Study) -> Table:
+    """What everything was computed with; several values of one thing where they differ."""
+    tasks = {row["task"]: row for row in study.results.rows}.values()
+    counts: dict[str, Counter[str]] = {}
+    for row in tasks:
+        for what, value in _facts(row["machine"] or {}):
+            counts.setdefault(what, Counter())[value] += 1
+        if row["code"]:
+            counts.setdefault("digest of the code", Counter())[row["code"]] += 1
+    rows = [
+        TableRow({"what": text(what), "value": text(value), "tasks": number(n, "d")})
+        for what, values in counts.items()
+        for value, n in values.items()
+    ]
+    caption = f"What the {len(tasks)} tasks were computed with; several values of one thing where they differ."
+    return Table("provenance", "Machine and versions", caption, tuple(rows))
+
+
+def _facts(machine: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+    for fact in dict.fromkeys((*_FACTS, *machine)):
+        if (value := machine.get(fact)) is not None and fact != "versions":
+            yield fact, value if isinstance(value, str) else json.dumps(value).strip('{}"')
+    yield from machine.get("versions", {}).items()
+
+
+_TABLES: tuple[Callable[[Study], Table | None], ...] = (
+    *(_detector_fps, _levels, _duels, _accuracy, _averages, _published, _band, _metrics, _timing),
+    *(_nees_of_flights, _nees_of_trials, _failures, _evo, _provenance),
+)
+
+
+# What several tables have -------------------------------------------------------------------------------------------
+
+
+def _by_cell(study: Study, entries: Callable[[pd.DataFrame], Entries | None]) -> tuple[TableRow, ...]:
+    """A row for each group of flights that differ by their seed alone and of which there is something to say."""
+    rows = []
+    for cell, own in groups(study.flights):
+        if (said := entries(own)) is not None:
+            data, sequence, condition, level, detector, backend = cell
+            about = {"sequence": sequence, "data": data, "condition": condition_text(condition, level)}
+            labels = {**{key: text(value) for key, value in about.items()}, **_contender(detector, backend)}
+            rows.append(TableRow({**labels, **said}, links(own), detector, backend))
+    return tuple(rows)
+
+
+def _contender(detector: str, backend: str) -> Entries:
+    return {"detector": text(detector), "back-end": text(backend)}
+
+
+def _circumstances(own: pd.DataFrame) -> Entries:
+    """What no ATE can be read without."""
+    low, high = own["start_s"].min(), own["start_s"].max()
+    start = "" if pd.isna(low) else f"{low:g}" if low == high else f"{low:g} to {high:g}"
+    return {
+        "start offset [s]": text(start),
+        "initialised after [s]": mean(own["initialised_after_s"], ".2f"),
+        "completion [%]": number(100.0 * own["completion"].mean(), ".1f"),
+        "resets, all seeds": number(own["resets"].sum(min_count=1), ".0f"),
+    }
+
+
+def links(own: pd.DataFrame, *, named: bool = False, whose: str = "") -> tuple[tuple[str, str], ...]:
+    """(seed, folder relative to the results) of flights or trials that left one, ``named`` by their sequence."""
+    rows = records(own[own["folder"].notna()])
+    return tuple((f"{row['sequence'] + ', ' if named else ''}seed {row['seed']}{whose}", row["folder"]) for row in rows)
