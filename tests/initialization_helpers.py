@@ -96,4 +96,4 @@ def seen_by(packets: Sequence[Packet], camera: Camera) -> list[Packet]:
 
 
 def without_points(tracks: FrameTracks) -> FrameTracks:
-    return FrameTracks(tracks.t_ns, np.empty(0, np.int64), np.empty((0, 2)), np.empty((0, 2)))
+    return FrameTracks.none(tracks.t_ns)

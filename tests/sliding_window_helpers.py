@@ -21,7 +21,7 @@ from vioframe.io.calibration import packaged_calibration
 from vioframe.simulation import simulated_sequence
 from vioframe.types import Float
 
-CAMERA = packaged_calibration("euroc").camera
+CAMERA = packaged_calibration("euroc").cameras[0].model
 NATURAL = np.repeat([0.01, 0.05, 0.1, 0.005, 0.05], 3)
 """Errors of a state that are large but linear enough: rad, m, m/s, rad/s, m/s^2."""
 NATURAL_CALIBRATION = np.repeat([0.005, 0.01, 0.002], [3, 3, 1])
@@ -54,7 +54,7 @@ def flown_window(
         imu = join_segments([imu for imu, _ in sequence.packets[k + 1 : k + 6]])
         biases = np.zeros((2, 3)) if exact else rng.normal(size=(2, 3)) * [[0.002], [0.02]]
         readings.append(preintegrate(imu, *biases, sequence.calibration.imu))
-    calibrated = Calibrated(sequence.calibration.R_BC, sequence.calibration.p_BC, offset_s)
+    calibrated = Calibrated(sequence.calibration.cameras[0].R_BC, sequence.calibration.cameras[0].p_BC, offset_s)
     sightings, points = _sightings(states, calibrated, camera, landmarks, noise_px, on_sphere, rng)
     x = Variables(states, calibrated, points)
     prior = prior_on(x, 2, rng)

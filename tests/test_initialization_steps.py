@@ -37,8 +37,8 @@ from vioframe.simulation.imu import ImuErrors, read_imu
 from vioframe.simulation.tracks import cut_segments, simulated_sequence
 from vioframe.types import DBA, DTHETA, GRAVITY_M_S2, Float, FrameTracks, ImuNoise, ImuSegment
 
-CALIBRATION = packaged_calibration("euroc")
-PIXEL = 1.0 / CALIBRATION.camera.focal_px
+CAMERA = packaged_calibration("euroc").cameras[0]
+PIXEL = 1.0 / CAMERA.model.focal_px
 BIAS_GYRO, BIAS_ACCEL = np.array([-0.02, 0.03, 0.08]), np.array([-0.05, 0.1, 0.08])
 ZERO = np.zeros(3)
 # Loud, so that a covariance that forgot the readings' noise would be caught.
@@ -59,12 +59,12 @@ class Scene:
     @property
     def camera(self) -> Float:
         """True camera positions from the first, in the axes of the first body."""
-        p_WC = self.truth.p_WB + self.truth.R_WB @ CALIBRATION.p_BC
+        p_WC = self.truth.p_WB + self.truth.R_WB @ CAMERA.p_BC
         return (p_WC - p_WC[0]) @ self.truth.R_WB[0]
 
     @property
     def R_B0C(self) -> Float:
-        return self.truth.R_WB[0].T @ self.truth.R_WB @ CALIBRATION.R_BC
+        return self.truth.R_WB[0].T @ self.truth.R_WB @ CAMERA.R_BC
 
 
 def scene(
@@ -76,7 +76,7 @@ def scene(
 ) -> Scene:
     """Sixty landmarks 2 to 8 m deep, or on a tilted plane, observed with noise of ``pixels``."""
     rng = np.random.default_rng(seed)
-    path = flight("figure_eight", 4.0, CALIBRATION.R_BC)
+    path = flight("figure_eight", 4.0, CAMERA.R_BC)
     rate = noise.rate_hz if noise else 1000.0
     imu_s, frames_s = 1.0 + np.arange(round(2.0 * rate) + 1) / rate, 1.0 + 0.2 * np.arange(11)
     errors = ImuErrors(bias_gyro_B=tuple(BIAS_GYRO), bias_accel_B=tuple(bias_accel))
@@ -87,7 +87,7 @@ def scene(
     motion = path.at(frames_s)
     truth = StateArrays(motion.R_WB, motion.p_WB, motion.v_WB, readings.bias_gyro_B[at], readings.bias_accel_B[at])
 
-    R_WC, p_WC = truth.R_WB @ CALIBRATION.R_BC, truth.p_WB + truth.R_WB @ CALIBRATION.p_BC
+    R_WC, p_WC = truth.R_WB @ CAMERA.R_BC, truth.p_WB + truth.R_WB @ CAMERA.p_BC
     rays = np.column_stack([rng.uniform(-0.6, 0.6, 60), rng.uniform(-0.4, 0.4, 60), np.ones(60)])
     depth = 4.0 / (1.0 + 0.4 * rays[:, 0] - 0.3 * rays[:, 1]) if plane else rng.uniform(2.0, 8.0, 60)
     p_WF = (rays * depth[:, None]) @ R_WC[5].T + p_WC[5]
@@ -102,19 +102,19 @@ def scene(
 
 def problem_of(s: Scene) -> tuple[Problem, Variables]:
     """The bundle adjustment of a scene, and its true values."""
-    camera = Calibrated(CALIBRATION.R_BC, CALIBRATION.p_BC)
+    camera = Calibrated(CAMERA.R_BC, CAMERA.p_BC)
     R_WC, p_WC = camera_poses(s.truth, camera)
     host = s.window.seen.argmax(axis=0)
     p_C = np.einsum("lji,lj->li", R_WC[host], s.p_WF - p_WC[host])
     truth = Variables(s.truth, camera, np.column_stack([p_C[:, :2] / p_C[:, 2:], 1.0 / p_C[:, 2]]))
-    return adjustment(s.window, s.imu(), truth, CALIBRATION.camera.focal_px), truth
+    return adjustment(s.window, s.imu(), truth, CAMERA.model.focal_px), truth
 
 
 class TestGyroBias:
     @pytest.mark.parametrize("plane", [False, True])
     def test_exact_on_exact_data(self, plane: bool):
         s = scene(plane=plane)
-        bias, distance = estimate_gyro_bias(s.window, s.imu(ZERO, ZERO), CALIBRATION.R_BC, PIXEL, 0.2)
+        bias, distance = estimate_gyro_bias(s.window, s.imu(ZERO, ZERO), CAMERA.R_BC, PIXEL, 0.2)
         # What is left is the pull of the prior and the first-order correction of the readings.
         np.testing.assert_allclose(bias, BIAS_GYRO, atol=2e-4)
         assert np.nanmax(distance) < 0.1
@@ -125,7 +125,7 @@ class TestGyroBias:
         estimates = []
         for seed in range(16):
             s = scene(1.0, seed, plane)
-            bias, _ = estimate_gyro_bias(s.window, s.imu(ZERO, ZERO), CALIBRATION.R_BC, PIXEL, 0.2)
+            bias, _ = estimate_gyro_bias(s.window, s.imu(ZERO, ZERO), CAMERA.R_BC, PIXEL, 0.2)
             estimates.append(bias)
         off = np.stack(estimates) - BIAS_GYRO
         scatter = off.std(axis=0)
@@ -139,7 +139,7 @@ class TestGyroBias:
         wrong = np.arange(0, len(s.window.ids), 8)
         xy[:, wrong] = xy[:, wrong[::-1]] + np.random.default_rng(0).normal(0.0, 0.05, xy[:, wrong].shape)
         window = replace(s.window, xy=xy, seen=~np.isnan(xy[..., 0]))
-        bias, distance = estimate_gyro_bias(window, s.imu(ZERO, ZERO), CALIBRATION.R_BC, PIXEL, 0.2)
+        bias, distance = estimate_gyro_bias(window, s.imu(ZERO, ZERO), CAMERA.R_BC, PIXEL, 0.2)
         np.testing.assert_allclose(bias, BIAS_GYRO, atol=0.008)
         good = np.setdiff1d(np.arange(len(window.ids)), wrong)
         assert np.nanmedian(distance[wrong]) > 3.0 > np.nanmax(distance[good])
@@ -162,7 +162,7 @@ class TestStructure:
             s = scene(2.0, seed)
             structure = solve_structure(s.window, s.R_B0C, 2.0 * PIXEL)
             true_size, size = np.linalg.norm(s.camera), np.linalg.norm(structure.position)
-            p_C = np.einsum("kji,klj->kli", s.truth.R_WB @ CALIBRATION.R_BC, s.p_WF - s.truth.p_WB[:, None])
+            p_C = np.einsum("kji,klj->kli", s.truth.R_WB @ CAMERA.R_BC, s.p_WF - s.truth.p_WB[:, None])
             use = s.window.seen & structure.good
             ratio.append(np.median(structure.depth[use] / p_C[..., 2][use]) * true_size / size)
         assert abs(np.mean(ratio) - 1.0) < 0.01
@@ -178,7 +178,7 @@ class TestStructure:
 class TestAlignment:
     def test_exact_on_exact_data(self):
         s = scene()
-        alignment = align(s.camera / 3.7, s.imu(BIAS_GYRO, ZERO), CALIBRATION.p_BC, 10.0)
+        alignment = align(s.camera / 3.7, s.imu(BIAS_GYRO, ZERO), CAMERA.p_BC, 10.0)
         R_0, g_B0 = s.truth.R_WB[0], s.truth.R_WB[0].T @ [0.0, 0.0, -GRAVITY_M_S2]
         np.testing.assert_allclose(alignment.scale, 3.7, rtol=1e-3)
         np.testing.assert_allclose(alignment.g_B0, g_B0, atol=5e-3)
@@ -189,7 +189,7 @@ class TestAlignment:
 
     def test_mirrored_path_has_negative_scale(self):
         s = scene()
-        assert align(-s.camera, s.imu(BIAS_GYRO, ZERO), CALIBRATION.p_BC, 0.15).scale < 0.0
+        assert align(-s.camera, s.imu(BIAS_GYRO, ZERO), CAMERA.p_BC, 0.15).scale < 0.0
 
     @pytest.mark.parametrize("seed", range(5))
     def test_gravity_sphere_holds_the_global_minimum(self, seed: int):
@@ -233,7 +233,7 @@ class TestBundleAdjustment:
         start = s.truth.retract(rng.normal(0.0, sigma, (11, 15)))
         points = truth.landmarks + rng.normal(0.0, [0.01, 0.01, 0.05], truth.landmarks.shape)
         start = replace(truth, states=start, landmarks=points)
-        problem = adjustment(s.window, s.imu(), start, CALIBRATION.camera.focal_px)
+        problem = adjustment(s.window, s.imu(), start, CAMERA.model.focal_px)
         solution = adjusted(problem, start)
         states = solution.variables.states
         assert solution.converged
@@ -321,7 +321,10 @@ class TestWindow:
             readings = np.full((len(stamps), 3), float(k))
             xy = np.column_stack([ids, np.full(len(ids), k)]).astype(float)
             packets.append(
-                (ImuSegment(stamps, readings, readings), FrameTracks(int(t_ns[k]), np.array(ids), xy, xy / 10))
+                (
+                    ImuSegment(stamps, readings, readings),
+                    FrameTracks(int(t_ns[k]), np.array(ids), np.zeros(len(ids), np.int64), xy, xy / 10),
+                )
             )
         window = build_window(packets, [0, 2, 3], 2, 10)
         np.testing.assert_array_equal(window.ids, [0, 1])

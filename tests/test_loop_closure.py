@@ -24,12 +24,9 @@ from vioframe.testing import check_loop_closer
 from vioframe.types import Estimate, Status
 from vioframe_pose_graph import vioframe_loop_closers
 from vioframe_pose_graph.closer import PoseGraph
-from vioframe_pose_graph.descriptors import image_angle_deg
-from vioframe_pose_graph.hamming import distance, match
-from vioframe_pose_graph.index import DescriptorIndex
-from vioframe_pose_graph.resection import reprojection, resect
-from vioframe_pose_graph.two_point import ransac, solve
-from vioframe_pose_graph.verification import Correspondences, residuals
+from vioframe_pose_graph.matching import DescriptorIndex, distance, match
+from vioframe_pose_graph.place import image_angle_deg, reprojection, resect
+from vioframe_pose_graph.verification import Correspondences, ransac, residuals, solve
 
 FOCAL_PX = CALIBRATION.camera.focal_px
 

@@ -19,13 +19,12 @@ from vioframe.simulation import TrackSequence, simulated_sequence
 from vioframe.testing import check_backend
 from vioframe.types import NS_PER_S, Float, Status
 from vioframe_loose_ekf import vioframe_backends
-from vioframe_loose_ekf.adjustment import adjust
 from vioframe_loose_ekf.backend import LooseEkf
 from vioframe_loose_ekf.measurement import VisionPose, predicted_pose
 from vioframe_loose_ekf.odometry import Event, VisualOdometry
 from vioframe_loose_ekf.options import LooseEkfOptions
 from vioframe_loose_ekf.resection import resect
-from vioframe_loose_ekf.vision_map import Keyframe, VisionMap
+from vioframe_loose_ekf.vision_map import Keyframe, VisionMap, adjust
 
 SIGMA = 1.0 / 458.0
 

@@ -14,7 +14,7 @@ from vioframe.types import DP, DTHETA, ImuSegment, NavState, g_W
 from vioframe_loose_ekf import measurement
 from vioframe_loose_ekf.fusion import Fusion
 from vioframe_loose_ekf.measurement import VisionPose
-from vioframe_loose_ekf.reprojection import reproject
+from vioframe_loose_ekf.resection import reproject
 from vioframe_loose_ekf.state import DP_WA, DTHETA_WV, IMU, LOG_SCALE, SIZE, FilterState
 
 CAMERA = CALIBRATION.cameras[0]

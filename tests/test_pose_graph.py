@@ -9,11 +9,10 @@ import pytest
 from scipy.stats import chi2
 
 from vioframe.geometry.so3 import rotation_z
-from vioframe_pose_graph.correction import carry
-from vioframe_pose_graph.drift import Odometry
-from vioframe_pose_graph.graph import Edges, residuals, root_of, solve, uncertainty
+from vioframe_pose_graph.closer import carry
+from vioframe_pose_graph.consistency import Odometry
+from vioframe_pose_graph.graph import Edges, residuals, root_of, solve, solve_robustly, uncertainty
 from vioframe_pose_graph.options import PoseGraphOptions
-from vioframe_pose_graph.robust import solve_robustly
 
 # The odometry of these tests drifts a few times as fast as a good one.
 OPTIONS = PoseGraphOptions(position_drift=0.1)

@@ -13,9 +13,8 @@ from vioframe.estimation.recovery import noise_over
 from vioframe.geometry import so3
 from vioframe.stopwatch import Stopwatch
 from vioframe.types import Estimate, Float, FrameTracks, ImuSegment, Start, Status
-from vioframe_loose_ekf.drifts import Drifts
 from vioframe_loose_ekf.fusion import Fusion
-from vioframe_loose_ekf.odometry import Event, Sighting, VisualOdometry
+from vioframe_loose_ekf.odometry import Drifts, Event, Sighting, VisualOdometry
 from vioframe_loose_ekf.options import LooseEkfOptions
 
 # Poses that do not fit for this long say that the vision frame is wrong, not they.

@@ -11,8 +11,7 @@ from vioframe_pose_graph.options import PoseGraphOptions
 
 def pose_graph(calibration: Calibration, options: PoseGraphOptions) -> LoopCloser:
     """Recognises places by ORB descriptors and corrects position and yaw by a pose graph that lets wrong loops go."""
-    from vioframe_pose_graph.closer import PoseGraph
-    from vioframe_pose_graph.warm_up import warm_up
+    from vioframe_pose_graph.closer import PoseGraph, warm_up
 
     warm_up()
     return PoseGraph(calibration, options)

@@ -13,18 +13,18 @@ from time import perf_counter
 
 import numpy as np
 
+from vioframe.geometry import so3
 from vioframe.geometry.so3 import rotation_z, yaw_of
 from vioframe.geometry.trajectory import Trajectory
 from vioframe.types import Calibration, Float, Int, Loop, LoopClosure, Status, Step
-from vioframe_pose_graph.consistency import GATE, agreed, measured, within_drift
-from vioframe_pose_graph.correction import carry
-from vioframe_pose_graph.drift import Odometry
-from vioframe_pose_graph.graph import Edges, root_of
+from vioframe_pose_graph.consistency import GATE, Odometry, agreed, measured, within_drift
+from vioframe_pose_graph.graph import Edges, root_of, solve_robustly
 from vioframe_pose_graph.keyframes import KeyframeSelector
+from vioframe_pose_graph.matching import DescriptorIndex, match
 from vioframe_pose_graph.options import PoseGraphOptions
 from vioframe_pose_graph.place import Keyframe, Place
 from vioframe_pose_graph.recognition import Recogniser, Sighting
-from vioframe_pose_graph.robust import solve_robustly
+from vioframe_pose_graph.verification import ransac
 
 
 class PoseGraph:
@@ -102,3 +102,52 @@ def _loop(sighting: Sighting, places: Sequence[Place], accepted: bool) -> Loop:
     yaw = float(yaw_of(later.R_WB)) + relation.yaw - heading
     yaw = float(np.arctan2(np.sin(yaw), np.cos(yaw)))
     return Loop(earlier.t_ns, later.t_ns, p_L, yaw, relation.inliers, accepted)
+
+
+def carry(
+    frames: tuple[Int, Int, Float, Float], keys: tuple[Int, Int, Float], p_corrected: Float, yaw: Float
+) -> tuple[Float, Float]:
+    """R_WB (F, 3, 3) and p_WB (F, 3) of all frames, moved along with the keyframes of their segment.
+
+    ``frames`` are the stamps, segments, attitudes and positions of all frames by the odometry, ``keys`` the stamps,
+    segments and positions of the keyframes; ``p_corrected`` (N, 3) and ``yaw`` (N,) are what the graph made of those. A
+    frame between two keyframes is where each of them would carry it, weighted by the time to the other, so that the
+    corrected path is as continuous as the odometry's own.
+    """
+    t_ns, segment, R_WB, p_WB = frames
+    key_t_ns, key_segment, key_p = keys
+    left, right, fraction = _between(t_ns, segment, key_t_ns, key_segment)
+    turn = np.arctan2(np.sin(yaw[right] - yaw[left]), np.cos(yaw[right] - yaw[left]))
+
+    def carried(by: Int) -> Float:
+        moved = np.einsum("fij,fj->fi", _rotations_z(yaw[by]), p_WB - key_p[by])
+        return np.asarray(p_corrected[by] + moved)
+
+    p = (1.0 - fraction)[:, None] * carried(left) + fraction[:, None] * carried(right)
+    return _rotations_z(yaw[left] + fraction * turn) @ R_WB, p
+
+
+def _between(t_ns: Int, segment: Int, key_t_ns: Int, key_segment: Int) -> tuple[Int, Int, Float]:
+    """(F,) the keyframes before and after each frame in its own segment, and how far it is from one to the other."""
+    first = np.searchsorted(key_segment, segment, side="left")
+    last = np.searchsorted(key_segment, segment, side="right") - 1
+    left = np.clip(np.searchsorted(key_t_ns, t_ns, side="right") - 1, first, last)
+    right = np.clip(left + 1, first, last)
+    span = np.maximum(key_t_ns[right] - key_t_ns[left], 1)
+    return left, right, np.clip((t_ns - key_t_ns[left]) / span, 0.0, 1.0)
+
+
+def _rotations_z(yaw: Float) -> Float:
+    """(N,) rad -> (N, 3, 3)."""
+    return so3.exp(np.column_stack([np.zeros((len(yaw), 2)), yaw]))
+
+
+def warm_up() -> None:
+    """Call every kernel once with the types that it will be called with."""
+    descriptors = np.zeros((2, 4), np.uint64)
+    index = DescriptorIndex()
+    index.add(descriptors, 0)
+    index.similarity(descriptors, 1)
+    match(descriptors, descriptors, np.zeros((2, 2)), 1, 1.0, 1.0)
+    side, cameras = np.zeros(2, np.int64), np.repeat(np.eye(3)[None], 2, axis=0)
+    ransac(np.eye(2, 3), np.zeros((2, 2)), side, cameras, np.zeros((2, 3)), np.array([[0, 1]]), 1.0)

@@ -8,10 +8,9 @@ import numpy as np
 
 from vioframe.stopwatch import Stopwatch
 from vioframe.types import NS_PER_S, Float
-from vioframe_pose_graph.descriptors import Describer
-from vioframe_pose_graph.index import DescriptorIndex
+from vioframe_pose_graph.matching import DescriptorIndex
 from vioframe_pose_graph.options import PoseGraphOptions
-from vioframe_pose_graph.place import Float32, Keyframe, Place, View, describe
+from vioframe_pose_graph.place import Describer, Float32, Keyframe, Place, View, describe
 from vioframe_pose_graph.verification import Relation, relate
 
 # Keyframes this near to a candidate look the same, and are not compared as well.
