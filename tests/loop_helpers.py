@@ -20,7 +20,7 @@ from vioframe.simulation.world import MeshBuilder, MeshWorld
 from vioframe.types import NS_PER_S, Calibration, Estimate, Float, FrameSet, FrameTracks, NavState, Status, Step
 
 CALIBRATION: Calibration = small_calibration(2)
-CAMERA = CAMERA.models[0]
+CAMERA = CALIBRATION.cameras[0]
 _START_NS = 5 * NS_PER_S
 _FEATURES = 120
 

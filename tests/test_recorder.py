@@ -9,6 +9,7 @@ import pytest
 from vioframe.errors import RunError
 from vioframe.geometry import so3
 from vioframe.incidents import Incidents
+from vioframe.io.calibration import packaged_calibration
 from vioframe.runs import machine
 from vioframe.runs.folder import RunFolder
 from vioframe.runs.recorder import (
@@ -20,7 +21,6 @@ from vioframe.runs.recorder import (
     free_run_folder,
     new_run_folder,
 )
-from vioframe.io.calibration import packaged_calibration
 from vioframe.types import (
     Calibration,
     CalibrationEstimate,
