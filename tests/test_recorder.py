@@ -11,6 +11,7 @@ from vioframe.geometry import so3
 from vioframe.incidents import Incidents
 from vioframe.io.calibration import packaged_calibration
 from vioframe.runs import machine
+from vioframe.runs import recorder as recorder_module
 from vioframe.runs.folder import RunFolder
 from vioframe.runs.recorder import (
     CALIBRATION_COLUMNS,
@@ -187,6 +188,16 @@ def test_a_landmark_is_written_as_last_refined(tmp_path):
     refined = [step(k, landmark_ids=np.array([3]), p_WF=np.full((1, 3), 0.5 * k)) for k in (1, 2)]
     record(tmp_path / "run", refined)
     assert (tmp_path / "run" / "map.ply").read_text().endswith("end_header\n1.000000 1.000000 1.000000 3\n")
+
+
+def test_of_many_landmarks_each_is_written_as_last_refined(tmp_path, monkeypatch):
+    """Also those that were put aside meanwhile."""
+    monkeypatch.setattr(recorder_module, "_RECENT_LANDMARKS", 10)
+    seen = [step(k, landmark_ids=np.arange(k, k + 8), p_WF=np.full((8, 3), float(k))) for k in range(30)]
+    record(tmp_path / "run", seen)
+    landmarks = RunFolder.open(tmp_path / "run").landmarks()
+    assert landmarks.ids.tolist() == list(range(37))
+    assert landmarks.p_WF[:, 1].tolist() == [float(min(i, 29)) for i in range(37)]
 
 
 def test_an_interrupted_run_keeps_what_it_had(tmp_path):
