@@ -1,4 +1,4 @@
-"""Whether pushing measurements from Python costs what the command line does: the same data, in turn, and the same bytes.
+"""Whether pushing measurements from Python costs what the command line does, on the same data, to the same bytes.
 
     python benchmarks/odometry_speed.py [--record] [--rounds N]
 
