@@ -60,13 +60,8 @@ class LifeCycle:
         if initial_state is not None and (initial_state.cov is None or not camera.rotation_known):
             raise ConfigError("an initial state needs a covariance, and a camera whose rotation on the body is known")
         self._options = options or EstimationOptions()
-<<<<<<< HEAD
-        self._backend, self._name = backend, name or type(backend).__name__
-        self._initializer = Initializer(calibration, self._options.imu_noise_factor)
-=======
         self._backend, self._name = backend, name or f"the back-end {type(backend).__name__}"
-        self._initializer = Initializer(calibration)
->>>>>>> tests
+        self._initializer = Initializer(calibration, self._options.imu_noise_factor)
         self._standstill = StandstillDetector(self._options.standstill_disparity_px)
         self._initial_state = initial_state
         self._following = False

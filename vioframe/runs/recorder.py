@@ -18,7 +18,6 @@ from __future__ import annotations
 
 import json
 import shutil
-from array import array
 from collections import Counter
 from collections.abc import Mapping
 from itertools import count
@@ -54,12 +53,7 @@ offset, intrinsics, and their standard deviations (rad, m, s, px); zero is what 
 LOOP_COLUMNS = ("earlier_t_ns", "later_t_ns", "x_m", "y_m", "z_m", "yaw_rad", "inliers", "accepted")
 _UPPER = np.triu_indices(6)
 _EVENTS_KEPT_PER_KIND = 20
-<<<<<<< HEAD
-# Frames after which a landmark that was not seen again is done with.
-_SETTLES_AFTER = 200
-=======
 _RECENT_LANDMARKS = 5000
->>>>>>> tests
 
 
 def check_run_folder(path: Path, *, overwrite: bool = False, marker: str = "summary.json") -> None:
@@ -110,11 +104,7 @@ class Recorder:
         self._append("pose_cov.csv", ",".join(POSE_COV_COLUMNS) + "\n")
         self._append("tracks.csv", "t_ns,id,camera,x_px,y_px\n")
         self._stages: list[str] = []
-<<<<<<< HEAD
-        self._landmarks = _Map()
-=======
         self._map = _Map()
->>>>>>> tests
         self._segments: list[dict[str, int]] = []
         self._events: list[dict[str, Any]] = []
         self._event_counts: Counter[str] = Counter()
@@ -134,11 +124,7 @@ class Recorder:
     ) -> None:
         for file in self._files.values():
             file.close()
-<<<<<<< HEAD
-        write_ply(self.folder / "map.ply", *self._landmarks.all())
-=======
         write_ply(self.folder / "map.ply", self._map.landmarks())
->>>>>>> tests
         if self._calibration is not None:
             write_calibration(self._calibration, self.folder / "calibration_learned")
         self.summary |= {
@@ -168,11 +154,7 @@ class Recorder:
         tracking = estimate.status is Status.TRACKING and estimate.state is not None
         if self._tracking and not tracking:
             self._resets += 1
-<<<<<<< HEAD
-            self._landmarks = _Map()  # a new start is a new world: old landmarks do not belong to it
-=======
             self._map = _Map()  # a new start is a new world: old landmarks do not belong to it
->>>>>>> tests
         if tracking:
             assert estimate.state is not None
             if self._begun is None:
@@ -183,11 +165,7 @@ class Recorder:
             self._segments[-1]["last_t_ns"] = t_ns
             self._segments[-1]["poses"] += 1
             self._add_state(t_ns, estimate.state)
-<<<<<<< HEAD
-            self._landmarks.update(estimate.landmark_ids, estimate.p_WF)
-=======
             self._map.update(estimate.landmark_ids, estimate.p_WF)
->>>>>>> tests
             if estimate.calibration is not None:
                 self._add_calibration(t_ns, estimate.calibration)
         self._tracking = tracking
@@ -298,34 +276,6 @@ class Recorder:
         write_json(self.folder / "summary.json", self.summary)
 
 
-class _Map:
-    """The landmarks of a run, each where it was estimated last; one that was not seen for long takes 32 bytes."""
-
-    def __init__(self) -> None:
-        self._live: dict[int, Float] = {}
-        self._fresh: set[int] = set()
-        self._ids, self._p_WF = array("q"), array("d")
-        self._updates = 0
-
-    def update(self, ids: Int, p_WF: Float) -> None:
-        """Put the landmarks ``ids`` (M,) at ``p_WF`` (M, 3) m."""
-        self._live.update(zip(ids.tolist(), p_WF, strict=True))
-        self._fresh.update(ids.tolist())
-        self._updates += 1
-        if self._updates % _SETTLES_AFTER == 0:
-            for settled in self._live.keys() - self._fresh:
-                self._ids.append(settled)
-                self._p_WF.extend(self._live.pop(settled))
-            self._fresh.clear()
-
-    def all(self) -> tuple[Int, Float]:
-        """Ids (M,), ascending, and positions (M, 3) m."""
-        ids = np.array([*self._ids, *self._live], np.int64)
-        p_WF = np.array([*self._p_WF, *(x for p in self._live.values() for x in p)]).reshape(-1, 3)
-        latest = len(ids) - 1 - np.unique(ids[::-1], return_index=True)[1]
-        return ids[latest], p_WF[latest]
-
-
 def write_json(path: Path, tree: Mapping[str, Any]) -> None:
     """Replace ``path`` as a whole."""
     write_whole(path, json.dumps(tree, indent=2, default=str) + "\n")
@@ -338,10 +288,6 @@ def write_whole(path: Path, text: str) -> None:
     partial.replace(path)
 
 
-<<<<<<< HEAD
-def write_ply(path: Path, ids: Int, p_WF: Float) -> None:
-    """Landmarks ``p_WF`` (M, 3) m as an ASCII PLY point cloud with an ``id`` property, in the order given."""
-=======
 class _Map:
     """Every landmark as it was last refined. Of those of long ago nothing is kept but their numbers, 32 bytes each."""
 
@@ -369,16 +315,11 @@ class _Map:
 
 def write_ply(path: Path, landmarks: Landmarks) -> None:
     """``landmarks`` as an ASCII PLY point cloud with an ``id`` property, in order of id."""
->>>>>>> tests
     header = (
-        f"ply\nformat ascii 1.0\nelement vertex {len(ids)}\n"
+        f"ply\nformat ascii 1.0\nelement vertex {len(landmarks)}\n"
         "property float x\nproperty float y\nproperty float z\nproperty int id\nend_header\n"
     )
-<<<<<<< HEAD
-    rows = (f"{p[0]:.6f} {p[1]:.6f} {p[2]:.6f} {i}\n" for i, p in zip(ids.tolist(), p_WF.tolist(), strict=True))
-=======
     rows = (f"{x:.6f} {y:.6f} {z:.6f} {i}\n" for i, (x, y, z) in zip(landmarks.ids, landmarks.p_WF, strict=True))
->>>>>>> tests
     with path.open("w", encoding="utf-8") as file:
         file.write(header)
         file.writelines(rows)
