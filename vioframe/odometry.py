@@ -72,6 +72,7 @@ class Odometry:
     ) -> None:
         self._registry = registry.load() if installed is None else installed
         self.incidents = Incidents() if incidents is None else incidents
+        camera = calibration.single("the odometry")
         if isinstance(detector, str):
             detector = self._registry.create_detector(detector, detector_options)
         name = None
@@ -81,7 +82,6 @@ class Odometry:
             with self._registry.blaming(), limited_threads():
                 warm_up(warm, calibration)
             backend = self._registry.create_backend(backend, backend_options)
-        camera = calibration.single("the odometry")
         self._frontend = Frontend(detector, calibration, frontend or FrontendOptions(), self.incidents)
         self._life = LifeCycle(backend, calibration, estimation, initial_state, name)
         self._synchroniser = Synchroniser(self.incidents, time_offset_ns=camera.time_offset_ns, wait_ms=wait_ms)
