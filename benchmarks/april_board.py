@@ -42,7 +42,7 @@ def april_sequence(folder: Path, calibration: Calibration | None = None) -> Trac
     view gets a new id, as it would from any tracker; ids of one corner differ by multiples of :func:`corner_count`.
     Raises :class:`DatasetError` where a file is missing.
     """
-    calibration = calibration or packaged_calibration("euroc")
+    calibration = calibration or packaged_calibration("euroc", cameras=["cam0"])
     imu_ns, imu = _read(folder / "imu0.csv.gz", range(1, 7))
     gyro_B, accel_B = imu[:, :3], imu[:, 3:]
     views = [v for v in read_board_views(folder) if imu_ns[0] <= v.t_ns <= imu_ns[-1]]

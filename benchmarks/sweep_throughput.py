@@ -49,7 +49,7 @@ def main(data: Path, backend: str, assignments: tuple[str, ...], keep: bool, fli
             store = Store.at(Path(temporary) / "none", recordings)
             store.begin(planned, overwrite=False)
             for recording in agenda(planned, store).recordings.values():
-                simulate(store, recording, 2)
+                simulate(recording, store, 2)
             seconds = {1: 0.0, 2: 0.0}
             for turn in range(rounds):
                 for workers in seconds:
@@ -58,7 +58,7 @@ def main(data: Path, backend: str, assignments: tuple[str, ...], keep: bool, fli
                     begin_s = perf_counter()
                     outcome = sweep(agenda(planned, store), store, workers=workers)
                     seconds[workers] += perf_counter() - begin_s
-                    assert outcome.done == len(planned.jobs), outcome
+                    assert outcome.done == len(planned.tasks), outcome
             for workers, taken in seconds.items():
                 yield {
                     "workers": workers,

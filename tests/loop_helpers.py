@@ -17,9 +17,10 @@ from vioframe.simulation.flights import levelled
 from vioframe.simulation.renderer import Renderer
 from vioframe.simulation.textures import procedural_textures
 from vioframe.simulation.world import MeshBuilder, MeshWorld
-from vioframe.types import NS_PER_S, Calibration, Estimate, Float, Frame, FrameTracks, NavState, Status, Step
+from vioframe.types import NS_PER_S, Calibration, Estimate, Float, FrameSet, FrameTracks, NavState, Status, Step
 
 CALIBRATION: Calibration = small_calibration(2)
+CAMERA = CALIBRATION.cameras[0]
 _START_NS = 5 * NS_PER_S
 _FEATURES = 120
 
@@ -38,7 +39,7 @@ def path_along(p_W: Float, yaws: Float | None = None, interval_s: float = 0.5) -
     if yaws is None:
         heading = np.gradient(p_W, axis=0)
         yaws = np.arctan2(heading[:, 1], heading[:, 0])
-    R_LB = levelled(CALIBRATION.R_BC)
+    R_LB = levelled(CAMERA.R_BC)
     t_ns = _START_NS + np.round(np.arange(len(p_W)) * interval_s * NS_PER_S).astype(np.int64)
     return Trajectory(t_ns, np.array([rotation_z(yaw) @ R_LB for yaw in yaws]), p_W)
 
@@ -68,14 +69,14 @@ def fly(
 def _steps(
     truth: Trajectory, odometry: Trajectory, turns: Float, world: World, rng: np.random.Generator
 ) -> Iterator[Step]:
-    renderer, scene = Renderer(CALIBRATION.camera, world), ray_scene(world.mesh.corners)
+    renderer, scene = Renderer(CAMERA.model, world), ray_scene(world.mesh.corners)
     for k, t_ns in enumerate(truth.t_ns.tolist()):
-        R_WC = truth.R_WB[k] @ CALIBRATION.R_BC
-        p_WC = truth.p_WB[k] + truth.R_WB[k] @ CALIBRATION.p_BC
-        light = renderer.render(R_WC, p_WC) + 0.01 * rng.standard_normal(CALIBRATION.camera.resolution[::-1])
+        R_WC = truth.R_WB[k] @ CAMERA.R_BC
+        p_WC = truth.p_WB[k] + truth.R_WB[k] @ CAMERA.p_BC
+        light = renderer.render(R_WC, p_WC) + 0.01 * rng.standard_normal(CAMERA.model.resolution[::-1])
         image = np.clip(255.0 * light, 0.0, 255.0).astype(np.uint8)
         xy = cv2.goodFeaturesToTrack(image, _FEATURES, 0.01, 8).reshape(-1, 2).astype(np.float64)
-        xy_normalised = CALIBRATION.camera.undistort(xy)
+        xy_normalised = CAMERA.model.undistort(xy)
         depth, rays = _depths(scene, R_WC, p_WC, xy_normalised)
         # A landmark is known to a per cent of its distance.
         depth = depth * (1.0 + 0.01 * rng.standard_normal(len(depth)))
@@ -85,7 +86,8 @@ def _steps(
         unknown = np.zeros(3)
         state = NavState(t_ns, odometry.R_WB[k], odometry.p_WB[k], unknown, unknown, unknown)
         estimate = Estimate(Status.TRACKING, state, ids, p_OF, is_keyframe=True)
-        yield Step(Frame(t_ns, image), FrameTracks(t_ns, ids, xy, xy_normalised), estimate, {})
+        tracks = FrameTracks(t_ns, ids, np.zeros_like(ids), xy, xy_normalised)
+        yield Step(FrameSet(t_ns, (image,)), tracks, estimate, {})
 
 
 def _depths(scene: object, R_WC: Float, p_WC: Float, xy_normalised: Float) -> tuple[Float, Float]:

@@ -21,17 +21,34 @@ import os, signal
 from pathlib import Path
 
 import numpy as np
+from dataclasses import replace
+from vioframe.estimation.lifecycle import LifeCycle
 from vioframe.types import Estimate, NavState, Status
+
+usual = LifeCycle.process
+
+
+def from_the_first_frame(self, imu, tracks):
+    # There is too little in small images to begin with, and it is no matter here.
+    if not isinstance(self._backend, Counting):
+        return usual(self, imu, tracks)
+    return replace(self._backend.process(imu, tracks, False), calibration=self._known)
+
+
+LifeCycle.process = from_the_first_frame
 
 
 class Counting:
     """Says it is where the number of its tracks puts it; may fail or die at its third frame, the first times."""
 
-    def __init__(self, calibration, *, fail: int = 0, die: int = 0, flag: str = "", step_m: float = 0.01):
+    def __init__(self, *, fail: int = 0, die: int = 0, flag: str = "", step_m: float = 0.01):
         self._left, self._flag, self._step_m, self._frames = max(fail, die), Path(flag), step_m, 0
         self._dies = die > 0
 
-    def process(self, imu, tracks):
+    def begin(self, start):
+        self._left = 0  # this is no flight, but the warming up before
+
+    def process(self, imu, tracks, still):
         self._frames += 1
         if self._frames == 3 and self._left:
             before = len(list(self._flag.glob("*")))
@@ -53,15 +70,15 @@ def vioframe_backends():
 
 def record_toy(folder: Path, name: str = "TOY", **settings: object) -> Path:
     """An ASL folder of 3 s at 10 Hz with small images and truth, which says nothing of having been simulated."""
-    calibration = packaged_calibration("euroc")
-    camera = calibration.camera
+    calibration = packaged_calibration("euroc", cameras=["cam0"])
+    (camera,) = calibration.cameras
     small = replace(
-        camera,
-        resolution=(camera.resolution[0] // SIDE, camera.resolution[1] // SIDE),
-        **{key: getattr(camera, key) / SIDE for key in ("fx", "fy", "cx", "cy")},
+        camera.model,
+        resolution=(camera.model.resolution[0] // SIDE, camera.model.resolution[1] // SIDE),
+        **{key: getattr(camera.model, key) / SIDE for key in ("fx", "fy", "cx", "cy")},
     )
     files = folder / "calibration"
-    write_calibration(replace(calibration, camera=small), files)
+    write_calibration(replace(calibration, cameras=(replace(camera, model=small),)), files)
     config = SimulationConfig(duration_s=3.0, frame_rate_hz=10.0, calibration=(files,), **settings)
     installed = registry.load()
     path = folder / name

@@ -1,10 +1,7 @@
 """What the benchmark of detectors measures, against cases counted by hand."""
 
-import json
-import runpy
 from dataclasses import asdict
 from itertools import pairwise
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -385,20 +382,3 @@ def test_degradations_are_chosen_by_name():
     assert len(choose([])) == 1 + sum(len(kind.levels) for kind in KINDS.values())
     with pytest.raises(ConfigError, match="did you mean 'noise'"):
         choose(["nois"])
-
-
-# Tables in the documentation
-
-
-def test_the_tables_of_detectors_are_those_of_the_records():
-    root = Path(__file__).resolve().parents[1]
-    script = runpy.run_path(str(root / "benchmarks" / "detector_tables.py"))
-    for page in script["PAGES"]:
-        text = page.read_text()
-        assert "<!-- table: " in text
-        assert script["page"](text) == text, "run python benchmarks/detector_tables.py"
-    # Whoever took part is shown.
-    record = json.loads((root / "benchmarks" / "results" / "detectors_quality.json").read_text())
-    took_part = {row["detector"] for row in record["results"] if "absent" not in row}
-    assert len(took_part) >= 10
-    assert [name for name in took_part if f"`{name}`" not in script["quality"]()] == []

@@ -25,7 +25,7 @@ from vioframe.io.calibration import packaged_calibration
 from vioframe.simulation import simulated_sequence
 from vioframe.types import Estimate, NavState, Status, g_W
 
-CALIBRATION = packaged_calibration("euroc")
+CALIBRATION = packaged_calibration("euroc", cameras=["cam0"])
 
 
 @pytest.fixture(scope="module")

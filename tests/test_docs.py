@@ -1,5 +1,6 @@
 """The documentation keeps its promises: links lead somewhere, and what can be counted is all there."""
 
+import json
 import re
 import runpy
 import tomllib
@@ -8,14 +9,19 @@ from typing import Any
 
 import pytest
 from click.testing import CliRunner
+from conftest import SHARED_DATA
+from rendered_flight import rendered_flight
 from ruamel.yaml import YAML
 
 from vioframe.cli import main
+from vioframe.io.trajectories import tum_line
 from vioframe.parts import hooks as hookspecs
 from vioframe.parts import registry
 from vioframe.testing import check_detector
 
 ROOT = Path(__file__).resolve().parents[1]
+README = (ROOT / "README.md").read_text()
+TABLES = runpy.run_path(str(ROOT / "benchmarks" / "make_tables.py"))
 PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md"), *(ROOT / "benchmarks").glob("*.md")])
 
 
@@ -46,7 +52,7 @@ def test_every_incident_is_explained():
 
 
 def test_commands_of_the_readme_exist():
-    commands = set(re.findall(r"^vioframe (\w+)", (ROOT / "README.md").read_text(), re.MULTILINE))
+    commands = set(re.findall(r"^vioframe (\w+)", README, re.MULTILINE))
     assert {"run", "evaluate", "plot"} <= commands
     for command in commands:
         assert CliRunner().invoke(main, [command, "--help"]).exit_code == 0
@@ -65,12 +71,60 @@ def test_every_part_that_ships_is_explained():
 
 
 def test_the_detector_of_the_readme_works():
-    (code,) = re.findall(
-        r"^```python\n(# mine\.py.*?)^```$", (ROOT / "README.md").read_text(), re.MULTILINE | re.DOTALL
-    )
+    (code,) = re.findall(r"^```python\n(# mine\.py.*?)^```$", README, re.MULTILINE | re.DOTALL)
     names: dict[str, Any] = {}
     exec(code, names)
     check_detector(names["vioframe_detectors"]()["agast"])
+
+
+def test_the_readme_comes_to_the_point():
+    """Install, one command on one's own recording, Python, how good it is: on the first screens."""
+    before, _, _ = README.partition("\n## Read on\n")
+    assert len(before.splitlines()) <= 60
+    assert before.index("pip install") < before.index("vioframe run my.bag") < before.index("import vioframe")
+
+
+@pytest.mark.slow
+def test_the_python_example_of_the_readme_is_what_the_command_line_does(tmp_path, request):
+    data = _recording(tmp_path, request)
+    assert CliRunner().invoke(main, ["run", str(data), "--out", str(tmp_path / "run"), "--quiet"]).exit_code == 0
+    (code,) = re.findall(r"^```python\n(import vioframe\n.*?)^```$", README, re.MULTILINE | re.DOTALL)
+    code, there = re.subn(r'open_dataset\("MH_01_easy.bag"', f'open_dataset("{data}"', code)
+    assert there == 1
+    steps: list[Any] = []
+    exec(code, {"print": lambda *values: steps.append(values)})
+    lines = [tum_line(t_ns, s.R_WB, s.p_WB) for t_ns, _, s in steps if s is not None]
+    assert len(lines) > 50
+    written = (tmp_path / "run" / "trajectory.tum").read_text().splitlines()
+    assert [line.rstrip() for line in lines] == [line for line in written if not line.startswith("#")]
+
+
+def _recording(tmp_path: Path, request: pytest.FixtureRequest) -> Path:
+    """Real images where they are at hand; else a short flight through dots of light."""
+    if (real := SHARED_DATA / "euroc" / "MH_01_easy_15s").is_dir():
+        return real
+    return rendered_flight().write(tmp_path / "flight.bag")
+
+
+def test_every_figure_in_print_is_that_of_a_record():
+    for page in TABLES["PAGES"]:
+        text = page.read_text()
+        assert "<!-- figures: " in text
+        assert TABLES["page"](text) == text, "run python benchmarks/make_tables.py"
+    shown = {name for page in TABLES["PAGES"] for _, name, _ in TABLES["BLOCK"].findall(page.read_text())}
+    assert shown == set(TABLES["FIGURES"])
+
+
+def test_no_figure_of_the_readme_is_typed_by_hand():
+    prose = TABLES["BLOCK"].sub("", README)
+    assert re.findall(r"\d (?:mm|cm|m|ms|%|FPS|deg)\b", prose) == []
+
+
+def test_every_detector_that_took_part_is_in_the_table():
+    record = json.loads((ROOT / "benchmarks" / "results" / "detectors_quality.json").read_text())
+    took_part = {row["detector"] for row in record["results"] if "absent" not in row}
+    assert len(took_part) >= 10
+    assert [name for name in took_part if f"`{name}`" not in TABLES["quality"]()] == []
 
 
 def test_every_page_is_in_the_site():

@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from loop_helpers import CALIBRATION, fly, hall, path_along, tiled_corridor
+from loop_helpers import CALIBRATION, CAMERA, fly, hall, path_along, tiled_corridor
 from rendered_flight import rendered_flight
 
 from vioframe.cli import main
@@ -28,7 +28,7 @@ from vioframe_pose_graph.matching import DescriptorIndex, distance, match
 from vioframe_pose_graph.place import image_angle_deg, reprojection, resect
 from vioframe_pose_graph.verification import Correspondences, ransac, residuals, solve
 
-FOCAL_PX = CALIBRATION.camera.focal_px
+FOCAL_PX = CAMERA.model.focal_px
 
 
 def random_descriptors(rng, count):
@@ -316,7 +316,7 @@ def test_the_summary_lists_the_segments(revisit, tmp_path):
         for status, step in zip(statuses, revisit.steps, strict=False):
             estimate = step.estimate if status is Status.TRACKING else Estimate(status)
             recorder.add(replace(step, estimate=estimate))
-    t_ns = [step.frame.t_ns for step in revisit.steps]
+    t_ns = [step.frames.t_ns for step in revisit.steps]
     assert recorder.summary["segments"] == [
         {"first_t_ns": t_ns[1], "last_t_ns": t_ns[2], "poses": 2},
         {"first_t_ns": t_ns[4], "last_t_ns": t_ns[4], "poses": 1},

@@ -11,7 +11,7 @@ from trajectory_helpers import disturbed, flight, moved, write_run
 
 from vioframe.cli import main
 from vioframe.errors import ConfigError, RunError
-from vioframe.evaluation.landmarks import belonging, read_landmarks
+from vioframe.evaluation.landmarks import Landmarks, belonging, read_landmarks
 from vioframe.evaluation.map_quality import MapQuality
 from vioframe.geometry import so3
 from vioframe.geometry.meshes import distances, read_mesh
@@ -43,7 +43,7 @@ def recorded(folder, p_WF=PLACES, yaw=0.0, config=None):
     R, p = so3.exp(np.array([0.0, 0.0, yaw])), yaw * np.array([3.0, -5.0, 1.0])
     truth = flight()
     write_run(folder, moved(truth, R, p), truth)
-    write_ply(folder / "map.ply", np.arange(len(p_WF)), p_WF @ R.T + p)
+    write_ply(folder / "map.ply", Landmarks(np.arange(len(p_WF)), p_WF @ R.T + p))
     if config is not None:
         (folder / "config.yaml").write_text(f"dataset:\n  path: {config}\n")
     return folder
@@ -171,11 +171,11 @@ def test_a_mesh_is_read_as_it_was_written(tmp_path):
 
 
 def test_landmarks_are_read_as_the_recorder_writes_them(tmp_path):
-    write_ply(tmp_path / "map.ply", np.array([3, 7]), np.array([[0.25, 0.0, -1e-6], [1.0, -2.0, 3.5]]))
+    write_ply(tmp_path / "map.ply", Landmarks(np.array([3, 7]), np.array([[0.25, 0.0, -1e-6], [1.0, -2.0, 3.5]])))
     found = read_landmarks(tmp_path / "map.ply")
     np.testing.assert_array_equal(found.ids, [3, 7])
     np.testing.assert_array_equal(found.p_WF, [[0.25, 0.0, -1e-6], [1.0, -2.0, 3.5]])
-    write_ply(tmp_path / "map.ply", np.empty(0, np.int64), np.empty((0, 3)))
+    write_ply(tmp_path / "map.ply", Landmarks(np.empty(0, np.int64), np.empty((0, 3))))
     assert len(read_landmarks(tmp_path / "map.ply")) == 0
 
 
@@ -184,7 +184,7 @@ def test_landmarks_are_read_as_the_recorder_writes_them(tmp_path):
 )
 def test_a_damaged_map_is_named(tmp_path, old, new):
     path = tmp_path / "map.ply"
-    write_ply(path, np.array([3, 7]), np.array([[0.25, 0.0, -1e-6], [1.0, -2.0, 3.5]]))
+    write_ply(path, Landmarks(np.array([3, 7]), np.array([[0.25, 0.0, -1e-6], [1.0, -2.0, 3.5]])))
     path.write_text(path.read_text().replace(old, new, 1) if old != "ply" else path.read_text()[:40])
     with pytest.raises(RunError, match=r"map\.ply is damaged"):
         read_landmarks(path)

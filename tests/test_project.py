@@ -18,12 +18,14 @@ INSTALLED = registry.load()
 
 
 @pytest.fixture(scope="module")
-def example(tmp_path_factory):
-    """The environment of a Python into which the example plug-in was installed by pip, without a network."""
+def examples(tmp_path_factory):
+    """The environment of a Python into which the example plug-ins were installed by pip, without a network."""
     site = tmp_path_factory.mktemp("site")
     pip = [sys.executable, "-m", "pip", "install", "--quiet", "--no-index", "--no-deps", "--no-build-isolation"]
-    subprocess.run([*pip, "--target", site, ROOT / "docs" / "example-plugin"], check=True)
-    return {**os.environ, "PYTHONPATH": str(site), "COLUMNS": "200"}
+    folders = [ROOT / "docs" / name for name in ("example-plugin", "example-backend")]
+    subprocess.run([*pip, "--target", site, *folders], check=True)
+    search = os.pathsep.join(filter(None, [str(site), os.environ.get("PYTHONPATH")]))
+    return {**os.environ, "PYTHONPATH": search, "COLUMNS": "200"}
 
 
 def call(environment, *arguments):
@@ -32,16 +34,26 @@ def call(environment, *arguments):
     return done.stdout
 
 
-def test_the_example_plugin_is_found_once_installed(example):
-    (row,) = [line for line in call(example, "vioframe", "plugins").splitlines() if " harris " in line]
-    assert row.split()[:4] == ["detector", "harris", "vioframe-harris", "0.1.0"]
-    assert "weakest corner kept, relative to the strongest" in call(example, "vioframe", "plugins", "harris")
-    assert "min_distance_px: 8.0" in call(example, "vioframe", "config", "--detector", "harris")
+@pytest.mark.parametrize(
+    ("kind", "name", "distribution"),
+    [("detector", "harris", "vioframe-harris"), ("backend", "tiny_msckf", "vioframe-tiny-msckf")],
+)
+def test_the_example_plugins_are_found_once_installed(examples, kind, name, distribution):
+    (row,) = [line for line in call(examples, "vioframe", "plugins").splitlines() if f" {name} " in line]
+    assert row.split()[:4] == [kind, name, distribution, "0.1.0"]
 
 
-def test_the_example_plugin_passes_its_own_tests(example):
-    test = ROOT / "docs" / "example-plugin" / "test_harris.py"
-    assert "1 passed" in call(example, "pytest", "-q", "-p", "no:cacheprovider", "-c", os.devnull, str(test))
+def test_the_options_of_the_examples_are_known(examples):
+    assert "weakest corner kept, relative to the strongest" in call(examples, "vioframe", "plugins", "harris")
+    config = call(examples, "vioframe", "config", "--detector", "harris", "--backend", "tiny_msckf")
+    assert "min_distance_px: 8.0" in config
+    assert "window: 8" in config
+
+
+@pytest.mark.parametrize("test", ["example-plugin/test_harris.py", "example-backend/test_tiny_msckf.py"])
+def test_the_example_plugins_pass_their_own_tests(examples, test):
+    path = str(ROOT / "docs" / test)
+    assert "1 passed" in call(examples, "pytest", "-q", "-p", "no:cacheprovider", "-c", os.devnull, path)
 
 
 @pytest.mark.parametrize("name", INSTALLED.names(registry.DETECTOR))

@@ -72,7 +72,7 @@ def test_several_recordings_have_names_of_their_own_and_an_overview(tmp_path):
     made.flight(labels("MH_05_difficult"), data=Data.REAL)
     made.flight(labels("V1_01_easy"), data=Data.SIMULATED)
     made.failed(labels("V2_03_difficult"), data=Data.REAL)
-    per_recording = ("relative_error", "side_view", "top_view", "trajectories_3d")
+    per_recording = ("relative_error", "side_view", "top_view", "trajectories_3d", "translation_error_per_axis")
     assert sorted(files_of(made.study())) == [
         *(f"MH_05_difficult_real_{name}" for name in per_recording),
         *(f"V1_01_easy_simulated_{name}" for name in per_recording),

@@ -11,7 +11,7 @@ from recordings import PAIR, pair_measurements
 from trajectory_helpers import disturbed, flight, moved, write_run
 
 from vioframe.cli import main
-from vioframe.evaluation.landmarks import read_landmarks
+from vioframe.evaluation.landmarks import Landmarks, read_landmarks
 from vioframe.geometry import so3
 from vioframe.geometry.trajectory import Trajectory
 from vioframe.io.calibration import packaged_calibration, write_calibration
@@ -51,7 +51,7 @@ def run(tmp_path_factory, landmarks):
     cov = np.tile(np.diag([1e-4] * 3 + [SIGMA_M**2] * 3), (len(truth), 1, 1))
     estimate = moved(truth, *YAW_M)
     write_run(folder, Trajectory(estimate.t_ns, estimate.R_WB, estimate.p_WB, cov), truth)
-    write_ply(folder / "map.ply", 10 * np.arange(len(landmarks)), landmarks @ YAW_M[0].T + YAW_M[1])
+    write_ply(folder / "map.ply", Landmarks(10 * np.arange(len(landmarks)), landmarks @ YAW_M[0].T + YAW_M[1]))
     write_calibration(packaged_calibration("euroc"), folder / "calibration")
     return folder
 

@@ -105,7 +105,7 @@ def check_montecarlo(setups: Sequence[Setup], backends: Mapping[str, PartConfig]
     """Raise :class:`ConfigError` or :class:`PluginError` for what can be told before the first trial."""
     if seeds < 1 or workers < 1:
         raise ConfigError(f"needs at least one seed and one worker, got {seeds} and {workers}")
-    calibration = packaged_calibration("euroc")
+    calibration = packaged_calibration("euroc", cameras=["cam0"])
     for setup in setups:
         named_flight(setup.flight, setup.duration_s, calibration.cameras[0].R_BC)
     for part in backends.values():

@@ -60,7 +60,7 @@ class LifeCycle:
         if initial_state is not None and (initial_state.cov is None or not camera.rotation_known):
             raise ConfigError("an initial state needs a covariance, and a camera whose rotation on the body is known")
         self._options = options or EstimationOptions()
-        self._backend, self._name = backend, name or type(backend).__name__
+        self._backend, self._name = backend, name or f"the back-end {type(backend).__name__}"
         self._initializer = Initializer(calibration, self._options.imu_noise_factor)
         self._standstill = StandstillDetector(self._options.standstill_disparity_px)
         self._initial_state = initial_state
@@ -79,7 +79,7 @@ class LifeCycle:
         try:
             estimate = self._backend.process(imu, tracks, still)
             if (defect := defect_of(estimate, tracks.t_ns)) is not None:
-                raise PluginError(f"the back-end {self._name} at {tracks.t_ns} ns: {defect}; repair the plug-in")
+                raise PluginError(f"{self._name} at {tracks.t_ns} ns: {defect}; repair the plug-in")
             self._check(estimate, tracks.t_ns)
         except (DivergedError, np.linalg.LinAlgError) as error:
             return self._lose(str(error))

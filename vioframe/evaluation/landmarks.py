@@ -6,7 +6,6 @@ A run folder keeps every landmark that its back-end spoke of. Cleaning is the re
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
 from dataclasses import dataclass
 from io import StringIO
 from pathlib import Path
@@ -35,9 +34,6 @@ class Landmarks:
     def moved(self, alignment: Alignment) -> Landmarks:
         """The same landmarks seen in the ground truth's world."""
         return Landmarks(self.ids, alignment.points(self.p_WF))
-
-    def by_id(self) -> Mapping[int, Float]:
-        return dict(zip(self.ids.tolist(), self.p_WF, strict=True))
 
 
 def read_landmarks(path: Path) -> Landmarks:

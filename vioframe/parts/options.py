@@ -100,7 +100,7 @@ def plugin_factory(build: Callable[..., PartT], options_type: type) -> Callable[
     """A factory whose options are the fields of the dataclass ``options_type``.
 
     ``build`` takes what the framework gives (a loop closer: the calibration; a back-end: nothing), then the options as
-    one object: ``plugin_factory(Mine, MyOptions)(calibration, window=10)`` is ``Mine(calibration, MyOptions(window=10))``.
+    one object: ``plugin_factory(f, Options)(calibration, window=10)`` is ``f(calibration, Options(window=10))``.
     """
     positional = [p for p in inspect.signature(build).parameters.values() if p.kind is not p.KEYWORD_ONLY]
     fields = inspect.signature(options_type).parameters.values()

@@ -195,7 +195,7 @@ def export_map(run: Evaluated, path: Path) -> int:
         raise RunError(f"{run.name} has no landmarks: only a run folder whose map.ply holds some has a map to write")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        write_ply(path, landmarks.ids, landmarks.p_WF)
+        write_ply(path, landmarks)
     except OSError as error:
         raise RunError(f"cannot write {path}: {error.strerror}; choose another name") from error
     return len(landmarks)

@@ -10,7 +10,7 @@
     trajectory_loop.tum, loops.csv  poses corrected by loop closure, and the loops, where a run has it
 
 Each frame is flushed as it comes, so an interrupted run leaves what it had, with ``finished: false`` in its summary.
-Nothing but the map is kept until the end, so that an hour takes no more memory than a minute.
+Nothing but the map is kept until the end, so that an hour takes hardly more memory than a minute.
 All but the timings, the machine and the summary's clock-dependent figures are the same byte for byte in every run.
 """
 
@@ -18,7 +18,6 @@ from __future__ import annotations
 
 import json
 import shutil
-from array import array
 from collections import Counter
 from collections.abc import Mapping
 from itertools import count
@@ -30,6 +29,7 @@ from typing import Any, Self, TextIO
 import numpy as np
 
 from vioframe.errors import RunError
+from vioframe.evaluation.landmarks import Landmarks
 from vioframe.geometry import so3
 from vioframe.incidents import Incidents
 from vioframe.io.calibration import write_calibration
@@ -53,8 +53,7 @@ offset, intrinsics, and their standard deviations (rad, m, s, px); zero is what 
 LOOP_COLUMNS = ("earlier_t_ns", "later_t_ns", "x_m", "y_m", "z_m", "yaw_rad", "inliers", "accepted")
 _UPPER = np.triu_indices(6)
 _EVENTS_KEPT_PER_KIND = 20
-# Frames after which a landmark that was not seen again is done with.
-_SETTLES_AFTER = 200
+_RECENT_LANDMARKS = 5000
 
 
 def check_run_folder(path: Path, *, overwrite: bool = False, marker: str = "summary.json") -> None:
@@ -105,7 +104,7 @@ class Recorder:
         self._append("pose_cov.csv", ",".join(POSE_COV_COLUMNS) + "\n")
         self._append("tracks.csv", "t_ns,id,camera,x_px,y_px\n")
         self._stages: list[str] = []
-        self._landmarks = _Map()
+        self._map = _Map()
         self._segments: list[dict[str, int]] = []
         self._events: list[dict[str, Any]] = []
         self._event_counts: Counter[str] = Counter()
@@ -125,7 +124,7 @@ class Recorder:
     ) -> None:
         for file in self._files.values():
             file.close()
-        write_ply(self.folder / "map.ply", *self._landmarks.all())
+        write_ply(self.folder / "map.ply", self._map.landmarks())
         if self._calibration is not None:
             write_calibration(self._calibration, self.folder / "calibration_learned")
         self.summary |= {
@@ -155,7 +154,7 @@ class Recorder:
         tracking = estimate.status is Status.TRACKING and estimate.state is not None
         if self._tracking and not tracking:
             self._resets += 1
-            self._landmarks = _Map()  # a new start is a new world: old landmarks do not belong to it
+            self._map = _Map()  # a new start is a new world: old landmarks do not belong to it
         if tracking:
             assert estimate.state is not None
             if self._begun is None:
@@ -166,7 +165,7 @@ class Recorder:
             self._segments[-1]["last_t_ns"] = t_ns
             self._segments[-1]["poses"] += 1
             self._add_state(t_ns, estimate.state)
-            self._landmarks.update(estimate.landmark_ids, estimate.p_WF)
+            self._map.update(estimate.landmark_ids, estimate.p_WF)
             if estimate.calibration is not None:
                 self._add_calibration(t_ns, estimate.calibration)
         self._tracking = tracking
@@ -277,34 +276,6 @@ class Recorder:
         write_json(self.folder / "summary.json", self.summary)
 
 
-class _Map:
-    """The landmarks of a run, each where it was estimated last; one that was not seen for long takes 32 bytes."""
-
-    def __init__(self) -> None:
-        self._live: dict[int, Float] = {}
-        self._fresh: set[int] = set()
-        self._ids, self._p_WF = array("q"), array("d")
-        self._updates = 0
-
-    def update(self, ids: Int, p_WF: Float) -> None:
-        """Put the landmarks ``ids`` (M,) at ``p_WF`` (M, 3) m."""
-        self._live.update(zip(ids.tolist(), p_WF, strict=True))
-        self._fresh.update(ids.tolist())
-        self._updates += 1
-        if self._updates % _SETTLES_AFTER == 0:
-            for settled in self._live.keys() - self._fresh:
-                self._ids.append(settled)
-                self._p_WF.extend(self._live.pop(settled))
-            self._fresh.clear()
-
-    def all(self) -> tuple[Int, Float]:
-        """Ids (M,), ascending, and positions (M, 3) m."""
-        ids = np.array([*self._ids, *self._live], np.int64)
-        p_WF = np.array([*self._p_WF, *(x for p in self._live.values() for x in p)]).reshape(-1, 3)
-        latest = len(ids) - 1 - np.unique(ids[::-1], return_index=True)[1]
-        return ids[latest], p_WF[latest]
-
-
 def write_json(path: Path, tree: Mapping[str, Any]) -> None:
     """Replace ``path`` as a whole."""
     write_whole(path, json.dumps(tree, indent=2, default=str) + "\n")
@@ -317,13 +288,38 @@ def write_whole(path: Path, text: str) -> None:
     partial.replace(path)
 
 
-def write_ply(path: Path, ids: Int, p_WF: Float) -> None:
-    """Landmarks ``p_WF`` (M, 3) m as an ASCII PLY point cloud with an ``id`` property, in the order given."""
+class _Map:
+    """Every landmark as it was last refined. Of those of long ago nothing is kept but their numbers, 32 bytes each."""
+
+    def __init__(self) -> None:
+        self._recent: dict[int, list[float]] = {}
+        self._packed: list[tuple[Int, Float]] = []
+
+    def update(self, ids: Int, p_WF: Float) -> None:
+        if len(self._recent) > _RECENT_LANDMARKS:
+            self._pack()
+        self._recent.update(zip(ids.tolist(), p_WF.tolist(), strict=True))
+
+    def landmarks(self) -> Landmarks:
+        self._pack()
+        ids, p_WF = (np.concatenate(column) for column in zip(*self._packed, strict=True))
+        # What was packed last is the newest.
+        ids, last = np.unique(ids[::-1], return_index=True)
+        return Landmarks(ids, p_WF[::-1][last])
+
+    def _pack(self) -> None:
+        recent = self._recent
+        self._packed.append((np.array([*recent], np.int64), np.array([*recent.values()], float).reshape(-1, 3)))
+        self._recent = {}
+
+
+def write_ply(path: Path, landmarks: Landmarks) -> None:
+    """``landmarks`` as an ASCII PLY point cloud with an ``id`` property, in order of id."""
     header = (
-        f"ply\nformat ascii 1.0\nelement vertex {len(ids)}\n"
+        f"ply\nformat ascii 1.0\nelement vertex {len(landmarks)}\n"
         "property float x\nproperty float y\nproperty float z\nproperty int id\nend_header\n"
     )
-    rows = (f"{p[0]:.6f} {p[1]:.6f} {p[2]:.6f} {i}\n" for i, p in zip(ids.tolist(), p_WF.tolist(), strict=True))
+    rows = (f"{x:.6f} {y:.6f} {z:.6f} {i}\n" for i, (x, y, z) in zip(landmarks.ids, landmarks.p_WF, strict=True))
     with path.open("w", encoding="utf-8") as file:
         file.write(header)
         file.writelines(rows)

@@ -272,7 +272,7 @@ def _over_time(
         if half_width:
             layout["shapes"] = [_shaded(k, -half_width, half_width) for k in range(len(panel_titles))]
         if traces:
-            cases[course.label] = course.case(traces, layout, of_many=bool(half_width))
+            cases[course.label] = course.case(traces, layout, of_many=name == "translation_error_per_axis")
     return Figure(name, "", cases, height=180 * len(panel_titles) + 20, narrow_height=520)
 
 

@@ -1,0 +1,404 @@
+"""Writes the figures that README.md, benchmarks/README.md and docs/ show, from what is recorded in results/.
+
+    python benchmarks/make_tables.py
+
+A page says where, between two comments: ``<!-- figures: NAME -->`` and ``<!-- end -->``; NAME is a function here.
+A test holds pages and records equal, so that no figure is typed by hand, and none outlives its record.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable, Iterable
+from pathlib import Path
+
+import pandas as pd
+
+from vioframe.bench.detectors.degradations import Degradation
+from vioframe.bench.detectors.tables import by_degradation
+
+HERE = Path(__file__).resolve().parent
+ROOT = HERE.parent
+PAGES = (ROOT / "README.md", HERE / "README.md", ROOT / "docs" / "keypointnet.md")
+BLOCK = re.compile(r"(<!-- figures: (\w+) -->\n).*?(<!-- end -->)", re.DOTALL)
+_RENDERED = "MH_05_difficult"
+
+
+def headline() -> str:
+    """What the built-in back-ends reach with the detector that is the default."""
+    moving, landmarks, rendered = (
+        recorded(name) for name in ("euroc_clips_*.json", "real_motion_*.json", "rendered_flights_*.json")
+    )
+    moving, rendered = (rows[rows["detector"] == "shi_tomasi"] for rows in (moving, rendered))
+    cases = {
+        "first 15 s of MH_01_easy, real images": _in_m(moving[moving["clip"] == "MH_01_easy_15s"]),
+        f"{_RENDERED} from 5 s, images rendered along it, real IMU": _in_m(rendered[rendered["clip"] == _RENDERED]),
+        "MH_02, MH_03, MH_05, V1_01, V1_02, landmarks simulated along them, real IMU": landmarks,
+    }
+    rows = [
+        {
+            "recording": name,
+            **{f"`{key}`": _ate(own) for key, own in _by_backend(found)},
+            "path": _mean(found, "path_m"),
+        }
+        for name, found in cases.items()
+    ]
+    return markdown(rows) + source(moving, rendered, landmarks)
+
+
+def real_images() -> str:
+    """The clip in motion, every back-end and detector."""
+    rows = recorded("euroc_clips_*.json")
+    rows = rows[rows["clip"] == "MH_01_easy_15s"].sort_values(["backend", "ate_mm"])
+    shown = [
+        {
+            "back-end": f"`{row.backend}`",
+            "detector": f"`{row.detector}`",
+            "initialised after": f"{row.initialised_s:.2f} s",
+            "completion": f"{100.0 * row.completion:.1f} %",
+            "resets": f"{row.resets}",
+            "ATE": f"{row.ate_mm:.1f} mm",
+        }
+        for row in rows.itertuples()
+    ]
+    return markdown(shown) + source(rows)
+
+
+def stages() -> str:
+    """Milliseconds a frame by stage, of the default detector in the clip in motion."""
+    rows = recorded("euroc_clips_*.json")
+    rows = rows[(rows["clip"] == "MH_01_easy_15s") & (rows["detector"] == "shi_tomasi")]
+    names = {name: name.removeprefix("stage_ms.") for name in rows.columns if name.startswith("stage_ms.")}
+    table = rows.set_index("backend")[list(names)].rename(columns=names)
+    table.insert(0, "all", rows.set_index("backend")["frame_ms"])
+    shown = [
+        {"ms a frame": stage, **{f"`{backend}`": _number(value, ".1f") for backend, value in values.items()}}
+        for stage, values in table.T.iterrows()
+    ]
+    return markdown(shown) + source(rows)
+
+
+def at_rest() -> str:
+    """How far the estimate strays from where it began, of a body at rest."""
+    rows = recorded("euroc_clips_*.json")
+    rows = rows[rows["clip"] == "V1_01_easy_rest"]
+    shown = [
+        {
+            "back-end": f"`{backend}`",
+            "detectors": f"{len(own)}",
+            "initialised after": _range(own["initialised_s"], ".2f", "s"),
+            "farthest from where it began": _range(own["drift_mm"], ".1f", "mm"),
+        }
+        for backend, own in _by_backend(rows)
+    ]
+    return markdown(shown) + source(rows)
+
+
+def landmarks() -> str:
+    """Simulated landmarks along real motion: mean and deviation over the seeds."""
+    rows = recorded("real_motion_*.json")
+    shown = [
+        {
+            "flight": sequence,
+            "path": _mean(own, "path_m"),
+            **{
+                f"`{backend}`": f"{_ate(found)}, {found['percent'].mean():.2f} %" for backend, found in _by_backend(own)
+            },
+            "resets": f"{own['resets'].sum()}",
+        }
+        for sequence, own in rows.groupby("sequence")
+    ]
+    return markdown(shown) + source(rows)
+
+
+def rendered() -> str:
+    """Whole flights with rendered images."""
+    rows = recorded("rendered_flights_*.json")
+    shown = [
+        {
+            "flight": clip,
+            "back-end": f"`{backend}`",
+            "detector": f"`{detector}`",
+            "path": _mean(own, "path_m"),
+            "initialised after": _range(own["initialised_s"], ".2f", "s"),
+            "completion": f"{100.0 * own['completion'].min():.1f} %",
+            "resets": f"{own['resets'].sum()}",
+            "ATE": _ate(_in_m(own)),
+            "ms a frame": f"{own['frame_ms'].mean():.1f}",
+        }
+        for (clip, backend, detector), own in rows.groupby(["clip", "backend", "detector"])
+    ]
+    return markdown(shown) + source(rows)
+
+
+def april() -> str:
+    """The AprilGrid board."""
+    rows = recorded("april_*.json")
+    shown = [
+        {
+            "back-end": f"`{row.backend}`",
+            "path": f"{row.path_m:.1f} m",
+            "initialised after": f"{row.initialised_s:.2f} s",
+            "resets": f"{row.resets}",
+            "ATE": f"{1e3 * row.ate_m:.1f} mm",
+            "ms a frame, tracks given": f"{row.cpu_ms:.1f}",
+        }
+        for row in rows.itertuples()
+    ]
+    return markdown(shown) + source(rows)
+
+
+def frontend() -> str:
+    """The front-end by detector and threads."""
+    rows = recorded("frontend_speed*.json")
+    shown = [
+        {
+            "detector": f"`{row['detector']}`",
+            "threads": f"{row['threads']}",
+            **{
+                f"{stage} ms": f"{row[f'ms.{stage}']:.1f}" for stage in ("equalise", "klt", "reject", "detect", "total")
+            },
+            "frames a track lives": f"{row['lifetime']:.0f}",
+            "px off the epipolar line after 1, 5, 10 frames": ", ".join(
+                row[f"px.{frames}"].partition(" /")[0] for frames in (1, 5, 10)
+            ),
+        }
+        for _, row in rows.iterrows()
+    ]
+    return markdown(shown) + source(rows)
+
+
+def consistency() -> str:
+    """Monte Carlo: errors, and NEES a degree of freedom with the band of an honest filter and the verdict."""
+    rows = recorded("montecarlo*.json")
+
+    def nees(row: pd.Series, part: str) -> str:
+        dof, (low, high) = row[f"nees.{part}.dof"], row[f"nees.{part}.band_95"]
+        verdict = row[f"nees.{part}.verdict"]
+        return f"{row[f'nees.{part}.per_axis']:.2f} of {low / dof:.2f} to {high / dof:.2f}: {verdict}"
+
+    shown = [
+        {
+            "flight": row["setup.flight"],
+            "back-end": f"`{row['name']}`",
+            "n": f"{row['trials']}",
+            "failed": f"{sum(row[name] for name in rows.columns if name.startswith('failures.'))}",
+            "ATE": _spread([trial["ate_m"] for trial in row["by_seed"] if trial["failure"] is None]),
+            "orientation": f"{row['orientation_deg']:.2f} deg",
+            **{f"NEES of {part}": nees(row, part) for part in ("orientation", "position", "pose")},
+        }
+        for _, row in rows.iterrows()
+    ]
+    return markdown(shown) + source(rows)
+
+
+def memory() -> str:
+    """How memory grows in a long flight."""
+    rows = recorded("memory*.json")
+    shown = [
+        {
+            "back-end": f"`{row.backend}`" + (f" with `{row.loop_closer}`" if row.loop_closer else ""),
+            "flight": f"{row.minutes:.0f} min",
+            "after a minute": f"{row.first_minute_mb:.0f} MB",
+            "grown since": f"{row.grown_mb:.1f} MB",
+            "landmarks in the map": f"{row.landmarks}",
+        }
+        for row in rows.itertuples()
+    ]
+    return markdown(shown) + source(rows)
+
+
+def speed() -> str:
+    """Every detector, the fastest first."""
+    rows = recorded("detectors_speed.json").sort_values("fps", ascending=False)
+    shown = [
+        {
+            "detector": f"`{row.detector}`",
+            "images a second": f"{row.fps:.0f}",
+            "ms": f"{row.ms:.1f}" if row.ms < 10.0 else f"{row.ms:.0f}",
+            "on": row.on,
+        }
+        for row in rows.itertuples()
+    ]
+    return markdown(shown) + source(rows)
+
+
+def quality() -> str:
+    """Repeatability of every detector under every degradation, the best in bold."""
+    rows = recorded("detectors_quality.json")
+    table = by_degradation(rows.drop(columns=["lead_repeatability"]), "repeatability", ".3f").set_index("degradation")
+    best = table.astype(float).eq(table.astype(float).max(axis=1), axis=0)
+    table = table.where(~best, "**" + table + "**").rename(columns=lambda name: f"`{name}`")
+    shown = table.reset_index().rename(columns={"degradation": ""}).to_dict("records")
+    return markdown(shown) + source(rows)
+
+
+def clean() -> str:
+    """Every detector on images as they are."""
+    rows = recorded("detectors_quality.json")
+    rows = rows[rows["degradation"] == Degradation().name].sort_values("repeatability", ascending=False)
+    shown = [
+        {
+            "": f"`{row.detector}`",
+            "repeatability": f"{row.repeatability:.3f}",
+            "of distinct points": f"{row.distinct:.3f}",
+            "localisation px": f"{row.localisation_px:.2f}",
+        }
+        for row in rows.itertuples()
+    ]
+    return markdown(shown) + source(rows)
+
+
+def comparison() -> str:
+    """The suite ``mh05_comparison``: accuracy over its starts."""
+    table = pd.read_csv(HERE / "results" / "mh05_comparison" / "accuracy.csv")
+    shown = [
+        {
+            "sequence": f"{row['sequence']}, {row['data']}",
+            "back-end": f"`{row['back-end']}`",
+            "detector": f"`{row['detector']}`",
+            "n": f"{row['seeds']}",
+            "ATE, mean": f"{row['ATE, position + yaw [m]']:.3f} ± {row['std [m]']:.3f} m",
+            "of the path": f"{row['ATE [% of path]']:.2f} %",
+            "completion": f"{row['completion [%]']:.0f} %",
+        }
+        for _, row in table.iterrows()
+    ]
+    return markdown(shown) + suite_source("mh05_comparison")
+
+
+def stress() -> str:
+    """The suite ``stress``: against Shi-Tomasi over all degraded pairs."""
+    table = pd.read_csv(HERE / "results" / "stress" / "duels.csv")
+    ratio = next(name for name in table.columns if name.startswith("ATE over that of"))
+    shown = [
+        {
+            "detector": f"`{row['detector']}`",
+            "back-end": f"`{row['back-end']}`",
+            ratio: f"{row[ratio]:.2f}",
+            "n, pairs": f"{row['of pairs']}",
+            "won - lost": f"{row['won']} - {row['lost']}",
+            "p, sign test": f"{row['p, sign test']:.2f}",
+        }
+        for _, row in table[table["condition"] == "all degraded"].iterrows()
+    ]
+    return markdown(shown) + suite_source("stress")
+
+
+def throughput() -> str:
+    """How a sweep gains from a second worker."""
+    rows = recorded("sweep_throughput_*.json")
+    shown = [
+        {
+            "workers": f"{row.workers}",
+            "flights": f"{row.flights}",
+            "seconds": f"{row.seconds:.0f}",
+            "times one worker": f"{row.times_one:.2f}",
+        }
+        for row in rows.itertuples()
+    ]
+    return markdown(shown) + source(rows)
+
+
+FIGURES: dict[str, Callable[[], str]] = {
+    make.__name__: make
+    for make in (
+        *(headline, real_images, stages, at_rest, landmarks, rendered, april, frontend, consistency, memory),
+        *(speed, quality, clean, comparison, stress, throughput),
+    )
+}
+
+
+def recorded(pattern: str) -> pd.DataFrame:
+    """The results in ``results/PATTERN``, a row each; nested figures are columns such as ``ms.klt``.
+
+    ``file``, ``commit`` and ``date`` say where a row is from, ``backend`` what made it where the record is of one.
+    """
+    found = []
+    for path in sorted((HERE / "results").glob(pattern)):
+        content = json.loads(path.read_text(encoding="utf-8"))
+        rows = pd.json_normalize([row for row in content["results"] if "absent" not in row])
+        about = {"file": path.name, "commit": content["machine"]["commit"], "date": content["recorded"][:10]}
+        if "backend" in content["settings"] and "backend" not in rows:
+            about["backend"] = content["settings"]["backend"]
+        found.append(rows.assign(**about))
+    if not found:
+        raise FileNotFoundError(pattern)
+    return pd.concat(found, ignore_index=True)
+
+
+def source(*records: pd.DataFrame) -> str:
+    """The line below a table that says which records it is made of."""
+    files = pd.concat([rows[["file", "commit", "date"]] for rows in records]).drop_duplicates()
+    told = (f"`{row.file}` ({_revision(row.commit)}, {row.date})" for row in files.itertuples())
+    return f"\nFrom {', '.join(told)} in `benchmarks/results`.\n"
+
+
+def suite_source(name: str) -> str:
+    """The same for the tables of a suite."""
+    about = pd.read_csv(HERE / "results" / name / "provenance.csv")
+    commits = [_revision(commit) for commit in about.loc[about["what"] == "commit", "value"]]
+    return f"\nFrom `{name}/` ({', '.join(commits)}) in `benchmarks/results`.\n"
+
+
+def _revision(commit: str) -> str:
+    revision, _, dirty = commit.partition("-")
+    return revision[:8] + (" with changes" if dirty else "")
+
+
+def markdown(rows: Iterable[dict[str, str]]) -> str:
+    table = pd.DataFrame(list(rows)).fillna("-")
+    lines = [list(table.columns), ["---"] * len(table.columns), *table.to_numpy().tolist()]
+    return "".join(f"| {' | '.join(line)} |\n" for line in lines)
+
+
+def _by_backend(rows: pd.DataFrame) -> Iterable[tuple[str, pd.DataFrame]]:
+    return rows.groupby("backend")
+
+
+def _in_m(rows: pd.DataFrame) -> pd.DataFrame:
+    return rows.assign(ate_m=1e-3 * rows["ate_mm"])
+
+
+def _ate(rows: pd.DataFrame) -> str:
+    return _spread(rows["ate_m"])
+
+
+def _spread(ate_m: Iterable[float]) -> str:
+    """Mean and sample standard deviation, and of how many; of a single one just the value."""
+    values = pd.Series(list(ate_m), dtype=float)
+    scale, spec, unit = (1.0, ".3f", "m") if values.mean() >= 0.1 else (1e3, ".1f", "mm")
+    if len(values) == 1:
+        return f"{scale * values[0]:{spec}} {unit}"
+    return f"{scale * values.mean():{spec}} ± {scale * values.std():{spec}} {unit} (n = {len(values)})"
+
+
+def _range(values: pd.Series, spec: str, unit: str) -> str:
+    low, high = format(values.min(), spec), format(values.max(), spec)
+    return f"{low} {unit}" if low == high else f"{low} to {high} {unit}"
+
+
+def _mean(rows: pd.DataFrame, column: str) -> str:
+    return f"{rows[column].mean():.1f} m"
+
+
+def _number(value: float, spec: str) -> str:
+    return "-" if pd.isna(value) else format(value, spec)
+
+
+def page(text: str) -> str:
+    """``text`` with every block of figures made anew."""
+
+    def block(found: re.Match[str]) -> str:
+        try:
+            return found[1] + FIGURES[found[2]]() + found[3]
+        except FileNotFoundError:
+            return f"{found[1]}Nothing is recorded yet.\n{found[3]}"
+
+    return BLOCK.sub(block, text)
+
+
+if __name__ == "__main__":
+    for path in PAGES:
+        path.write_text(page(path.read_text(encoding="utf-8")), encoding="utf-8")
