@@ -288,7 +288,7 @@ def test_a_backend_may_refuse_the_flight_that_warms_it_up():
 def off(calibration: Calibration) -> Calibration:
     """The camera sits otherwise than told, as far off as the prior allows."""
     (camera,) = calibration.cameras
-    R_BC, p_BC = camera.R_BC @ so3.exp([0.004, -0.006, 0.005]), camera.p_BC + [0.012, -0.015, 0.01]
+    R_BC, p_BC = camera.R_BC @ so3.exp([0.004, -0.006, 0.005]), camera.p_BC + np.array([0.012, -0.015, 0.01])
     return calibration.with_camera(0, R_BC=R_BC, p_BC=p_BC)
 
 

@@ -70,6 +70,7 @@ class Odometry:
         incidents: Incidents | None = None,
         installed: Registry | None = None,
     ) -> None:
+        camera = calibration.single("the odometry")
         self._registry = registry.load() if installed is None else installed
         self.incidents = Incidents() if incidents is None else incidents
         if isinstance(detector, str):
@@ -81,7 +82,6 @@ class Odometry:
             with self._registry.blaming(), limited_threads():
                 warm_up(warm, calibration)
             backend = self._registry.create_backend(backend, backend_options)
-        camera = calibration.single("the odometry")
         self._frontend = Frontend(detector, calibration, frontend or FrontendOptions(), self.incidents)
         self._life = LifeCycle(backend, calibration, estimation, initial_state, name)
         self._synchroniser = Synchroniser(self.incidents, time_offset_ns=camera.time_offset_ns, wait_ms=wait_ms)
