@@ -66,8 +66,9 @@ def test_the_index_finds_the_keyframe_that_holds_the_descriptors():
     rng = np.random.default_rng(2)
     keyframes = [random_descriptors(rng, 300) for _ in range(30)]
     index = DescriptorIndex()
-    for descriptors in keyframes:
-        index.add(descriptors)
+    rows = [index.add(descriptors, number) for number, descriptors in enumerate(keyframes)]
+    for added, descriptors in zip(rows, keyframes, strict=True):
+        np.testing.assert_array_equal(index.descriptors(added), descriptors)
     # Twelve of a hundred bits wrong, as between two views of a place.
     scores = index.similarity(flipped(keyframes[7], 30, rng), before=30)
     assert scores.argmax() == 7
@@ -79,10 +80,10 @@ def test_a_descriptor_that_is_everywhere_counts_little():
     rng = np.random.default_rng(3)
     common = random_descriptors(rng, 10)
     index = DescriptorIndex()
-    for _ in range(40):
-        index.add(np.concatenate([common, random_descriptors(rng, 20)]))
+    for number in range(40):
+        index.add(np.concatenate([common, random_descriptors(rng, 20)]), number)
     own = random_descriptors(rng, 10)
-    index.add(own)
+    index.add(own, 40)
     assert index.similarity(own, 41)[40] > 10.0 * index.similarity(common, 41).max()
 
 

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from vioframe.incidents import Incidents
-from vioframe.io.synchronise import Packet, synchronise
+from vioframe.io.synchronise import Packet, Synchroniser, synchronise
 from vioframe.types import FrameSet, ImuSample, Measurement, Unreadable
 
 IMU_PERIOD_NS = 5_000_000
@@ -224,6 +224,63 @@ def test_it_streams() -> None:
 
     next(synchronise(source(), incidents=Incidents()))
     assert measurements[taken - 1].t_ns == 14 * IMU_PERIOD_NS  # the second from 62.3 ms on
+
+
+def arriving_late(late_ns: int) -> list[Measurement]:
+    """The recording with every third reading ``late_ns`` behind its turn."""
+    measurements = recording()
+    turn = {
+        id(m): m.t_ns + (late_ns if isinstance(m, ImuSample) and m.t_ns // IMU_PERIOD_NS % 3 == 1 else 0)
+        for m in measurements
+    }
+    return sorted(measurements, key=lambda m: turn[id(m)])
+
+
+def push(measurements: list[Measurement], wait_ms: float) -> tuple[list[Packet], dict[str, int]]:
+    incidents = Incidents()
+    synchroniser = Synchroniser(incidents, wait_ms=wait_ms)
+    packets = [packet for measurement in measurements for packet in synchroniser.add(measurement)]
+    return packets + list(synchroniser.finish()), dict(incidents.counts)
+
+
+@pytest.mark.parametrize("wait_ms", [20.0, 50.0, 200.0])
+def test_readings_as_late_as_a_frame_waits_find_their_place(wait_ms: float) -> None:
+    expected = play(recording())[0]
+    packets, counts = push(arriving_late(round(wait_ms * 1e6)), wait_ms)
+    assert_same(packets, expected)
+    assert set(counts) == {"imu_out_of_order"}
+    # One that comes later still is counted, and is no part of a segment that was cut before.
+    packets, _ = push(arriving_late(round((wait_ms + 50.0) * 1e6)), wait_ms)
+    assert_clean(packets)
+    assert len(packets) == len(expected)
+    assert sum(len(imu.t_ns) for imu, _ in packets) < sum(len(imu.t_ns) for imu, _ in expected)
+
+
+def test_without_a_wait_a_frame_comes_out_at_the_first_reading_at_or_behind_it() -> None:
+    for first_frame_ns in (12_345_678, 0):
+        synchroniser = Synchroniser(Incidents(), wait_ms=0.0)
+        waiting: list[int] = []
+        for measurement in recording(first_frame_ns=first_frame_ns):
+            released = [frame.t_ns for _, frame in synchroniser.add(measurement)]
+            if isinstance(measurement, FrameSet):
+                waiting.append(measurement.t_ns)
+            due = [t_ns for t_ns in waiting if isinstance(measurement, ImuSample) or t_ns % IMU_PERIOD_NS == 0]
+            assert released == [t_ns for t_ns in due if t_ns <= measurement.t_ns]
+            waiting = [t_ns for t_ns in waiting if t_ns not in released]
+        assert not waiting
+    packets, counts = push(recording(), 0.0)
+    assert counts == {}
+    assert_same(packets, play(recording())[0])
+
+
+@pytest.mark.parametrize("wait_ms", [5.0, 50.0, 150.0])
+def test_one_wild_stamp_harms_nothing_however_long_frames_wait(wait_ms: float) -> None:
+    measurements = recording()
+    measurements.insert(80, ImuSample(4 * 10**18, np.full(3, 99.0), np.full(3, 99.0)))
+    measurements.insert(90, FrameSet(5 * 10**18, IMAGES))
+    packets, counts = push(measurements, wait_ms)
+    assert_same(packets, play(recording())[0])
+    assert counts["imu_out_of_order"] == counts["frame_out_of_order"] == 1
 
 
 @st.composite

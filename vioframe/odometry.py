@@ -70,6 +70,7 @@ class Odometry:
         incidents: Incidents | None = None,
         installed: Registry | None = None,
     ) -> None:
+        camera = calibration.single("the odometry")
         self._registry = registry.load() if installed is None else installed
         self.incidents = Incidents() if incidents is None else incidents
         camera = calibration.single("the odometry")

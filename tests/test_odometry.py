@@ -1,0 +1,343 @@
+"""The push interface: it gives the bytes of a recording played, and nothing grows while it runs."""
+
+from __future__ import annotations
+
+import gc
+import json
+import resource
+import subprocess
+import sys
+import tracemalloc
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from time import perf_counter
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from rendered_flight import CALIBRATION, RenderedFlight, rendered_flight
+
+from vioframe import pipeline
+from vioframe.cli import main
+from vioframe.errors import ConfigError, DatasetError
+from vioframe.estimation.lifecycle import LifeCycle
+from vioframe.geometry import so3
+from vioframe.incidents import Incidents
+from vioframe.io.calibration import load_calibration
+from vioframe.io.memory import ArrayDataset
+from vioframe.io.synchronise import synchronise
+from vioframe.odometry import Odometry, limited_threads
+from vioframe.parts import registry
+from vioframe.runs.folder import RunFolder
+from vioframe.runs.recorder import CALIBRATION_COLUMNS, Recorder
+from vioframe.simulation import TrackOptions, simulated_stream
+from vioframe.types import (
+    NS_PER_S,
+    Estimate,
+    FrameSet,
+    FrameTracks,
+    Image,
+    ImuSample,
+    Measurement,
+    Status,
+    Step,
+)
+from vioframe_euroc import EurocDataset
+
+BACKENDS = ("msckf", "sliding_window", "loose_ekf")
+INSTALLED = registry.load()
+
+
+def as_bytes(estimate: Estimate) -> bytes:
+    """Everything in an estimate but the clock."""
+    told = repr((estimate.status, estimate.events, estimate.is_keyframe)).encode()
+    arrays = [estimate.landmark_ids, estimate.p_WF]
+    if (state := estimate.state) is not None:
+        arrays += [state.R_WB, state.p_WB, state.v_WB, state.bias_gyro_B, state.bias_accel_B]
+        arrays += [] if state.cov is None else [state.cov]
+    if (learned := estimate.calibration) is not None:
+        (camera,) = learned.calibration.cameras
+        arrays += [camera.R_BC, camera.p_BC, np.array([camera.time_offset_ns]), learned.sigma[0].intrinsics]
+    return told + b"".join(np.ascontiguousarray(array).tobytes() for array in arrays)
+
+
+def all_bytes(steps: Iterable[Step]) -> list[tuple[int, bytes, bytes]]:
+    return [(s.frames.t_ns, s.tracks.ids.tobytes() + s.tracks.xy.tobytes(), as_bytes(s.estimate)) for s in steps]
+
+
+def tracked(steps: list[Step]) -> int:
+    return sum(step.estimate.status is Status.TRACKING for step in steps)
+
+
+def pushed(odometry: Odometry, measurements: Iterable[Measurement], rng: np.random.Generator) -> Iterator[Step]:
+    """The stream in pieces of any size, each sensor's own in order: now one runs ahead, now the other.
+
+    The arrays are filled anew for every piece, as a driver's buffers are.
+    """
+    imu, frames = [], []
+    for measurement in measurements:
+        (imu if isinstance(measurement, ImuSample) else frames).append(measurement)
+    image_buffer = np.empty_like(frames[0].images[0])
+    buffer = np.empty((2, 200, 3))
+    while imu or frames:
+        if imu and (not frames or rng.random() < 0.5):
+            count = int(rng.integers(1, 200))
+            piece, imu = imu[:count], imu[count:]
+            gyro_B, accel_B = buffer[:, : len(piece)]
+            gyro_B[:], accel_B[:] = [s.gyro_B for s in piece], [s.accel_B for s in piece]
+            if len(piece) == 1:
+                yield from odometry.add_imu(piece[0].t_ns, gyro_B[0], accel_B[0])
+            else:
+                yield from odometry.add_imu([s.t_ns for s in piece], gyro_B, accel_B)
+            continue
+        for _ in range(int(rng.integers(1, 12))):
+            if frames:
+                frame = frames.pop(0)
+                image_buffer[:] = frame.images[0]
+                yield from odometry.add_images(frame.t_ns, image_buffer)
+    yield from odometry.finish()
+
+
+@cache
+def short_flight() -> tuple[Measurement, ...]:
+    """A second and a half at rest and three in flight."""
+    whole: RenderedFlight = rendered_flight()
+    return tuple(m for m in whole.measurements if m.t_ns < whole.measurements[0].t_ns + 4.6 * NS_PER_S)
+
+
+def in_memory(measurements: Iterable[Measurement]) -> ArrayDataset:
+    imu = [m for m in measurements if isinstance(m, ImuSample)]
+    frames = [m for m in measurements if isinstance(m, FrameSet)]
+    return ArrayDataset(
+        CALIBRATION,
+        [m.t_ns for m in imu],
+        [m.gyro_B for m in imu],
+        [m.accel_B for m in imu],
+        [m.t_ns for m in frames],
+        [m.images[0] for m in frames],
+    )
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_pieces_of_any_size_give_the_bytes_of_the_recording(backend):
+    def odometry() -> Odometry:
+        return Odometry(CALIBRATION, backend=backend, installed=INSTALLED)
+
+    played = list(pipeline.run(in_memory(short_flight()), odometry()))
+    assert len(played) == 46
+    assert tracked(played) > 30
+    expected = all_bytes(played)
+    for seed in range(2):
+        assert all_bytes(pushed(odometry(), short_flight(), np.random.default_rng(seed))) == expected
+
+
+def test_a_recording_from_files_is_the_same_pushed(shared_data):
+    dataset = EurocDataset(shared_data / "euroc/MH_01_easy_15s", cameras="cam0")
+
+    def odometry() -> Odometry:
+        return Odometry(dataset.calibration, "fast", installed=INSTALLED)
+
+    played = list(pipeline.run(dataset, odometry(), duration_s=4.0))
+    assert tracked(played) > 20
+    last_ns = played[-1].frames.t_ns
+    part = [
+        m
+        for m in dataset.measurements()
+        if m.t_ns <= last_ns or (isinstance(m, ImuSample) and m.t_ns <= last_ns + NS_PER_S)
+    ]
+    assert all_bytes(pushed(odometry(), part, np.random.default_rng(3))) == all_bytes(played)
+
+
+def test_the_calibration_is_as_learned_by_now():
+    odometry = Odometry(CALIBRATION, installed=INSTALLED)
+    assert odometry.calibration is CALIBRATION
+    steps = list(pipeline.run(in_memory(short_flight()), odometry))
+    (camera,), (given,) = odometry.calibration.cameras, CALIBRATION.cameras
+    assert 1e-6 < np.linalg.norm(so3.log(camera.R_BC.T @ given.R_BC)) < 0.02
+    assert odometry.calibration is steps[-1].estimate.calibration.calibration
+    assert odometry.calibration.imu == CALIBRATION.imu
+
+
+def test_threads_are_few_while_it_runs_and_as_before_afterwards():
+    import cv2
+    from threadpoolctl import threadpool_info
+
+    def blas() -> list[int]:
+        return [library["num_threads"] for library in threadpool_info() if library["user_api"] == "blas"]
+
+    before, opencv = blas(), cv2.getNumThreads()
+    with limited_threads():
+        assert set(blas()) == {1}
+        assert cv2.getNumThreads() <= 4
+    assert (blas(), cv2.getNumThreads()) == (before, opencv)
+
+
+# What does not fit.
+
+
+def test_two_cameras_are_refused_in_one_line():
+    camera = CALIBRATION.cameras[0]
+    pair = replace(CALIBRATION, cameras=(camera, replace(camera, name="cam1")))
+    with pytest.raises(ConfigError) as refused:
+        Odometry(pair, installed=INSTALLED)
+    assert "takes one camera for now, the calibration has cam0, cam1; choose one of them" in str(refused.value)
+    assert "\n" not in str(refused.value)
+
+
+IMAGE: Image = np.zeros((240, 376), np.uint8)
+
+
+@pytest.mark.parametrize(
+    ("push", "why"),
+    [
+        (lambda o: o.add_images(0, IMAGE, IMAGE), "2 images came for a rig of 1 camera"),
+        (lambda o: o.add_images(0), "0 images came for a rig of 1 camera"),
+        (lambda o: o.add_images(0, None), "1 images came for a rig of 1 camera"),
+        (lambda o: o.add_imu([0, 1], np.zeros((2, 3)), np.zeros((1, 3))), "2 stamps came with 2 and 1 readings"),
+        (lambda o: o.add_imu([0], np.zeros((2, 3)), np.zeros((2, 3))), "1 stamps came with 2 and 2 readings"),
+    ],
+)
+def test_what_does_not_fit_together_is_refused(push, why):
+    odometry = Odometry(CALIBRATION, installed=INSTALLED)
+    with pytest.raises(DatasetError, match=why):
+        push(odometry)
+
+
+@pytest.mark.parametrize("wait_ms", [-1.0, float("nan")])
+def test_a_wait_that_is_none_is_refused(wait_ms):
+    with pytest.raises(ConfigError, match="wait_ms must be zero or more"):
+        Odometry(CALIBRATION, wait_ms=wait_ms, installed=INSTALLED)
+
+
+# Frames that somebody else has tracked.
+
+
+@cache
+def tracked_flight(duration_s: float = 6.0) -> tuple[ImuSample | FrameTracks, ...]:
+    return tuple(simulated_stream("figure_eight", seed=1, duration_s=duration_s, calibration=CALIBRATION))
+
+
+def add(odometry: Odometry, item: ImuSample | FrameTracks) -> list[Step]:
+    return odometry.add_tracks(item) if isinstance(item, FrameTracks) else odometry.add(item)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_tracks_given_are_estimated_as_the_life_cycle_does(backend):
+    items = tracked_flight()
+    odometry = Odometry(CALIBRATION, backend=backend, installed=INSTALLED)
+    steps = [step for item in items for step in add(odometry, item)] + odometry.finish()
+    frames = {item.t_ns: item for item in items if isinstance(item, FrameTracks)}
+    stream = (FrameSet(item.t_ns, ()) if isinstance(item, FrameTracks) else item for item in items)
+    life = LifeCycle(INSTALLED.create_backend(backend), CALIBRATION)
+    with limited_threads():
+        alone = [life.process(imu, frames[frame.t_ns]) for imu, frame in synchronise(stream, Incidents())]
+    assert tracked(steps) > 30
+    assert [as_bytes(step.estimate) for step in steps] == [as_bytes(estimate) for estimate in alone]
+    assert all(step.tracks is frames[step.frames.t_ns] for step in steps)
+
+
+def test_of_frames_that_are_dropped_nothing_is_kept():
+    odometry = Odometry(CALIBRATION, backend="msckf", installed=INSTALLED)
+    items = tracked_flight()
+    begin_ns, steps = items[0].t_ns, []
+    for item in items:
+        if isinstance(item, ImuSample) and item.t_ns < begin_ns + NS_PER_S:
+            continue  # the frames of the first second have no readings
+        steps += add(odometry, item)
+        if isinstance(item, FrameTracks):
+            steps += odometry.add_tracks(replace(item.only(item.ids < 0), t_ns=item.t_ns))  # a second of this stamp
+            steps += odometry.add_tracks(replace(item, t_ns=item.t_ns - NS_PER_S))  # and one that is far too late
+    steps += odometry.finish()
+    assert len(odometry._waiting_tracks) <= 2
+    assert odometry.incidents.counts["frame_duplicate"] > 90
+    assert len(steps) == 101
+    assert all(len(step.tracks.ids) for step in steps)
+
+
+# What is learned of the calibration.
+
+
+def test_the_learned_calibration_serves_the_next_run(tmp_path):
+    bag, first, second = rendered_flight().write(tmp_path / "f.bag"), tmp_path / "first", tmp_path / "second"
+    for out, more in ((first, []), (second, ["--calibration", str(first / "calibration_learned")])):
+        done = CliRunner().invoke(main, ["run", str(bag), "--out", str(out), "--quiet", *more])
+        assert done.exit_code == 0, done.output
+    run = RunFolder.open(first)
+    given, learned = run.calibration(), run.learned_calibration()
+    assert given is not None
+    assert learned is not None
+    assert learned.imu == given.imu
+    assert [camera.name for camera in learned.cameras] == [camera.name for camera in given.cameras]
+    apart = so3.log(learned.cameras[0].R_BC.T @ given.cameras[0].R_BC)
+    assert 1e-6 < np.linalg.norm(apart) < 0.02
+    assert load_calibration(second / "calibration").cameras[0].model == learned.cameras[0].model
+    assert RunFolder.open(second).summary["completion"] == 1.0
+    table = np.genfromtxt(first / "calibration.csv", delimiter=",", names=True)
+    assert table.dtype.names == CALIBRATION_COLUMNS
+    assert len(table) == len(run.trajectory())
+    assert (table["camera"] == 0).all()
+    for column in ("sigma_rx", "sigma_ry", "sigma_rz", "sigma_time_offset_s"):
+        assert table[column][-1] < table[column][0]
+        assert (np.diff(table[column]) < 1e-6).all()
+    assert table["fx"][-1] == pytest.approx(learned.cameras[0].model.fx, rel=1e-8)
+
+
+# Nothing grows.
+
+
+def fly_and_watch(backend: str, duration_s: float, folder: Path) -> Iterator[float]:
+    """Fly to and fro with the recorder running; seconds flown, after each frame."""
+    options = TrackOptions(max_points=100)
+    stream = simulated_stream("figure_eight", options=options, duration_s=duration_s, calibration=CALIBRATION)
+    odometry = Odometry(CALIBRATION, backend=backend, installed=INSTALLED)
+    begin_ns = None
+    with Recorder(folder, {}, odometry.incidents, perf_counter()) as recorder:
+        for item in stream:
+            for step in add(odometry, item):
+                recorder.add(step)
+                begin_ns = step.frames.t_ns if begin_ns is None else begin_ns
+                yield (step.frames.t_ns - begin_ns) / NS_PER_S
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_no_object_is_kept_of_a_frame_that_is_done(backend, tmp_path):
+    """Traced while it flies: what is alive in the last quarter is what was in the second, but for the map."""
+    duration_s, alive = 32.0, []
+    tracemalloc.start()
+    try:
+        for flown_s in fly_and_watch(backend, duration_s, tmp_path):
+            if not len(alive) % 50:
+                gc.collect()
+            alive.append((flown_s, tracemalloc.get_traced_memory()[0]))
+    finally:
+        tracemalloc.stop()
+    flown_s, size = np.array(alive).T
+    early, late = (np.median(size[(flown_s > a) & (flown_s < b)]) for a, b in ((8.0, 16.0), (24.0, 32.0)))
+    landmarks = len(RunFolder.open(tmp_path).landmarks())
+    # Some 300 bytes a landmark in the map; a frame's tracks alone would be 2 MB by then.
+    assert late - early < 300_000 + 300 * landmarks
+
+
+@pytest.mark.very_slow
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_an_hour_takes_no_more_memory_than_a_minute(backend, tmp_path, minutes=60):
+    """By what the process ever took of the system: less than 50 MB after the first minute."""
+    done = subprocess.run(
+        [sys.executable, __file__, backend, str(60.0 * minutes), str(tmp_path)], check=True, capture_output=True
+    )
+    after_minutes = json.loads(done.stdout)
+    assert len(after_minutes) == minutes
+    assert after_minutes[-1] - after_minutes[0] < 50.0
+    summary = RunFolder.open(tmp_path).summary
+    assert summary["finished"]
+    assert summary["completion"] > 0.99
+
+
+if __name__ == "__main__":
+    megabytes: list[float] = []
+    for flown_s in fly_and_watch(sys.argv[1], float(sys.argv[2]), Path(sys.argv[3])):
+        if flown_s >= 60.0 * (len(megabytes) + 1):
+            megabytes.append(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)
+    print(json.dumps(megabytes))
