@@ -1,12 +1,12 @@
 # Everything on a fresh Debian or Ubuntu machine with Python >= 3.11, make and a compiler:
-#   make demo   set up, then the main job on a simulated flight: bag -> runs -> evaluation, plots and a view
-#   make test   set up, then lint, types and the tests; make test-all: those that take minutes as well
+#   make demo   set up what the demo needs, then the main job on a simulated flight: bag -> runs -> evaluation, plots and a view
+#   make test   set up what the tests need, then lint, types and the tests; make test-all: those that take minutes as well
 PYTHON ?= $(shell for p in python3 python3.13 python3.12 python3.11 python; do \
 	$$p -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null && echo $$p && break; done)
 VENV := .venv
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
-CODE := vioframe plugins tests docs/example-plugin
+INSTALLED_FOR_DEMO := $(VENV)/.installed-demo
 
 DEMO := build/demo
 FLIGHT ?= inspection
@@ -39,7 +39,7 @@ lint: install
 	$(BIN)/lint-imports
 
 # Every detector with the filter, and the optimiser with loop closure, on the same simulated flight; nothing is downloaded.
-demo: install
+demo: $(INSTALLED_FOR_DEMO) system-libraries
 	@mkdir -p $(DEMO)
 	$(BIN)/vioframe simulate $(FLIGHT_BAG) --flight $(FLIGHT) --duration 25 --overwrite
 	for detector in $(DETECTORS); do \
@@ -52,12 +52,17 @@ demo: install
 
 install: $(INSTALLED) system-libraries
 
-$(INSTALLED): pyproject.toml constraints.txt
-	@test -n "$(PYTHON)" || { echo "vioframe needs Python 3.11 or newer: make PYTHON=/path/to/python3.11"; exit 2; }
-	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV) || { rm -rf $(VENV); \
-		echo "cannot create $(VENV); on Debian or Ubuntu: apt-get install python3-venv"; exit 2; }
-	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable ".[test,open3d]"
+# What the demo needs, and what the tests need: the latter holds the former. Versions are those of constraints.txt.
+$(INSTALLED_FOR_DEMO): EXTRAS := open3d,openvino,view
+$(INSTALLED): EXTRAS := test,open3d
+$(INSTALLED_FOR_DEMO) $(INSTALLED): pyproject.toml constraints.txt | $(BIN)/python
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable ".[$(EXTRAS)]"
 	@touch $@
+
+$(BIN)/python:
+	@test -n "$(PYTHON)" || { echo "vioframe needs Python 3.11 or newer: make PYTHON=/path/to/python3.11"; exit 2; }
+	@$(PYTHON) -m venv $(VENV) || { rm -rf $(VENV); \
+		echo "cannot create $(VENV); on Debian or Ubuntu: apt-get install python3-venv"; exit 2; }
 
 # Only Open3D needs these, so what cannot be installed is said and not fatal.
 system-libraries:

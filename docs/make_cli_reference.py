@@ -8,8 +8,8 @@ import click
 from click.testing import CliRunner
 
 from vioframe.cli import main
-from vioframe.frontend import FrontendOptions
 from vioframe.parts import registry
+from vioframe.parts.config import OPTION_SECTIONS
 from vioframe.parts.options import REQUIRED, Option, options_of
 
 PAGE = Path(__file__).parent / "cli.md"
@@ -25,15 +25,15 @@ _PARTS = """\
 ## Options of the parts
 
 What `-o NAME=VALUE` sets; write `-o SECTION.NAME=VALUE`, with the section `detector`, `backend`, `loop_closure`,
-`dataset` or `frontend`, where several parts have such an option. `vioframe plugins NAME` prints the same for every
-installed part, yours included.
+`dataset`, `frontend` or `estimation`, where several parts have such an option. `vioframe plugins NAME` prints the same
+for every installed part, yours included.
 """
 
 
 def page() -> str:
     """The whole of docs/cli.md."""
-    frontend = _section("frontend", "The KLT tracker, for every detector.", options_of(FrontendOptions))
-    return "\n".join([_HEAD, *_commands(), _PARTS, *_parts(), frontend])
+    shared = [_section(name, _summary(of), options_of(of)) for name, of in OPTION_SECTIONS.items()]
+    return "\n".join([_HEAD, *_commands(), _PARTS, *_parts(), *shared])
 
 
 def _commands() -> list[str]:
