@@ -12,8 +12,11 @@ import pytest
 from initialization_helpers import Motion, judge, without_points
 from scipy.stats import chi2
 
+from vioframe import pipeline
+from vioframe.errors import ConfigError
 from vioframe.estimation.initialization import CameraRotation, Initializer, RotationCalibrator, hand_eye
 from vioframe.estimation.initialization.epipolar_pairs import BearingPairs, _noise_of_normals
+from vioframe.estimation.lifecycle import LifeCycle
 from vioframe.evaluation import evaluate
 from vioframe.frontend import Frontend, FrontendOptions
 from vioframe.geometry import so3
@@ -22,23 +25,27 @@ from vioframe.incidents import Incidents
 from vioframe.io.calibration import packaged_calibration
 from vioframe.io.synchronise import synchronise
 from vioframe.io.trajectories import load_trajectory
-from vioframe.pipeline import run
+from vioframe.odometry import Odometry
 from vioframe.simulation import Packet, TrackSequence, simulated_sequence
 from vioframe.simulation.flights import ShapedFlight, levelled
 from vioframe.types import Calibration, Estimate, Float, NavState, Status
 from vioframe_euroc import EurocDataset
 from vioframe_msckf.backend import Msckf
-from vioframe_msckf.options import MsckfOptions
 from vioframe_shi_tomasi import ShiTomasi
 
-EUROC = packaged_calibration("euroc")
+EUROC = packaged_calibration("euroc", cameras=["cam0"])
 BIAS_GYRO = np.array([-0.002, 0.021, 0.077])
 FLIGHTS = ["figure_eight", "aggressive", "stop_and_go", "pure_rotation"]
 
 
 def turned(calibration: Calibration, R_BC: Float | None = None) -> Calibration:
     """The calibration with the camera turned some other way: as the body unless ``R_BC`` says how."""
-    return replace(calibration, R_BC=np.eye(3) if R_BC is None else R_BC)
+    return calibration.with_camera(0, R_BC=np.eye(3) if R_BC is None else R_BC)
+
+
+def unknown(calibration: Calibration) -> Calibration:
+    """The calibration of which nobody knows how the camera is turned."""
+    return calibration.with_camera(0, R_BC=np.eye(3), rotation_known=False)
 
 
 def calibrate(packets: Sequence[Packet], calibration: Calibration) -> tuple[CameraRotation | None, RotationCalibrator]:
@@ -53,7 +60,7 @@ def calibrate(packets: Sequence[Packet], calibration: Calibration) -> tuple[Came
 
 def error(found: CameraRotation, calibration: Calibration) -> Float:
     """(3,) rad."""
-    return so3.log(found.R_BC.T @ calibration.R_BC)
+    return so3.log(found.R_BC.T @ calibration.cameras[0].R_BC)
 
 
 def error_deg(found: CameraRotation | None, calibration: Calibration) -> float:
@@ -96,7 +103,7 @@ class TestPairs:
 
     def test_small_parallax_does_not_pull_the_rotation(self):
         """Motion of a pixel or two under a pixel of noise: the mean over many pairs is still the truth."""
-        rng, sigma = np.random.default_rng(2), 1.0 / EUROC.camera.focal_px
+        rng, sigma = np.random.default_rng(2), 1.0 / EUROC.cameras[0].model.focal_px
         pairs, R_12, _ = random_pairs(rng, count=400, tracks=60, baseline=0.03, sigma=sigma)
         R, weight = R_12, pairs.common.astype(float)
         for _ in range(30):
@@ -170,7 +177,7 @@ class TestNoise:
 
 class TestRefusals:
     def test_turns_about_one_axis(self):
-        flight = ShapedFlight(15.0, swaying, yawing, levelled(EUROC.R_BC))
+        flight = ShapedFlight(15.0, swaying, yawing, levelled(EUROC.cameras[0].R_BC))
         s = simulated_sequence(flight, bias_gyro_B=BIAS_GYRO)
         found, calibrator = calibrate(s.packets, s.calibration)
         assert found is None
@@ -179,7 +186,7 @@ class TestRefusals:
 
     def test_turns_about_one_axis_are_seen_by_the_covariance_too(self, monkeypatch: pytest.MonkeyPatch):
         monkeypatch.setattr(hand_eye, "_LEAST_SECOND_TURN", 0.0)
-        flight = ShapedFlight(15.0, swaying, yawing, levelled(EUROC.R_BC))
+        flight = ShapedFlight(15.0, swaying, yawing, levelled(EUROC.cameras[0].R_BC))
         s = simulated_sequence(flight, bias_gyro_B=BIAS_GYRO)
         found, calibrator = calibrate(s.packets, s.calibration)
         assert found is None
@@ -239,8 +246,8 @@ class TestBadInput:
 class TestInitializer:
     def test_begins_once_the_rotation_is_found(self, caplog: pytest.LogCaptureFixture):
         s = simulated_sequence("aggressive", duration_s=10.0, bias_gyro_B=BIAS_GYRO)
-        initializer = Initializer(turned(s.calibration), unknown_camera_rotation=True)
-        np.testing.assert_array_equal(initializer.calibration.R_BC, np.eye(3))
+        initializer = Initializer(unknown(s.calibration))
+        np.testing.assert_array_equal(initializer.calibration.cameras[0].R_BC, np.eye(3))
         with caplog.at_level(logging.INFO, "vioframe.estimation.initialization"):
             for imu, tracks in s.packets:
                 estimate = initializer.add(imu, tracks)
@@ -253,18 +260,18 @@ class TestInitializer:
         assert error_deg(found, s.calibration) < 1.0
         assert found is not None
         assert any(str(found) in message for message in caplog.messages)
-        np.testing.assert_array_equal(initializer.calibration.R_BC, found.R_BC)
-        np.testing.assert_array_equal(initializer.calibration.p_BC, s.calibration.p_BC)
+        np.testing.assert_array_equal(initializer.calibration.cameras[0].R_BC, found.R_BC)
+        np.testing.assert_array_equal(initializer.calibration.cameras[0].p_BC, s.calibration.cameras[0].p_BC)
 
     def test_waits_at_rest_and_says_why(self):
         s = simulated_sequence("standstill", duration_s=4.0, bias_gyro_B=BIAS_GYRO)
-        initializer = Initializer(turned(s.calibration), unknown_camera_rotation=True)
+        initializer = Initializer(unknown(s.calibration))
         assert all(initializer.add(imu, tracks) is None for imu, tracks in s.packets)
         assert initializer.refusal.startswith("hand-eye: turned by 0.0")
 
     def test_the_rotation_outlives_a_reset(self):
         s = simulated_sequence("aggressive", duration_s=5.0)
-        initializer = Initializer(turned(s.calibration), unknown_camera_rotation=True)
+        initializer = Initializer(unknown(s.calibration))
         for imu, tracks in s.packets:
             initializer.add(imu, tracks)
             if initializer.camera_rotation is not None:
@@ -277,17 +284,17 @@ class TestInitializer:
         assert any(initializer.add(imu, tracks) is not None for imu, tracks in at_rest.packets)
 
 
-def fly(sequence: TrackSequence, options: MsckfOptions) -> tuple[list[Estimate], list[NavState]]:
-    """Estimates of a filter that believes its camera to be turned as the body is."""
-    backend = Msckf(turned(sequence.calibration), options)
-    estimates = [backend.process(imu, tracks) for imu, tracks in sequence.packets]
+def fly(sequence: TrackSequence, calibration: Calibration) -> tuple[list[Estimate], list[NavState]]:
+    """Estimates of a filter that takes ``calibration`` for that of the sequence."""
+    life = LifeCycle(Msckf(), calibration)
+    estimates = [life.process(imu, tracks) for imu, tracks in sequence.packets]
     return estimates, [e.state for e in estimates if e.state is not None]
 
 
 class TestMsckf:
     def test_flies_with_a_camera_mounted_unknown(self):
         s = simulated_sequence("aggressive", duration_s=12.0, bias_gyro_B=BIAS_GYRO)
-        estimates, states = fly(s, MsckfOptions(unknown_camera_rotation=True))
+        estimates, states = fly(s, unknown(s.calibration))
         assert Status.LOST not in {e.status for e in estimates}
         assert any("camera's rotation on the body found" in event for e in estimates for event in e.events)
         path = Trajectory(*(np.stack(x) for x in zip(*((x.t_ns, x.R_WB, x.p_WB) for x in states), strict=True)))
@@ -297,38 +304,38 @@ class TestMsckf:
 
     def test_never_begins_with_a_wrong_rotation_taken_for_true(self):
         s = simulated_sequence("aggressive", duration_s=4.0)
-        assert not fly(s, MsckfOptions())[1]
+        assert not fly(s, turned(s.calibration))[1]
 
     def test_a_start_from_a_known_state_does_not_go_with_it(self):
         s = simulated_sequence("aggressive", duration_s=1.0)
         start = replace(s.true_states[0], cov=np.eye(15))
-        with pytest.raises(ValueError, match="leave out initial_state"):
-            Msckf(s.calibration, MsckfOptions(unknown_camera_rotation=True), start)
+        with pytest.raises(ConfigError, match="whose rotation on the body is known"):
+            LifeCycle(Msckf(), unknown(s.calibration), initial_state=start)
 
 
 class TestRealRecordings:
     def test_machine_hall_from_a_camera_taken_to_be_turned_as_the_body(self, shared_data: Path):
-        """The front-end predicts with the wrong rotation too, and the filter ends up as good as ever."""
+        """The front-end predicts nothing until it is found, and the filter ends up as good as ever."""
         folder = shared_data / "euroc" / "MH_01_easy_15s"
-        dataset = EurocDataset(folder)
-        true = dataset.calibration
-        wrong = EurocDataset(folder)
-        object.__setattr__(wrong, "calibration", turned(true))
-        backend = Msckf(turned(true), MsckfOptions(unknown_camera_rotation=True))
-        states = [step.estimate.state for step in run(wrong, ShiTomasi(), backend) if step.estimate.state is not None]
-        assert backend.state is not None
-        assert np.rad2deg(np.linalg.norm(so3.log(backend.state.R_BC.T @ true.R_BC))) < 1.0
+        dataset = EurocDataset(folder, cameras=["cam0"])
+        true = dataset.calibration.cameras[0]
+        odometry = Odometry(unknown(dataset.calibration), ShiTomasi(), "msckf")
+        steps = pipeline.run(dataset, odometry)
+        states = [step.estimate.state for step in steps if step.estimate.state is not None]
+        learned = odometry.calibration.cameras[0]
+        assert learned.rotation_known
+        assert np.rad2deg(np.linalg.norm(so3.log(learned.R_BC.T @ true.R_BC))) < 1.0
         path = Trajectory(*(np.stack(x) for x in zip(*((x.t_ns, x.R_WB, x.p_WB) for x in states), strict=True)))
         errors = evaluate(path, load_trajectory(folder / "mav0/state_groundtruth_estimate0/data.csv"))
         assert errors.coverage > 0.7
         assert errors.ate_m.rmse < 0.015
 
     def test_at_rest(self, shared_data: Path):
-        dataset, incidents = EurocDataset(shared_data / "euroc" / "V1_01_easy_rest"), Incidents()
+        dataset, incidents = EurocDataset(shared_data / "euroc" / "V1_01_easy_rest", cameras=["cam0"]), Incidents()
         calibration = dataset.calibration
-        frontend = Frontend(ShiTomasi(), calibration.camera, FrontendOptions(), incidents)
+        frontend = Frontend(ShiTomasi(), calibration, FrontendOptions(), incidents)
         packets = synchronise(dataset.measurements(), incidents=incidents)
-        tracked = [(imu, frontend.track(imu, frame, calibration.R_BC)) for imu, frame in packets]
+        tracked = [(imu, frontend.track(imu, frame, calibration)) for imu, frame in packets]
         found, calibrator = calibrate(tracked, calibration)
         assert found is None
         assert "about a second axis" in calibrator.refusal

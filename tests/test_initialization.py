@@ -29,10 +29,10 @@ BIAS_GYRO, BIAS_ACCEL = np.array([-0.002, 0.021, 0.077]), np.array([-0.02, 0.13,
 
 def tracked(folder: Path, duration_s: float) -> tuple[Calibration, list[Packet]]:
     """The first seconds of a real recording through the front-end."""
-    dataset, incidents = EurocDataset(folder), Incidents()
-    frontend = Frontend(ShiTomasi(), dataset.calibration.camera, FrontendOptions(), incidents)
+    dataset, incidents = EurocDataset(folder, cameras=["cam0"]), Incidents()
+    frontend = Frontend(ShiTomasi(), dataset.calibration, FrontendOptions(), incidents)
     packets = synchronise(dataset.measurements(), duration_s=duration_s, incidents=incidents)
-    return dataset.calibration, [(imu, frontend.track(imu, frame, dataset.calibration.R_BC)) for imu, frame in packets]
+    return dataset.calibration, [(imu, frontend.track(imu, frame, dataset.calibration)) for imu, frame in packets]
 
 
 def motion(trajectory: Trajectory, packets: list[Packet]) -> Motion:
@@ -87,9 +87,9 @@ class TestRealRecordings:
     def test_intrinsics_wrong_by_two_pixels_are_survived(self, shared_data: Path):
         folder = shared_data / "euroc" / "MH_01_easy_15s"
         calibration, packets = tracked(folder, 3.0)
-        camera = calibration.camera
+        camera = calibration.cameras[0].model
         wrong = replace(camera, fx=camera.fx + 2.0, fy=camera.fy - 2.0, cx=camera.cx - 2.0, cy=camera.cy + 2.0)
-        estimate, _ = first_estimate(seen_by(packets, wrong), replace(calibration, camera=wrong))
+        estimate, _ = first_estimate(seen_by(packets, wrong), calibration.with_camera(0, model=wrong))
         assert estimate is not None
         truth = motion(load_trajectory(folder / "mav0/state_groundtruth_estimate0/data.csv"), packets)
         errors = judge(estimate, truth, packets[0][1].t_ns)
@@ -197,8 +197,11 @@ class TestSimulatedFlights:
         calibration = sequence.calibration
         tracks = next(t for _, t in sequence.packets if t.t_ns == newest.t_ns)
         _, a, b = np.intersect1d(estimate.landmark_ids, tracks.ids, return_indices=True)
-        p_C = ((estimate.p_WF[a] - newest.p_WB) @ newest.R_WB - calibration.p_BC) @ calibration.R_BC
-        error = np.linalg.norm(calibration.camera.project(p_C) - tracks.xy[b], axis=1)
+        R_BC, p_BC = calibration.cameras[0].R_BC, calibration.cameras[0].p_BC
+        p_C = ((estimate.p_WF[a] - newest.p_WB) @ newest.R_WB - p_BC) @ R_BC
+            0
+        ].R_BC
+        error = np.linalg.norm(calibration.cameras[0].model.project(p_C) - tracks.xy[b], axis=1)
         assert len(a) > 30
         assert np.median(error) < 0.5
 
