@@ -6,7 +6,7 @@ from dataclasses import fields, replace
 
 import numpy as np
 import pytest
-from msckf_helpers import after
+from msckf_helpers import since
 from sliding_window_helpers import flown_window, moved, natural, only, standing
 
 from vioframe.bench import run_backend
@@ -219,7 +219,7 @@ def fly(
     monkeypatch.setattr(window_module, "marginalise_oldest", recorded)
     sequence = simulated_sequence(flight, seed=1, duration_s=8.0)
     start = start_in_the_dark(sequence.true_states[1], 1, position_m, yaw_rad)
-    run = run_backend(after(sequence, 1), SlidingWindow(sequence.calibration, options, start))
+    run = run_backend(since(sequence, 1), SlidingWindow(options), initial_state=start)
     assert run.completion == 1.0
     assert len(priors) > 5
     return priors

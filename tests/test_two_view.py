@@ -13,7 +13,6 @@ R_C2C1 = so3.exp([0.01, -0.03, 0.02])
 P_C2C1 = np.array([0.10, -0.02, 0.05])
 
 METHODS = {
-    "essential": two_view.essential_inliers,
     "fundamental": two_view.fundamental_inliers,
     "magsac": two_view.magsac_inliers,
     # The rotation as a gyroscope with a bias of 0.1 rad/s would give it at 20 Hz.
