@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from vioframe.evaluation import evaluate
+from vioframe.odometry import Odometry
 from vioframe.parts import registry
 from vioframe.parts.config import parse
 from vioframe.pipeline import prepare, record
@@ -136,10 +137,15 @@ def test_an_interrupted_run_leaves_what_it_had(shared_data, tmp_path, how, code)
 
 def test_ctrl_c_within_compiled_code_is_an_interruption(shared_data, tmp_path):
     class Interrupted:
-        def process(self, imu, tracks):
+        def begin(self, start):
+            pass
+
+        def process(self, imu, tracks, still):
             raise SystemError("a result with an exception set") from KeyboardInterrupt()
 
-    config = parse({"dataset": {"path": str(shared_data / "euroc/MH_01_easy_15s")}}, "test")
-    experiment = replace(prepare(config, registry.load()), backend=Interrupted())
+    config = parse({"dataset": {"path": str(shared_data / "euroc/MH_01_easy_15s")}, "duration_s": 4.0}, "test")
+    experiment = prepare(config, registry.load())
+    experiment = replace(experiment, odometry=Odometry(experiment.dataset.calibration, "fast", Interrupted()))
     with pytest.raises(KeyboardInterrupt):
         record(experiment, tmp_path / "run")
+    assert len(RunFolder.open(tmp_path / "run").trajectory()) == 1

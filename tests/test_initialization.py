@@ -199,8 +199,6 @@ class TestSimulatedFlights:
         _, a, b = np.intersect1d(estimate.landmark_ids, tracks.ids, return_indices=True)
         R_BC, p_BC = calibration.cameras[0].R_BC, calibration.cameras[0].p_BC
         p_C = ((estimate.p_WF[a] - newest.p_WB) @ newest.R_WB - p_BC) @ R_BC
-            0
-        ].R_BC
         error = np.linalg.norm(calibration.cameras[0].model.project(p_C) - tracks.xy[b], axis=1)
         assert len(a) > 30
         assert np.median(error) < 0.5

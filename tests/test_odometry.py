@@ -301,10 +301,11 @@ def fly_and_watch(backend: str, duration_s: float, folder: Path) -> Iterator[flo
                 yield (step.frames.t_ns - begin_ns) / NS_PER_S
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_no_object_is_kept_of_a_frame_that_is_done(backend, tmp_path):
     """Traced while it flies: what is alive in the last quarter is what was in the second, but for the map."""
-    duration_s, alive = 32.0, []
+    duration_s, alive = 24.0, []
     tracemalloc.start()
     try:
         for flown_s in fly_and_watch(backend, duration_s, tmp_path):
@@ -314,19 +315,19 @@ def test_no_object_is_kept_of_a_frame_that_is_done(backend, tmp_path):
     finally:
         tracemalloc.stop()
     flown_s, size = np.array(alive).T
-    early, late = (np.median(size[(flown_s > a) & (flown_s < b)]) for a, b in ((8.0, 16.0), (24.0, 32.0)))
+    early, late = (np.median(size[(flown_s > a) & (flown_s < b)]) for a, b in ((6.0, 12.0), (18.0, 24.0)))
     landmarks = len(RunFolder.open(tmp_path).landmarks())
-    # Some 300 bytes a landmark in the map; a frame's tracks alone would be 2 MB by then.
+    # Some 300 bytes a landmark in the map; the tracks of all frames alone would be more than a megabyte.
     assert late - early < 300_000 + 300 * landmarks
 
 
 @pytest.mark.very_slow
+@pytest.mark.parametrize("minutes", [60])
 @pytest.mark.parametrize("backend", BACKENDS)
-def test_an_hour_takes_no_more_memory_than_a_minute(backend, tmp_path):
+def test_an_hour_takes_no_more_memory_than_a_minute(backend, minutes, tmp_path):
     """By what the process ever took of the system: less than 50 MB after the first minute."""
-    minutes = 60
     done = subprocess.run(
-        [sys.executable, __file__, backend, str(60.0 * minutes), str(tmp_path)], check=True, capture_output=True
+        [sys.executable, __file__, backend, str(60.0 * minutes + 1.0), str(tmp_path)], check=True, capture_output=True
     )
     after_minutes = json.loads(done.stdout)
     assert len(after_minutes) == minutes

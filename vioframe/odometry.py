@@ -73,7 +73,6 @@ class Odometry:
         camera = calibration.single("the odometry")
         self._registry = registry.load() if installed is None else installed
         self.incidents = Incidents() if incidents is None else incidents
-        camera = calibration.single("the odometry")
         if isinstance(detector, str):
             detector = self._registry.create_detector(detector, detector_options)
         name = None
