@@ -38,7 +38,7 @@ lint: install
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
-# Every detector with the filter, and the optimiser with loop closure, on the same simulated flight; nothing is downloaded.
+# Every detector with the filter, and the optimiser with loop closure, on the same simulated flight; no data is downloaded.
 demo: $(INSTALLED_FOR_DEMO) system-libraries
 	@mkdir -p $(DEMO)
 	$(BIN)/vioframe simulate $(FLIGHT_BAG) --flight $(FLIGHT) --duration 25 --overwrite

@@ -209,6 +209,22 @@ def memory() -> str:
     return markdown(shown) + source(rows)
 
 
+def push() -> str:
+    """Measurements pushed from Python against the command line."""
+    rows = recorded("odometry_speed.json")
+    shown = [
+        {
+            "way": row.way,
+            "n, runs": f"{row.rounds}",
+            "ms a frame, median": f"{row.frame_ms:.1f} ({row.lowest_ms:.1f} to {row.highest_ms:.1f})",
+            "times the command line": f"{row.ratio:.2f}",
+            "the same bytes": row.same_bytes,
+        }
+        for row in rows.itertuples()
+    ]
+    return markdown(shown) + source(rows)
+
+
 def speed() -> str:
     """Every detector, the fastest first."""
     rows = recorded("detectors_speed.json").sort_values("fps", ascending=False)
@@ -304,7 +320,7 @@ def throughput() -> str:
 FIGURES: dict[str, Callable[[], str]] = {
     make.__name__: make
     for make in (
-        *(headline, real_images, stages, at_rest, landmarks, rendered, april, frontend, consistency, memory),
+        *(headline, real_images, stages, at_rest, landmarks, rendered, april, frontend, consistency, memory, push),
         *(speed, quality, clean, comparison, stress, throughput),
     )
 }

@@ -2,7 +2,7 @@
 
     python benchmarks/rendered_flights.py [--record]
 
-Targets. MH_05_difficult from 5 s on: complete, ATE at most 0.5 m (OpenVINS reached 0.48 m on a rendering of this kind).
+Targets. MH_05_difficult from 5 s on: complete, ATE at most 0.5 m.
 V1_02_medium: at most 0.15 m. The world is simulated: not to be compared with published ATE on the real images.
 """
 

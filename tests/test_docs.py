@@ -133,6 +133,7 @@ def test_every_page_is_in_the_site():
     assert sorted(re.findall(r"[\w/]+\.md", str(nav))) == sorted(pages)
 
 
-def test_the_changelog_is_of_this_version():
+def test_changelog_and_citation_are_of_this_version():
     version = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
     assert f"[{version}]" in (ROOT / "CHANGELOG.md").read_text()
+    assert f"\nversion: {version}\n" in (ROOT / "CITATION.cff").read_text()

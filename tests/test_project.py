@@ -6,6 +6,7 @@ import subprocess
 import sys
 import tomllib
 from pathlib import Path
+from zipfile import ZipFile
 
 import pytest
 
@@ -72,6 +73,52 @@ def test_every_backend_conforms(name):
 
 def test_the_folder_reader_conforms(shared_data):
     check_dataset(INSTALLED.find(registry.DATASET, "euroc").factory, shared_data / "euroc" / "V1_01_easy_rest")
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("dist")
+    subprocess.run([sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", folder], cwd=ROOT, check=True)
+    (path,) = folder.glob("vioframe-*.whl")
+    return path
+
+
+def test_the_wheel_holds_what_an_installation_needs(wheel):
+    names = set(ZipFile(wheel).namelist())
+    assert "vioframe/py.typed" in names
+    tracked = subprocess.run(["git", "ls-files"], cwd=ROOT, capture_output=True, text=True, check=True).stdout.split()
+    code = [name for name in tracked if name.startswith(("vioframe/", "plugins/"))]
+    moved = {"benchmarks/suites/": "vioframe/data/suites/", "benchmarks/thesis/": "vioframe/data/thesis/"}
+    data = [name.replace(old, new) for name in tracked for old, new in moved.items() if name.startswith(old)]
+    assert len(code) > 100
+    assert len(data) > 5
+    missing = [name for name in [*(name.removeprefix("plugins/") for name in code), *data] if name not in names]
+    assert missing == []
+    assert [name for name in names if name.startswith(("tests/", "docs/", "benchmarks/"))] == []
+
+
+def test_the_wheel_works_where_it_is_installed(wheel, tmp_path):
+    pip = [sys.executable, "-m", "pip", "install", "--quiet", "--no-index", "--no-deps", "--target", tmp_path]
+    subprocess.run([*pip, wheel], check=True)
+    environment = {**os.environ, "PYTHONPATH": str(tmp_path)}
+    where = subprocess.run(
+        [sys.executable, "-c", "import vioframe; print(vioframe.__file__)"],
+        env=environment,
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=True,
+    ).stdout
+    assert Path(where.strip()).is_relative_to(tmp_path)
+    shown = subprocess.run(
+        [sys.executable, "-m", "vioframe", "bench", "--help"],
+        env=environment,
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=True,
+    ).stdout
+    assert "mh05_comparison" in shown
 
 
 def test_every_requirement_is_pinned():
