@@ -94,7 +94,7 @@ class Suite(Section):
     metrics: tuple[str, ...] = ()
     frontend: dict[str, Any] = Field(default_factory=dict)
     workers: Annotated[int | None, Field(ge=1)] = None
-    setup: dict[str, Any] = Field(default_factory=dict)
+    setup: Setup = Setup()
     rounds: Annotated[int, Field(ge=1)] = 10
     images: Annotated[int, Field(ge=1)] = 8
     published: tuple[Published, ...] = ()
@@ -163,8 +163,6 @@ def read(path: Path) -> Suite:
     if isinstance(tree.get("reference"), str):
         tree["reference"] = read_tree(path.parent / tree["reference"])
     suite = validate(Suite, tree, str(path))
-    if suite.kind == "trials":
-        montecarlo_setup(suite)
     FrontendOptions(**validate_options("the front-end", FrontendOptions, suite.frontend))
     return suite
 
@@ -186,14 +184,6 @@ def narrowed(suite: Suite, *, seeds: int | None = None, **only: Iterable[str]) -
         if names:
             changes[kind] = tuple(each for name, each in have.items() if name in names)
     return suite.model_copy(update=changes)
-
-
-def montecarlo_setup(suite: Suite) -> Setup:
-    """What the trials of ``suite`` fly through; raises :class:`ConfigError`."""
-    try:
-        return Setup(**suite.setup)
-    except TypeError as error:
-        raise ConfigError(f"setup: {error}; its keys are {', '.join(Setup.__dataclass_fields__)}") from error
 
 
 def render(suite: Suite) -> str:
