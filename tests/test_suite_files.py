@@ -17,6 +17,7 @@ from vioframe.cli import main
 from vioframe.errors import ConfigError, DatasetError, VioframeError
 from vioframe.io.convert import convert
 from vioframe.parts import registry
+from vioframe.parts.config import to_yaml
 from vioframe.runs.results import FINGERPRINT, Data
 from vioframe.simulation.config import SimulationConfig, complete
 from vioframe.simulation.record import record
@@ -55,7 +56,7 @@ class TestFiles:
         for path in suites.shipped().values():
             suite = suites.read(path)
             again = tmp_path / "again.yaml"
-            again.write_text(suites.render(suite))
+            again.write_text(to_yaml(suite))
             assert suites.read(again) == suite
 
     @pytest.mark.parametrize(

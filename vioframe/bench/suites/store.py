@@ -12,10 +12,9 @@ from typing import Any
 from pydantic_core import to_jsonable_python
 
 from vioframe.bench.suites.plan import Plan, Recording, Task
-from vioframe.bench.suites.suite import render
 from vioframe.errors import RunError
 from vioframe.io.calibration import sidecar_folder
-from vioframe.parts.config import read_tree
+from vioframe.parts.config import read_tree, to_yaml
 from vioframe.runs.recorder import write_whole
 from vioframe.runs.results import RUNS_FOLDER, SUITE_FILE, read_rows, write_rows
 from vioframe.simulation.config import simulation_folder
@@ -40,7 +39,7 @@ class Store:
 
     def begin(self, plan: Plan, *, overwrite: bool) -> None:
         """Make the folder that of ``plan``, or go on with it; raises :class:`RunError` where it is another suite's."""
-        text, file = render(plan.suite), self.path / SUITE_FILE
+        text, file = to_yaml(plan.suite), self.path / SUITE_FILE
         if self.path.exists() and any(self.path.iterdir()):
             if not file.is_file():
                 raise RunError(
