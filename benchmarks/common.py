@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from functools import wraps
+from functools import reduce, wraps
 from pathlib import Path
 from typing import Any
 
 import click
 from rich.console import Console
+from rich.table import Table
 from threadpoolctl import threadpool_limits
 
-from vioframe.bench import Row, backend_row, record, run_backend, table
+from vioframe.bench import Row, backend_row, record, run_backend
 from vioframe.errors import VioframeError
 from vioframe.parts import config as configuration
 from vioframe.parts import registry
@@ -95,6 +96,18 @@ def present(
         path = results_file(name, settings)
         record(path, done, settings)
         console.print(f"written to {path.relative_to(HERE.parent)}")
+
+
+def table(title: str, rows: Sequence[Row], columns: Mapping[str, str]) -> Table:
+    """``columns`` maps keys (``stage_ms.total`` reaches into ``stage_ms``) to format specifications."""
+    out = Table(title=title)
+    for key, spec in columns.items():
+        out.add_column(key, justify="right" if spec else "left", no_wrap=True)
+    for row in rows:
+        values = [reduce(lambda found, part: (found or {}).get(part), key.split("."), row) for key in columns]
+        cells = zip(values, columns.values(), strict=True)
+        out.add_row(*("-" if value is None else format(value, spec) for value, spec in cells))
+    return out
 
 
 def results_file(name: str, settings: Mapping[str, Any]) -> Path:

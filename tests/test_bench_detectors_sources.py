@@ -248,7 +248,7 @@ def test_every_call_is_counted(with_broken):
         line_up(entrants, with_broken).ready, [textured(k) for k in range(4)], 3, on_round=rounds.append
     )
     assert len(rounds) == 4  # one of them to warm up
-    corner, shi_tomasi = rows
+    corner, shi_tomasi = rows.to_dict("records")
     assert corner["calls"] == shi_tomasi["calls"] == 12
     assert (corner["on"], shi_tomasi["on"]) == ("cuda, float16", "cpu")
     assert (corner["keypoints"], shi_tomasi["keypoints"] > 100) == (1.0, True)

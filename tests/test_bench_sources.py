@@ -15,9 +15,10 @@ from april_board import (
     reprojection_px,
     rotation_to_vertical,
 )
+from common import table
 from trajectory_helpers import run_of
 
-from vioframe.bench import backend_row, record, table
+from vioframe.bench import backend_row, record
 from vioframe.errors import DatasetError, TrajectoryError
 from vioframe.geometry import so3
 from vioframe.geometry.trajectory import Trajectory

@@ -17,6 +17,7 @@ from vioframe.cli import main
 from vioframe.errors import ConfigError, DatasetError, VioframeError
 from vioframe.io.convert import convert
 from vioframe.parts import registry
+from vioframe.parts.config import to_yaml
 from vioframe.runs.results import FINGERPRINT, Data
 from vioframe.simulation.config import SimulationConfig, complete
 from vioframe.simulation.record import record
@@ -55,7 +56,7 @@ class TestFiles:
         for path in suites.shipped().values():
             suite = suites.read(path)
             again = tmp_path / "again.yaml"
-            again.write_text(suites.render(suite))
+            again.write_text(to_yaml(suite))
             assert suites.read(again) == suite
 
     @pytest.mark.parametrize(
@@ -71,8 +72,14 @@ class TestFiles:
             (TOY.replace("[fast]", "[]"), "flights need detectors, backends and sequences"),
             (TOY + "reference: {band: {half_widthm: 0.2, axes: {}}}\n", "did you mean 'half_width_m'"),
             (TOY + "rounds: 3\n", "rounds does nothing in a suite of kind flights"),
-            ("title: t\nkind: trials\nbackends: [msckf]\nsetup: {speed: 1}\n", "its keys are flight"),
-            ("title: t\nkind: trials\nbackends: [msckf]\nsetup: {duration_s: 1}\n", "at least 10 s"),
+            (
+                "title: t\nkind: trials\nbackends: [msckf]\nsetup: {speed: 1}\n",
+                "unknown key 'setup.speed'; keys here: flight",
+            ),
+            (
+                "title: t\nkind: trials\nbackends: [msckf]\nsetup: {duration_s: 1}\n",
+                "setup.duration_s: Input should be greater than or equal to 10",
+            ),
         ],
     )
     def test_mistakes_are_said_in_a_line(self, tmp_path, text, complaint):

@@ -7,10 +7,10 @@ initialises, diverges or crashes is kept and says so. What the NEES of many tria
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
 from itertools import product
 
 import numpy as np
+from pydantic import Field
 
 from vioframe.bench.processes import installed, map_in_processes
 from vioframe.bench.run import BackendRun, backend_row, run_backend
@@ -23,7 +23,7 @@ from vioframe.evaluation.nees import nees
 from vioframe.geometry.trajectory import Trajectory
 from vioframe.io.calibration import packaged_calibration
 from vioframe.parts import registry
-from vioframe.parts.config import PartConfig
+from vioframe.parts.config import PartConfig, Section
 from vioframe.simulation import TrackSequence, simulated_sequence
 from vioframe.simulation.flights import flight as named_flight
 from vioframe.types import Float, Int
@@ -35,41 +35,21 @@ SHORTEST_S = 10.0
 _DIVERGED_FRACTION, _DIVERGED_M, _DIVERGED_DEG = 0.05, 0.5, 15.0
 
 
-@dataclass(frozen=True, slots=True)
-class Setup:
+class Setup(Section):
     """What every trial flies through: an installed flight, EuRoC's camera and IMU noise, and what is tracked.
 
-    ``pixel_sigma`` px is the noise of an observation, ``outlier_ratio`` the chance that one is 5 to 30 px off. Raises
-    :class:`ConfigError` for values that make no flight.
+    ``pixel_sigma`` px is the noise of an observation, ``outlier_ratio`` the chance that one is 5 to 30 px off.
     """
 
     flight: str = "figure_eight"
-    duration_s: float = 60.0
-    pixel_sigma: float = 1.0
-    outlier_ratio: float = 0.0
-    max_points: int = 150
-
-    def __post_init__(self) -> None:
-        # Written so that NaN fails.
-        if not SHORTEST_S <= self.duration_s < np.inf:
-            raise ConfigError(f"a flight of {self.duration_s:g} s tells nothing; give at least {SHORTEST_S:g} s")
-        if not 0.0 <= self.pixel_sigma < np.inf:
-            raise ConfigError(f"the pixels' noise cannot be {self.pixel_sigma:g} px; give 0 or more")
-        if not 0.0 <= self.outlier_ratio < 1.0:
-            raise ConfigError(f"the part of outliers cannot be {self.outlier_ratio:g}; give 0 or more, below 1")
-        if self.max_points < 1:
-            raise ConfigError(f"{self.max_points} landmarks are none to see; give at least 1")
+    duration_s: float = Field(default=60.0, ge=SHORTEST_S, allow_inf_nan=False)
+    pixel_sigma: float = Field(default=1.0, ge=0.0, allow_inf_nan=False)
+    outlier_ratio: float = Field(default=0.0, ge=0.0, lt=1.0)
+    max_points: int = Field(default=150, ge=1)
 
     def sequence(self, seed: int) -> TrackSequence:
         """The flight with the noise of ``seed``."""
-        return simulated_sequence(
-            self.flight,
-            pixel_sigma=self.pixel_sigma,
-            seed=seed,
-            duration_s=self.duration_s,
-            outlier_ratio=self.outlier_ratio,
-            max_points=self.max_points,
-        )
+        return simulated_sequence(self.flight, seed=seed, **self.model_dump(exclude={"flight"}))
 
 
 def run_montecarlo(
@@ -89,15 +69,10 @@ def run_montecarlo(
     cases = list(product(setups, backends))
     jobs = [(setup, backends[name], seed, name) for setup, name in cases for seed in range(seeds)]
     flown = map_in_processes(_fly_job, jobs, workers, on_trial)
+    trials = [tuple(flown[k * seeds : (k + 1) * seeds]) for k in range(len(cases))]
     return [
-        Trials(
-            name,
-            backends[name].name,
-            dict(backends[name].options),
-            asdict(setup),
-            tuple(flown[k * seeds : (k + 1) * seeds]),
-        )
-        for k, (setup, name) in enumerate(cases)
+        Trials(name, backends[name].name, dict(backends[name].options), setup.model_dump(), own)
+        for (setup, name), own in zip(cases, trials, strict=True)
     ]
 
 

@@ -1,14 +1,16 @@
-"""The command line: one small module a sub-command, imported only when it is called."""
+"""The command line: sub-commands in small modules, imported only when one is called."""
 
 from __future__ import annotations
 
 import errno
 import logging
+from collections.abc import Mapping
+from importlib import import_module
+from typing import Any
 
 import click
 
 import vioframe
-from vioframe.cli.lazy import LazyGroup
 from vioframe.errors import VioframeError
 
 _COMMANDS = {
@@ -27,8 +29,38 @@ _COMMANDS = {
 }
 """Sub-commands and their short help, kept here so that ``vioframe --help`` needs none of their modules."""
 
+_MODULES = {
+    **dict.fromkeys(("evaluate", "plot", "view", "report"), "show"),
+    **dict.fromkeys(("plugins", "config"), "parts"),
+    **dict.fromkeys(("simulate", "convert"), "recordings"),
+}
+
 EXIT_BAD_INPUT = 2
 EXIT_INTERRUPTED = 130
+
+
+class LazyGroup(click.Group):
+    """A group whose sub-commands, ``summaries`` with their short help by name, are imported only when they are called.
+
+    ``modules`` of this package hold them under their own names; one that is not listed is in a module of its own.
+    """
+
+    def __init__(self, *args: Any, modules: Mapping[str, str], summaries: Mapping[str, str], **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        self._modules, self._summaries = modules, summaries
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        return list(self._summaries)
+
+    def get_command(self, ctx: click.Context, name: str) -> click.Command | None:
+        if name not in self._summaries:
+            return None
+        command: click.Command = getattr(import_module(f"vioframe.cli.{self._modules.get(name, name)}"), name)
+        return command
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        with formatter.section("Commands"):
+            formatter.write_dl(list(self._summaries.items()))
 
 
 class _Main(LazyGroup):
@@ -67,9 +99,7 @@ class _EchoHandler(logging.Handler):
         click.echo(f"vioframe: {record.levelname.lower()}: {self.format(record)}", err=True)
 
 
-@click.group(
-    cls=_Main, modules="vioframe.cli.{}", summaries=_COMMANDS, context_settings={"help_option_names": ["-h", "--help"]}
-)
+@click.group(cls=_Main, modules=_MODULES, summaries=_COMMANDS, context_settings={"help_option_names": ["-h", "--help"]})
 @click.version_option(vioframe.__version__, prog_name="vioframe")
 @click.option("--debug", is_flag=True, envvar="VIOFRAME_DEBUG", help="Show the traceback of an error.")
 def main(debug: bool) -> None:

@@ -2,23 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass
+from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
+from vioframe.cli.common import FILE, Bar, print_notes, quiet_option, workers_option
 from vioframe.errors import ConfigError, DatasetError, PluginError
 
 if TYPE_CHECKING:
     import pandas as pd
 
-    from vioframe.bench.detectors.entrants import Entrant, LineUp
-    from vioframe.parts.registry import Registry
+    from vioframe.bench.detectors.entrants import LineUp
 
-_FILE = click.Path(path_type=Path)
 _SPEED_IMAGES, _SPEED_ROUNDS, _FLIGHT_S = 8, 10, 10.0
 _USES = {
     "speed": ("images", "limit", "rounds"),
@@ -27,71 +25,20 @@ _USES = {
 }
 """Of the arguments that not every question has a use for, those that each has."""
 
-
-@dataclass(frozen=True)
-class _Request:
-    entrants: Sequence[Entrant]
-    installed: Registry
-    seed: int
-    quiet: bool
-    given: dict[str, Any]
-    """Arguments of the one question by name."""
-
-    def __getitem__(self, name: str) -> Any:
-        return self.given[name]
-
-    @property
-    def workers(self) -> int:
-        from vioframe.bench.processes import usable_cores
-
-        return self["workers"] or usable_cores()
-
-    def line_up(self, *, describing: bool = False) -> LineUp:
-        """Those that can take part; asked for descriptors where these are of use."""
-        from vioframe.bench.detectors.entrants import line_up
-
-        entrants = [each.describing(self.installed) for each in self.entrants] if describing else self.entrants
-        return line_up(entrants, self.installed)
-
-    def baseline(self) -> str:
-        """The detector to lead over; raises :class:`ConfigError` where the one asked for does not take part."""
-        from vioframe.bench.detectors.tables import BASELINE
-
-        given, labels = self["baseline"], [entrant.label for entrant in self.entrants]
-        if given is not None and given not in labels:
-            raise ConfigError(f"--baseline {given} does not take part; one of {', '.join(labels)} can be led over")
-        return given or BASELINE
-
-    @contextmanager
-    def watch(self, what: str, total: int) -> Iterator[Callable[[int], None]]:
-        """A progress bar, to be told how many more are done."""
-        from rich.console import Console
-        from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
-        columns = (BarColumn(bar_width=12), MofNCompleteColumn(), TextColumn(what), TimeRemainingColumn(compact=True))
-        with Progress(*columns, console=Console(stderr=True), disable=self.quiet) as progress:
-            task = progress.add_task("", total=total)
-            yield lambda count: progress.advance(task, count)
-
-
-@dataclass(frozen=True)
-class _Answer:
-    result: pd.DataFrame
-    settings: dict[str, Any]
-    tables: Sequence[str]
-    line_up: LineUp
+_Answer = tuple["pd.DataFrame", dict[str, Any], str]
+"""What came out, the settings it was made with, and what its table is headed by."""
 
 
 @click.command("detectors")
-@click.argument("dataset", type=_FILE, required=False)
+@click.argument("dataset", type=FILE, required=False)
 @click.option("--quality", is_flag=True, help="Find places again, instead of speed.")
 @click.option("--frontend", is_flag=True, help="Tracks of the front-end along DATASET, instead of speed.")
 @click.option(
     "--detector", "detectors", metavar="NAME[:KEY=VALUE,...]", multiple=True, help="Detector.  [default: all]"
 )
 @click.option("-o", "--option", "options", metavar="NAME.KEY=VALUE", multiple=True, help="Set a detector's option.")
-@click.option("--images", type=_FILE, metavar="DIR", help="Photographs.  [default for speed: drawn surfaces]")
-@click.option("--hpatches", type=_FILE, metavar="DIR", help="HPatches, for --quality.")
+@click.option("--images", type=FILE, metavar="DIR", help="Photographs.  [default for speed: drawn surfaces]")
+@click.option("--hpatches", type=FILE, metavar="DIR", help="HPatches, for --quality.")
 @click.option(
     "--limit", type=click.IntRange(1), metavar="N", help=f"Images.  [default: {_SPEED_IMAGES} for speed, or all]"
 )
@@ -100,12 +47,12 @@ class _Answer:
 @click.option("--rounds", type=click.IntRange(1), metavar="N", help=f"Rounds to time.  [default: {_SPEED_ROUNDS}]")
 @click.option("--start", type=click.FloatRange(0.0), metavar="S", help="Skip the first S seconds of DATASET.")
 @click.option("--duration", type=float, metavar="S", help=f"Seconds of DATASET.  [default: {_FLIGHT_S:g}]")
-@click.option("--ground-truth", type=_FILE, help="True motion, where DATASET brings none: TUM or EuRoC csv.")
-@click.option("--workers", type=click.IntRange(1), metavar="N", help="Processes.  [default: one a core]")
+@click.option("--ground-truth", type=FILE, help="True motion, where DATASET brings none: TUM or EuRoC csv.")
+@workers_option
 @click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="Seed of all that is random.")
-@click.option("--record", "keep", type=_FILE, metavar="FILE", help="Also write the results, as JSON.")
-@click.option("--quiet", is_flag=True, help="No progress bar.")
-def command(
+@click.option("--record", "keep", type=FILE, metavar="FILE", help="Also write the results, as JSON.")
+@quiet_option
+def detectors(
     quality: bool,
     frontend: bool,
     detectors: tuple[str, ...],
@@ -132,31 +79,37 @@ def command(
     given = _given(question, specific)
     try:
         import pandas as pd
-
-        from vioframe.bench.detectors.entrants import everyone, parse_entrants
     except ModuleNotFoundError as error:
-        if error.name != "pandas":
-            raise
         raise PluginError("comparing detectors needs pandas: pip install 'vioframe[bench]'") from error
+    from vioframe.bench.detectors import tables
+    from vioframe.bench.detectors.entrants import everyone, line_up, parse_entrants
+    from vioframe.bench.processes import usable_cores
     from vioframe.bench.results import record
     from vioframe.parts import registry
 
     installed = registry.load()
     entrants = parse_entrants(detectors or everyone(installed, question), options, installed)
+    if quality:
+        entrants = [entrant.describing(installed) for entrant in entrants]
+    if (over := given.get("baseline")) is not None and over not in (labels := [each.label for each in entrants]):
+        raise ConfigError(f"--baseline {over} does not take part; one of {', '.join(labels)} can be led over")
+    given |= {"baseline": over or tables.BASELINE, "workers": given.get("workers") or usable_cores(), "seed": seed}
+    given["quiet"] = quiet
+
+    @cache
+    def lined_up() -> LineUp:
+        return line_up(entrants, installed)
+
     ask = {"speed": _speed, "quality": _quality, "frontend": _frontend}
-    answer = ask[question](_Request(entrants, installed, seed, quiet, given))
-    click.echo("\n\n".join(answer.tables))
-    absent = answer.line_up.absent
-    for label, reason in absent.items():
-        click.echo(f"note: {label} does not take part: {reason}", err=True)
+    result, settings, heading = ask[question](given, lined_up)
+    click.echo("\n\n".join(tables.shown(question, heading, result, given["baseline"])))
+    absent = lined_up().absent
+    print_notes(f"{label} does not take part: {reason}" for label, reason in absent.items())
     if keep is not None:
-        known = answer.result.astype(object).where(pd.notna(answer.result), None)
-        rows: list[Any] = [
-            *known.to_dict("records"),
-            *({"detector": label, "absent": reason} for label, reason in absent.items()),
-        ]
-        taking_part = {entrant.label: dict(entrant.options) for entrant, _ in answer.line_up.ready}
-        record(keep, rows, {"question": question, "seed": seed, **answer.settings, "detectors": taking_part})
+        rows: list[Any] = result.astype(object).where(pd.notna(result), None).to_dict("records")
+        rows += [{"detector": label, "absent": reason} for label, reason in absent.items()]
+        taking_part = {entrant.label: dict(entrant.options) for entrant, _ in lined_up().ready}
+        record(keep, rows, {"question": question, "seed": seed, **settings, "detectors": taking_part})
         click.echo(f"written to {keep}")
 
 
@@ -171,88 +124,81 @@ def _given(question: str, specific: dict[str, Any]) -> dict[str, Any]:
     return {name: specific[name] for name in _USES[question]}
 
 
-def _speed(asked: _Request) -> _Answer:
-    import pandas as pd
-
-    from vioframe.bench.detectors import speed, tables
+def _speed(given: dict[str, Any], lined_up: Callable[[], LineUp]) -> _Answer:
+    from vioframe.bench.detectors import speed
     from vioframe.bench.detectors.images import evenly, find_images, fit, procedural_images, read_grey
 
-    images, limit, rounds = asked["images"], asked["limit"] or _SPEED_IMAGES, asked["rounds"] or _SPEED_ROUNDS
+    images, limit, rounds = given["images"], given["limit"] or _SPEED_IMAGES, given["rounds"] or _SPEED_ROUNDS
     if images is None:
-        pictures, source = procedural_images(limit, speed.RESOLUTION, asked.seed), "drawn surfaces"
+        pictures, source = procedural_images(limit, speed.RESOLUTION, given["seed"]), "drawn surfaces"
     else:
         pictures = [fit(read_grey(path), speed.RESOLUTION) for path in evenly(find_images(images), limit)]
         source = images.name
-    lined_up = asked.line_up()
-    with asked.watch("rounds", rounds + 1) as on_done:
-        result = pd.DataFrame(speed.time_detectors(lined_up.ready, pictures, rounds, on_round=on_done))
+    ready = lined_up().ready
+    with Bar(rounds + 1, "rounds", quiet=given["quiet"]) as bar:
+        result = speed.time_detectors(ready, pictures, rounds, on_round=lambda count: bar(advance=count))
     settings = speed.speed_settings(source, len(pictures), rounds)
     heading = (
         f"Frames a second at 640 x 480, {speed.MAX_POINTS} keypoints, one at a time, decoding excluded: "
         f"{'; '.join(settings['devices'])}; {len(pictures)} images ({source}) in {rounds} rounds; median and quartiles"
     )
-    return _Answer(result, settings, [f"{heading}\n{tables.overview(result, tables.SPEED)}"], lined_up)
+    return result, settings, heading
 
 
-def _quality(asked: _Request) -> _Answer:
-    from vioframe.bench.detectors import quality, tables
+def _quality(given: dict[str, Any], lined_up: Callable[[], LineUp]) -> _Answer:
+    from vioframe.bench.detectors import quality
     from vioframe.bench.detectors.degradations import choose
     from vioframe.bench.detectors.images import evenly, hpatches_pairs, synthetic_pairs
 
-    images, hpatches = asked["images"], asked["hpatches"]
+    images, hpatches, over = given["images"], given["hpatches"], given["baseline"]
     if images is not None and hpatches is not None:
         raise ConfigError("--images and --hpatches are two sets of pairs; measure one at a time")
-    chosen, over = choose(asked["degradation"]), asked.baseline()
+    degradations = choose(given["degradation"])
     if images is not None:
-        pairs, source = synthetic_pairs(images, asked.seed), f"{images.name}, synthetic homographies"
+        pairs, source = synthetic_pairs(images, given["seed"]), f"{images.name}, synthetic homographies"
     elif hpatches is not None:
         pairs, source = hpatches_pairs(hpatches), "HPatches"
     else:
         raise DatasetError("no images given: --images DIR for any photographs, or --hpatches DIR")
-    pairs = evenly(pairs, asked["limit"])
-    lined_up = asked.line_up(describing=True)
-    entrants = [entrant for entrant, _ in lined_up.ready]
-    with asked.watch("pairs", len(pairs)) as on_done:
-        scores = quality.score_detectors(
-            entrants, pairs, chosen, seed=asked.seed, workers=asked.workers, on_pairs=on_done
-        )
+    pairs = evenly(pairs, given["limit"])
+    entrants = [entrant for entrant, _ in lined_up().ready]
+    with Bar(len(pairs), "pairs", quiet=given["quiet"]) as bar:
+        how = {"seed": given["seed"], "workers": given["workers"], "on_pairs": lambda count: bar(advance=count)}
+        result = quality.summary(quality.score_detectors(entrants, pairs, degradations, **how), over)
     settings = {"pairs": source, "pair_count": len(pairs), "resolution": quality.RESOLUTION, "top_k": quality.TOP_K}
     heading = (
         f"Found again: {len(pairs)} pairs ({source}), 320 x 240, the {quality.TOP_K} strongest in both views, within "
         "3 px; mean and standard deviation over pairs"
     )
-    result = quality.summary(scores, over)
-    return _Answer(result, {**settings, "baseline": over}, tables.swept("quality", heading, result, over), lined_up)
+    return result, {**settings, "baseline": over}, heading
 
 
-def _frontend(asked: _Request) -> _Answer:
-    from vioframe.bench.detectors import flight, tables
+def _frontend(given: dict[str, Any], lined_up: Callable[[], LineUp]) -> _Answer:
+    from vioframe.bench.detectors import flight
     from vioframe.bench.detectors.degradations import choose
 
-    if asked["dataset"] is None:
+    if given["dataset"] is None:
         raise DatasetError(
             "no recording given: `vioframe bench detectors --frontend DATASET`; `vioframe simulate` makes some"
         )
-    chosen, over = choose(asked["degradation"]), asked.baseline()
-    duration_s = _FLIGHT_S if asked["duration"] is None else asked["duration"]
-    stretch = flight.Stretch(asked["dataset"], asked["start"] or 0.0, duration_s, asked["ground_truth"])
-    name = flight.check(stretch, asked.installed)
-    lined_up = asked.line_up()
-    entrants = [entrant for entrant, _ in lined_up.ready]
-    with asked.watch("flights", len(chosen)) as on_done:
-        result = flight.fly_detectors(
-            entrants, stretch, chosen, seed=asked.seed, workers=asked.workers, baseline=over, on_flight=on_done
-        )
+    degradations, over = choose(given["degradation"]), given["baseline"]
+    duration_s = _FLIGHT_S if given["duration"] is None else given["duration"]
+    stretch = flight.Stretch(given["dataset"], given["start"] or 0.0, duration_s, given["ground_truth"])
+    name = flight.check(stretch)
+    entrants = [entrant for entrant, _ in lined_up().ready]
+    with Bar(len(degradations), "flights", quiet=given["quiet"]) as bar:
+        how = {"seed": given["seed"], "workers": given["workers"], "on_flight": lambda count: bar(advance=count)}
+        result = flight.fly_detectors(entrants, stretch, degradations, baseline=over, **how)
     settings = {
         "dataset": name,
         "start_s": stretch.start_s,
-        "duration_s": stretch.duration_s,
+        "duration_s": duration_s,
         "baseline": over,
         "epipolar_baseline_frames": flight.BASELINE_FRAMES,
         "epipolar_inlier_px": flight.INLIER_PX,
     }
     heading = (
-        f"Followed by the front-end: {name}, {stretch.duration_s:g} s after the first {stretch.start_s:g} s; inliers "
-        f"within {flight.INLIER_PX:g} px of the true epipolar line over {flight.BASELINE_FRAMES} frames"
+        f"Followed by the front-end: {name}, {duration_s:g} s after the first {stretch.start_s:g} s; inliers within "
+        f"{flight.INLIER_PX:g} px of the true epipolar line over {flight.BASELINE_FRAMES} frames"
     )
-    return _Answer(result, settings, tables.swept("frontend", heading, result, over), lined_up)
+    return result, settings, heading

@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from vioframe.cli.common import FILE, Bar, print_notes, print_table, quiet_option
+
 if TYPE_CHECKING:
     from vioframe.evaluation.consistency import Trial
 
@@ -31,19 +33,21 @@ if TYPE_CHECKING:
     help="Flight; repeat for more.",
 )
 @click.option("--seeds", type=int, default=25, show_default=True, help="Trials of each back-end on each flight.")
-@click.option("--duration", type=float, metavar="S", default=60.0, show_default=True, help="Length of a flight.")
+@click.option("--duration", "duration_s", metavar="S", default=60.0, show_default=True, help="Length of a flight.")
+@click.option("--pixel-sigma", metavar="PX", default=1.0, show_default=True, help="Noise of an observation.")
 @click.option(
-    "--pixel-sigma", type=float, metavar="PX", default=1.0, show_default=True, help="Noise of an observation."
-)
-@click.option(
-    "--outliers", type=float, metavar="PART", default=0.0, show_default=True, help="Observations that are 5-30 px off."
+    *("--outliers", "outlier_ratio"),
+    metavar="PART",
+    default=0.0,
+    show_default=True,
+    help="Observations that are 5-30 px off.",
 )
 @click.option("--max-points", type=int, default=150, show_default=True, help="Landmarks in view.")
 @click.option("--workers", type=int, help="Processes.  [default: one a core]")
-@click.option("--out", type=click.Path(path_type=Path), help="Folder.  [default: runs/montecarlo]")
+@click.option("--out", type=FILE, help="Folder.  [default: runs/montecarlo]")
 @click.option("--overwrite", is_flag=True, help="Replace the results that are in --out.")
-@click.option("--quiet", is_flag=True, help="No progress bar.")
-def command(
+@quiet_option
+def montecarlo(
     backends: tuple[str, ...],
     flights: tuple[str, ...],
     seeds: int,
@@ -61,9 +65,8 @@ def command(
     from vioframe.bench.montecarlo import Setup, check_montecarlo, run_montecarlo
     from vioframe.bench.processes import usable_cores
     from vioframe.bench.results import record
-    from vioframe.cli.progress import print_table, progress_bar
     from vioframe.parts import registry
-    from vioframe.parts.config import PartConfig, parse_part
+    from vioframe.parts.config import PartConfig, parse_part, validate
     from vioframe.parts.registry import BACKEND
     from vioframe.report.montecarlo import MARKER, figures, write_files
     from vioframe.report.tables import to_rich
@@ -71,10 +74,7 @@ def command(
 
     if out is not None:
         check_run_folder(out, overwrite=overwrite, marker=MARKER)
-    setups = [
-        Setup(flight, sensors["duration"], sensors["pixel_sigma"], sensors["outliers"], sensors["max_points"])
-        for flight in dict.fromkeys(flights)
-    ]
+    setups = [validate(Setup, {"flight": each, **sensors}, "command line") for each in dict.fromkeys(flights)]
     installed = registry.load()
     parts = {spec: parse_part(spec, BACKEND, installed) for spec in backends}
     complete = {
@@ -83,21 +83,18 @@ def command(
     }
     workers = usable_cores() if workers is None else workers
     check_montecarlo(setups, complete, seeds, workers)  # before there is a bar: an error is one line and nothing else
-    with progress_bar(quiet=quiet) as progress:
-        task = progress.add_task("", total=len(setups) * len(complete) * seeds, figures="first trials under way")
+    with Bar(len(setups) * len(complete) * seeds, "first trials under way", quiet=quiet) as bar:
         failed = 0
 
         def on_trial(trial: Trial) -> None:
             nonlocal failed
             failed += trial.failure is not None
             went = trial.failure or f"{trial.figures['ate_m']:.3f} m, {trial.figures['orientation_deg']:.2f} deg"
-            progress.update(task, advance=1, figures=f"{failed} failed, seed {trial.seed}: {went}")
+            bar(f"{failed} failed, seed {trial.seed}: {went}")
 
         cases = run_montecarlo(setups, complete, seeds, workers=workers, on_trial=on_trial)
     print_table(to_rich(figures(cases)))
-    for case in cases:
-        for note in case.notes():
-            click.echo(f"note: {note}", err=True)
+    print_notes(note for case in cases for note in case.notes())
     # Last: what was found is shown even where the disk is full.
     folder = out or free_run_folder(Path("runs"), "montecarlo")
     new_run_folder(folder, overwrite=overwrite, marker=MARKER)

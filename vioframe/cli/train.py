@@ -6,27 +6,24 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import click
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from vioframe.cli.common import FILE, Bar
 from vioframe.interfaces import Trainer
 from vioframe.parts import config as configuration
 from vioframe.parts import registry
 from vioframe.types import TrainingJob, TrainingStep
 
-_FILE = click.Path(path_type=Path)
-
 
 @click.command("train")
 @click.argument("name")
-@click.option("--images", type=_FILE, multiple=True, required=True, help="Folder of photographs, or recording; repeat.")
-@click.option("--out", type=_FILE, help="Folder for checkpoint, log and weights.  [default: training/NAME]")
+@click.option("--images", type=FILE, multiple=True, required=True, help="Folder of photographs, or recording; repeat.")
+@click.option("--out", type=FILE, help="Folder for checkpoint, log and weights.  [default: training/NAME]")
 @click.option("--hold-out", metavar="PATTERN", multiple=True, help="Images to validate on, by name; repeat.")
-@click.option("--finetune", "start_from", metavar="CKPT", type=_FILE, help="Weights to begin with.")
-@click.option("--config", "config_file", type=_FILE, help="YAML file of options; -o overrides it.")
+@click.option("--finetune", "start_from", metavar="CKPT", type=FILE, help="Weights to begin with.")
+@click.option("--config", "config_file", type=FILE, help="YAML file of options; -o overrides it.")
 @click.option("-o", "--option", "options", metavar="KEY=VALUE", multiple=True, help="Set an option of the trainer.")
 @click.option("--resume", is_flag=True, help="Go on with the training in --out.")
-def command(
+def train(
     name: str,
     images: tuple[Path, ...],
     out: Path | None,
@@ -47,25 +44,13 @@ def command(
         chosen[option] = value
     job = TrainingJob(images, out or Path("training") / name, hold_out, start_from, resume)
     trainer: Trainer = part.create(job, options=chosen)
-    console = Console(stderr=True)
     step: TrainingStep | None = None
-    with _progress(console) as progress:
-        task = progress.add_task("", total=None, figures="")
+    with Bar(None) as bar:
         for step in trainer.train():
-            progress.update(task, completed=step.done, total=step.total, figures=_figures(step.losses))
+            bar(_figures(step.losses), advance=step.done - bar.completed, total=step.total)
             if step.epoch is not None:
-                progress.print(_figures(step.epoch))
+                bar.progress.print(_figures(step.epoch))
     click.echo(f"{name}: {step.done if step else 0} steps; written to {job.out}")
-
-
-def _progress(console: Console) -> Progress:
-    return Progress(
-        BarColumn(bar_width=12),
-        MofNCompleteColumn(),
-        TextColumn("{task.fields[figures]}"),
-        TimeRemainingColumn(compact=True),
-        console=console,
-    )
 
 
 def _figures(values: Mapping[str, float]) -> str:

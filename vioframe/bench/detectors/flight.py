@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +25,6 @@ from vioframe.interfaces import Dataset
 from vioframe.io.synchronise import synchronise
 from vioframe.io.trajectories import load_trajectory
 from vioframe.parts import registry
-from vioframe.parts.registry import Registry
 from vioframe.types import NS_PER_S, Float, FrameSet, FrameTracks, ImuSegment, Int
 
 SURVIVAL_FRAMES = (5, 10, 20)
@@ -45,14 +45,6 @@ class Stretch:
     ground_truth: Path | None = None
 
 
-@dataclass(frozen=True, slots=True)
-class _Job:
-    stretch: Stretch
-    entrants: tuple[Entrant, ...]
-    degradation: Degradation
-    seed: int
-
-
 def fly_detectors(
     entrants: Sequence[Entrant],
     stretch: Stretch,
@@ -68,46 +60,41 @@ def fly_detectors(
     ``lead_survival_N`` are leads over the entrant of the label ``baseline``, with half the width of their 95 %
     interval, every track counting as one that goes its own way; ``on_flight`` counts flights.
     """
-    jobs = [_Job(stretch, tuple(entrants), degradation, seed) for degradation in degradations]
-    parts = map_in_processes(_fly, jobs, workers, lambda part: on_flight(1))
+    parts = map_in_processes(
+        partial(_fly, stretch, tuple(entrants), seed), degradations, workers, lambda part: on_flight(1)
+    )
     rows = pd.DataFrame([row for part in parts for row in part])
     return _with_leads(rows, baseline) if (rows["detector"] == baseline).any() else rows
 
 
-def check(stretch: Stretch, installed: Registry) -> str:
+def check(stretch: Stretch) -> str:
     """The recording's name; raises :class:`DatasetError` where it cannot be opened or brings no ground truth, and
     :class:`ConfigError` for a stretch that has no length."""
     if stretch.duration_s is not None and not 0.0 < stretch.duration_s < np.inf:
         raise ConfigError(f"--duration must be above 0, not {stretch.duration_s:g}")
-    dataset = installed.open_dataset(stretch.path)
+    dataset = registry.load().open_dataset(stretch.path)
     truth_of(dataset, stretch)
     return dataset.name
 
 
-def _fly(job: _Job) -> list[dict[str, Any]]:
+def _fly(stretch: Stretch, entrants: Sequence[Entrant], seed: int, degradation: Degradation) -> list[dict[str, Any]]:
     installed = registry.load()
-    dataset = installed.open_dataset(job.stretch.path)
-    options = FrontendOptions()
-    incidents = {entrant.label: Incidents() for entrant in job.entrants}
-    frontends = {
-        entrant.label: Frontend(
-            installed.create_detector(entrant.name, entrant.options),
-            dataset.calibration,
-            options,
-            incidents[entrant.label],
-        )
-        for entrant in job.entrants
-    }
+    dataset = installed.open_dataset(stretch.path)
+    incidents = {entrant.label: Incidents() for entrant in entrants}
+    frontends = {}
+    for each in entrants:
+        detector = installed.create_detector(each.name, each.options)
+        frontends[each.label] = Frontend(detector, dataset.calibration, FrontendOptions(), incidents[each.label])
     steps: dict[str, list[FrameTracks]] = {label: [] for label in frontends}
     with single_threaded():
-        for imu, frames in degraded(dataset, job.stretch, job.degradation, job.seed):
+        for imu, frames in degraded(dataset, stretch, degradation, seed):
             for label, frontend in frontends.items():
                 steps[label].append(frontend.track(imu, frames, dataset.calibration))
-    truth = truth_of(dataset, job.stretch)
+    truth = truth_of(dataset, stretch)
     return [
         {
             "detector": label,
-            **job.degradation.columns,
+            **degradation.columns,
             **track_figures(tracks, dataset, truth),
             "incidents": ", ".join(f"{count} {kind}" for kind, count in incidents[label].counts.items()),
         }
@@ -120,14 +107,12 @@ def _with_leads(rows: pd.DataFrame, baseline: str) -> pd.DataFrame:
     of_baseline = rows[["degradation", "level"]].merge(rows[rows["detector"] == baseline], how="left")
     leads = {}
     for n in SURVIVAL_FRAMES:
-        variance = pd.Series(0.0, rows.index)
-        for each in (rows, of_baseline):
-            share = each[f"survival_{n}"].astype(float)
-            variance += share * (1.0 - share) / each[f"tracks_{n}"]
-        lead = rows[f"survival_{n}"].astype(float) - of_baseline[f"survival_{n}"].astype(float)
-        known = (rows["detector"] != baseline) & lead.notna()
-        leads[f"lead_survival_{n}"] = lead.where(known)
-        leads[f"lead_survival_{n}_half_width"] = (CONFIDENCE * variance**0.5).where(known)
+        shares = [each[f"survival_{n}"].astype(float) for each in (rows, of_baseline)]
+        tracks = [each[f"tracks_{n}"] for each in (rows, of_baseline)]
+        lead = (shares[0] - shares[1]).where(rows["detector"] != baseline)
+        variance = sum(share * (1.0 - share) / count for share, count in zip(shares, tracks, strict=True))
+        leads[f"lead_survival_{n}"] = lead
+        leads[f"lead_survival_{n}_half_width"] = (CONFIDENCE * variance**0.5).where(lead.notna())
     return rows.assign(**leads)
 
 

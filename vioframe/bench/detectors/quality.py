@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -29,16 +30,6 @@ _CANDIDATES = 4 * TOP_K
 _LARGEST_JOB = 8
 
 
-@dataclass(frozen=True, slots=True)
-class _Job:
-    """Some of the pairs, by their place among all, which noise is drawn by."""
-
-    pairs: tuple[tuple[int, Pair], ...]
-    entrants: tuple[Entrant, ...]
-    degradations: tuple[Degradation, ...]
-    seed: int
-
-
 def score_detectors(
     entrants: Sequence[Entrant],
     pairs: Sequence[Pair],
@@ -55,24 +46,25 @@ def score_detectors(
     changes its brightness. ``on_pairs`` is told how many pairs were done.
     """
     size = min(_LARGEST_JOB, -(-len(pairs) // workers))
+    # Pairs go by their place among all, which noise is drawn by.
     numbered = list(enumerate(pairs))
-    jobs = [
-        _Job(tuple(numbered[k : k + size]), tuple(entrants), tuple(degradations), seed)
-        for k in range(0, len(pairs), size)
-    ]
-    parts = map_in_processes(_score, jobs, workers, lambda part: on_pairs(len({row["pair"] for row in part})))
+    score = partial(_score, tuple(entrants), tuple(degradations), seed)
+    jobs = [numbered[k : k + size] for k in range(0, len(pairs), size)]
+    parts = map_in_processes(score, jobs, workers, lambda part: on_pairs(len({row["pair"] for row in part})))
     return pd.DataFrame([row for part in parts for row in part])
 
 
-def _score(job: _Job) -> list[dict[str, Any]]:
+def _score(
+    entrants: Sequence[Entrant], degradations: Sequence[Degradation], seed: int, pairs: Sequence[tuple[int, Pair]]
+) -> list[dict[str, Any]]:
     installed = registry.load()
-    ready = [(entrant, installed.create_detector(entrant.name, entrant.options)) for entrant in job.entrants]
+    ready = [(entrant, installed.create_detector(entrant.name, entrant.options)) for entrant in entrants]
     rows = []
     with single_threaded():
-        for number, pair in job.pairs:
+        for number, pair in pairs:
             views = pair(RESOLUTION)
-            for degradation in job.degradations:
-                images = _degraded(views, degradation, (job.seed, number))
+            for degradation in degradations:
+                images = _degraded(views, degradation, (seed, number))
                 for entrant, detector in ready:
                     first, second = (detect(entrant, detector, image, _CANDIDATES) for image in images)
                     score = score_pair(first, second, views.H_21, RESOLUTION, TOP_K)

@@ -8,6 +8,7 @@ from time import perf_counter
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
+import pandas as pd
 
 from vioframe.bench.detectors.entrants import Entrant, detect
 from vioframe.bench.processes import usable_cores
@@ -36,34 +37,30 @@ def time_detectors(
     rounds: int,
     max_points: int = MAX_POINTS,
     on_round: Callable[[int], None] = lambda count: None,
-) -> list[dict[str, Any]]:
+) -> pd.DataFrame:
     """A row a detector: median and quartiles of frames a second and ms, over every image in every round.
 
     The detectors take turns within a round, so that whatever else the machine does slows all of them alike. A round
     of a detector begins with a call that is not counted: caches, and threads that others left spinning, are then its
     own. A whole round before the first warms up. Raises :class:`PluginError` where a detector fails.
     """
-    ms: list[list[float]] = [[] for _ in ready]
-    keypoints: list[list[int]] = [[] for _ in ready]
+    calls = []
     for number in range(rounds + 1):
-        for k, (entrant, detector) in enumerate(ready):
+        for entrant, detector in ready:
             detect(entrant, detector, images[-1], max_points)
             for image in images:
                 begin = perf_counter()
                 found = detect(entrant, detector, image, max_points)
                 taken = perf_counter() - begin
                 if number > 0:
-                    ms[k].append(1e3 * taken)
-                    keypoints[k].append(len(found.xy))
+                    calls.append((entrant.label, 1e3 * taken, len(found.xy)))
         on_round(1)
-    rows = []
-    for k, (entrant, detector) in enumerate(ready):
-        low, median, high = (float(q) for q in np.quantile(ms[k], [0.25, 0.5, 0.75]))
-        fps = {"fps": 1e3 / median, "fps_low": 1e3 / high, "fps_high": 1e3 / low}
-        on = f"{detector.device}, {detector.precision}" if isinstance(detector, Placed) else "cpu"
-        rest = {"keypoints": float(np.median(keypoints[k])), "calls": len(ms[k]), "on": on}
-        rows.append({"detector": entrant.label, **fps, "ms": median, "ms_low": low, "ms_high": high, **rest})
-    return rows
+    every = pd.DataFrame(calls, columns=["detector", "ms", "keypoints"]).groupby("detector", sort=False)
+    ms = every["ms"].quantile(np.array([0.25, 0.5, 0.75])).unstack().set_axis(["ms_low", "ms", "ms_high"], axis=1)
+    fps = (1e3 / ms).set_axis(["fps_high", "fps", "fps_low"], axis=1)
+    on = [f"{d.device}, {d.precision}" if isinstance(d, Placed) else "cpu" for _, d in ready]
+    out = pd.concat([fps, ms, every["keypoints"].median()], axis=1).assign(calls=every.size())
+    return out.loc[[entrant.label for entrant, _ in ready]].assign(on=on).rename_axis("detector").reset_index()
 
 
 def speed_settings(images: str, image_count: int, rounds: int) -> dict[str, Any]:

@@ -50,52 +50,41 @@ FRONTEND: Columns = {
     "epipolar_median_px": ("median px", ".3f"),
     "coverage": ("cells covered", ".1%"),
 }
-_ASKED: Mapping[str, tuple[Columns, Columns]] = {
-    "quality": (
-        QUALITY,
-        {
-            "repeatability": ("Repeatability", ".3f"),
-            "distinct": ("Repeatability of distinct points", ".3f"),
-        },
-    ),
-    "frontend": (
-        FRONTEND,
-        {
-            **{f"survival_{n}": (f"Share of tracks alive after {n} frames", ".3f") for n in (5, 10, 20)},
-            "median_life": ("Frames after which fewer than half of the tracks are alive", ".0f"),
-            "alive": ("Tracks alive in a frame", ".0f"),
-            "epipolar_inliers": ("Share of epipolar inliers", ".3f"),
-            "coverage": ("Share of the grid's cells covered", ".3f"),
-        },
-    ),
+_BY_DEGRADATION: Mapping[str, Columns] = {
+    "quality": {"repeatability": ("Repeatability", ".3f"), "distinct": ("Repeatability of distinct points", ".3f")},
+    "frontend": {
+        **{f"survival_{n}": (f"Share of tracks alive after {n} frames", ".3f") for n in (5, 10, 20)},
+        "median_life": ("Frames after which fewer than half of the tracks are alive", ".0f"),
+        "alive": ("Tracks alive in a frame", ".0f"),
+        "epipolar_inliers": ("Share of epipolar inliers", ".3f"),
+        "coverage": ("Share of the grid's cells covered", ".3f"),
+    },
 }
-"""What is shown of images as they are, and at every level."""
+
+
+def shown(question: str, heading: str, result: pd.DataFrame, baseline: str) -> list[str]:
+    """Images as they are, and, where there were others, each figure that matters to ``question`` by degradation."""
+    columns = {"speed": SPEED, "quality": QUALITY, "frontend": FRONTEND}[question]
+    if question == "speed":
+        return [f"{heading}\n{overview(result, columns)}"]
+    tables = [f"{heading}\n{overview(result[result['degradation'] == Degradation().name], columns)}"]
+    if result["degradation"].nunique() > 1:
+        for figure, (title, spec) in _BY_DEGRADATION[question].items():
+            led = f"; in brackets the lead over {baseline}" if f"lead_{figure}" in result else ""
+            tables.append(f"{title}, by degradation{led}\n{_text(by_degradation(result, figure, spec))}")
+    return tables
 
 
 def overview(result: pd.DataFrame, columns: Columns) -> str:
     """A row a detector: the figures in ``columns``, deviations in brackets."""
-    shown = {"detector": result["detector"].tolist()}
+    cells = {"detector": result["detector"].tolist()}
     for figure, (title, spec) in columns.items():
-        cells = [_cell(value, spec) for value in result[figure]]
-        if f"{figure}_sd" in result:
-            cells = [
-                cell if pd.isna(sd) else f"{cell} ({sd:.3f})"
-                for cell, sd in zip(cells, result[f"{figure}_sd"], strict=True)
-            ]
-        shown[title] = cells
-    return _text(pd.DataFrame(shown))
-
-
-def swept(question: str, heading: str, result: pd.DataFrame, baseline: str) -> list[str]:
-    """Images as they are, and, where there were others, each figure of ``question`` by degradation."""
-    columns, figures = _ASKED[question]
-    shown = [f"{heading}\n{overview(result[result['degradation'] == Degradation().name], columns)}"]
-    if result["degradation"].nunique() == 1:
-        return shown
-    for figure, (title, spec) in figures.items():
-        led = f"; in brackets the lead over {baseline}" if f"lead_{figure}" in result else ""
-        shown.append(f"{title}, by degradation{led}\n{_text(by_degradation(result, figure, spec))}")
-    return shown
+        deviations = result.get(f"{figure}_sd", pd.Series(index=result.index, dtype=float))
+        cells[title] = [
+            _cell(value, spec) + ("" if pd.isna(sd) else f" ({sd:.3f})")
+            for value, sd in zip(result[figure], deviations, strict=True)
+        ]
+    return _text(pd.DataFrame(cells))
 
 
 def by_degradation(result: pd.DataFrame, figure: str, spec: str) -> pd.DataFrame:

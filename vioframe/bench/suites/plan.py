@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -11,7 +12,7 @@ from typing import Any
 
 from vioframe.bench.montecarlo import Setup
 from vioframe.bench.suites import fingerprints, sources
-from vioframe.bench.suites.suite import SEED_SHIFT_S, NamedPart, Suite, montecarlo_setup
+from vioframe.bench.suites.suite import SEED_SHIFT_S, NamedPart, Suite
 from vioframe.errors import ConfigError, DatasetError
 from vioframe.estimation.lifecycle import warm_up
 from vioframe.io.calibration import packaged_calibration
@@ -19,7 +20,7 @@ from vioframe.parts import config as configuration
 from vioframe.parts.config import Config, DatasetConfig, PartConfig
 from vioframe.parts.registry import BACKEND, DETECTOR, Registry
 from vioframe.runs.metrics import create_metrics
-from vioframe.runs.results import CLEAR, Data
+from vioframe.runs.results import CELL, CLEAR, Data
 from vioframe.simulation.config import SimulationConfig
 from vioframe.simulation.flights import flight as named_flight
 
@@ -149,7 +150,8 @@ def _flights(suite: Suite, folders: Sequence[Path], installed: Registry) -> Iter
             nowhere = config.dataset.model_copy(update={"path": None})  # where the data lie says nothing about them
             plain = config.model_copy(update={"dataset": nowhere, "ground_truth": None}).model_dump(mode="json")
             about = _about(
-                *("flight", flown.data, sequence.name, condition, level, detector.called, backend.called, seed),
+                *("flight", flown.data, sequence.name, condition, level, detector.called, backend.called),
+                seed=seed,
                 note=flown.note,
                 code=code,
                 config=fingerprints.of_values(plain, list(suite.metrics)),
@@ -167,17 +169,18 @@ def _recording(sequence: str, config: SimulationConfig, digest: str, code: str) 
 
 
 def _trials(suite: Suite, installed: Registry) -> Iterator[TrialTask]:
-    code, setup = fingerprints.of_code(installed), montecarlo_setup(suite)
+    code, setup = fingerprints.of_code(installed), suite.setup
     R_BC = packaged_calibration("euroc").cameras[0].R_BC
     named_flight(setup.flight, setup.duration_s, R_BC)  # says so where there is none
     for backend, seed in product(suite.backends, range(suite.seeds)):
         options = installed.find(BACKEND, backend.name).validate(backend.options)
         about = _about(
-            *("trial", Data.SIMULATED, setup.flight, CLEAR, 0.0, "simulated tracks", backend.called, seed),
+            *("trial", Data.SIMULATED, setup.flight, CLEAR, 0.0, "simulated tracks", backend.called),
+            seed=seed,
             note=f"simulated tracks of the flight {setup.flight}, {setup.pixel_sigma:g} px noise; no images",
             code=code,
             config=fingerprints.of_values(backend.name, options),
-            inputs=fingerprints.of_values(suite.setup, seed),
+            inputs=fingerprints.of_values(setup.model_dump(), seed),
         )
         part = PartConfig(name=backend.name, options=options)
         yield TrialTask(about, _TRIAL_S * setup.duration_s, setup, part)
@@ -205,23 +208,13 @@ def _speed(suite: Suite, folders: Sequence[Path], installed: Registry) -> SpeedT
     return SpeedTask(about, 60.0, suite.detectors, suite.rounds, suite.images, source.recording)
 
 
-def _about(
-    kind: str,
-    data: Data,
-    sequence: str,
-    condition: str,
-    level: float,
-    detector: str,
-    backend: str,
-    seed: int,
-    *,
-    note: str,
-    **fingerprint: str,
-) -> dict[str, Any]:
-    """The columns of a flight's or a trial's row; its task has a name that says what it is and can be a folder's."""
+def _about(kind: str, *cell: Any, seed: int, note: str, **fingerprint: str) -> dict[str, Any]:
+    """The columns of a flight's or a trial's row, ``cell`` by :data:`CELL`.
+
+    Its task has a name that says what it is and can be a folder's.
+    """
+    _, sequence, condition, level, detector, backend = cell
     how = f"{condition}_{level:g}" if level else condition
-    parts = (sequence, how, detector, backend, f"seed{seed}")
-    name = ".".join("".join(c if c.isalnum() or c in "_-+" else "_" for c in part) for part in parts)
-    where = {"data": data.value, "sequence": sequence, "condition": condition, "level": level}
-    who = {"detector": detector, "backend": backend, "seed": seed}
-    return {"task": name, "kind": kind, **where, **who, "data_note": note, **fingerprint}
+    name = ".".join(re.sub(r"[^\w+-]", "_", part) for part in (sequence, how, detector, backend, f"seed{seed}"))
+    about = {"task": name, "kind": kind, **dict(zip(CELL, cell, strict=True)), "seed": seed}
+    return {**about, "data_note": note, **fingerprint}

@@ -123,15 +123,14 @@ def flown(
         digest = fingerprints.of_recordings(files)
         note = f"{name}: {made_of[source.kind]}"
         return Flown(source.kind, note, begin_s, digest, source.recording, source.ground_truth)
+    data, note = Data.SIMULATED, f"simulated flight {name}"
     settings: dict[str, Any] = {"seed": seed, "conditions": dict(conditions)}
     if source.motion is not None:
-        data, note = (
-            Data.RENDERED,
-            f"{name}: its recorded IMU and motion, images rendered along them; not its own images",
-        )
+        data = Data.RENDERED
+        note = f"{name}: its recorded IMU and motion, images rendered along them; not its own images"
         settings |= {"recorded": source.motion, "duration_s": None if duration_s is None else begin_s + duration_s}
     elif known is not None:
-        data, note = Data.SIMULATED, f"a simulated flight stands in for {name}: its speed and light, not its path"
+        note = f"a simulated flight stands in for {name}: its speed and light, not its path"
         # It begins at its beginning: there is no shaking before the take-off to be skipped.
         begin_s = 0.0
         settings |= {
@@ -140,7 +139,6 @@ def flown(
             "conditions": {**known.conditions, **conditions},
         }
     else:
-        data, note = Data.SIMULATED, f"simulated flight {name}"
         settings |= {"flight": PartConfig(name=name), "duration_s": begin_s + (duration_s or DEFAULT_STAND_IN_S)}
     config = simulation.complete(SimulationConfig(**settings), installed)
     # Where the motion lies says nothing about it.

@@ -11,13 +11,12 @@ from typing import Any
 
 from pydantic_core import to_jsonable_python
 
-from vioframe.bench.suites.plan import AnyTask, Plan, Recording, Task
-from vioframe.bench.suites.suite import render
+from vioframe.bench.suites.plan import Plan, Recording, Task
 from vioframe.errors import RunError
 from vioframe.io.calibration import sidecar_folder
-from vioframe.parts.config import read_tree
+from vioframe.parts.config import read_tree, to_yaml
 from vioframe.runs.recorder import write_whole
-from vioframe.runs.results import FINGERPRINT, RUNS_FOLDER, SUITE_FILE, Row, read_rows, write_rows
+from vioframe.runs.results import RUNS_FOLDER, SUITE_FILE, read_rows, write_rows
 from vioframe.simulation.config import simulation_folder
 
 
@@ -40,7 +39,7 @@ class Store:
 
     def begin(self, plan: Plan, *, overwrite: bool) -> None:
         """Make the folder that of ``plan``, or go on with it; raises :class:`RunError` where it is another suite's."""
-        text, file = render(plan.suite), self.path / SUITE_FILE
+        text, file = to_yaml(plan.suite), self.path / SUITE_FILE
         if self.path.exists() and any(self.path.iterdir()):
             if not file.is_file():
                 raise RunError(
@@ -80,12 +79,6 @@ class Store:
                 if not self.keep_recordings:
                     shutil.rmtree(self.recordings, ignore_errors=True)
 
-    def left(self, tasks: Sequence[AnyTask]) -> tuple[list[AnyTask], int]:
-        """Those of ``tasks`` without a result by the same code of the same data, and how many have one of others."""
-        kept = read_rows(self.path)
-        left = [task for task in tasks if not _done(task, kept.get(task.name, ()))]
-        return left, sum(not _same(task, row) for task in left for row in kept.get(task.name, ())[:1])
-
     def keep(self, task: Task, rows: Sequence[Mapping[str, Any]]) -> None:
         """Put down the ``rows`` of a task in place of any that it had."""
         write_rows(self.path, {**read_rows(self.path), task.name: [{**task.about, **row} for row in rows]})
@@ -103,15 +96,6 @@ class Store:
             path.unlink(missing_ok=True)
             for folder in (simulation_folder(path), sidecar_folder(path)):
                 shutil.rmtree(folder, ignore_errors=True)
-
-
-def _done(task: Task, rows: Sequence[Row]) -> bool:
-    return bool(rows) and all(row["status"] != "failed" and _same(task, row) for row in rows)
-
-
-def _same(task: Task, row: Row) -> bool:
-    """Whether the row was made by the same code of the same data as the task would be."""
-    return all(row[column] == task.about[column] for column in FINGERPRINT)
 
 
 @contextmanager

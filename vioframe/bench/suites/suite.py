@@ -12,7 +12,7 @@ from pydantic import Field, model_validator
 from vioframe.bench.montecarlo import Setup
 from vioframe.errors import ConfigError
 from vioframe.frontend import FrontendOptions
-from vioframe.parts.config import PartConfig, Section, read_tree, to_yaml, validate
+from vioframe.parts.config import PartConfig, Section, read_tree, validate
 from vioframe.parts.options import did_you_mean, validate_options
 from vioframe.runs.results import Reference
 from vioframe.simulation.conditions import Conditions
@@ -94,7 +94,7 @@ class Suite(Section):
     metrics: tuple[str, ...] = ()
     frontend: dict[str, Any] = Field(default_factory=dict)
     workers: Annotated[int | None, Field(ge=1)] = None
-    setup: dict[str, Any] = Field(default_factory=dict)
+    setup: Setup = Setup()
     rounds: Annotated[int, Field(ge=1)] = 10
     images: Annotated[int, Field(ge=1)] = 8
     published: tuple[Published, ...] = ()
@@ -116,7 +116,9 @@ class Suite(Section):
             Conditions.of({name: 1.0})
             if len(set(levels)) < len(levels):
                 raise ValueError(f"conditions: {name} has a level twice")
-        _check_unused(self)
+        for key in sorted(self.model_fields_set - _ALWAYS - set(_USES[self.kind].split())):
+            if getattr(self, key) != Suite.model_fields[key].get_default(call_default_factory=True):
+                raise ValueError(f"{key} does nothing in a suite of kind {self.kind}")
         return self
 
 
@@ -129,13 +131,6 @@ _USES: dict[Kind, str] = {
     "trials": "backends seeds setup workers",
 }
 _ALWAYS = {"name", "title", "description", "kind", "reference"}
-
-
-def _check_unused(suite: Suite) -> None:
-    """Raise ValueError for a key that a suite of its kind has no use for."""
-    for key in sorted(suite.model_fields_set - _ALWAYS - set(_USES[suite.kind].split())):
-        if getattr(suite, key) != Suite.model_fields[key].get_default(call_default_factory=True):
-            raise ValueError(f"{key} does nothing in a suite of kind {suite.kind}")
 
 
 def shipped() -> dict[str, Path]:
@@ -163,8 +158,6 @@ def read(path: Path) -> Suite:
     if isinstance(tree.get("reference"), str):
         tree["reference"] = read_tree(path.parent / tree["reference"])
     suite = validate(Suite, tree, str(path))
-    if suite.kind == "trials":
-        montecarlo_setup(suite)
     FrontendOptions(**validate_options("the front-end", FrontendOptions, suite.frontend))
     return suite
 
@@ -186,16 +179,3 @@ def narrowed(suite: Suite, *, seeds: int | None = None, **only: Iterable[str]) -
         if names:
             changes[kind] = tuple(each for name, each in have.items() if name in names)
     return suite.model_copy(update=changes)
-
-
-def montecarlo_setup(suite: Suite) -> Setup:
-    """What the trials of ``suite`` fly through; raises :class:`ConfigError`."""
-    try:
-        return Setup(**suite.setup)
-    except TypeError as error:
-        raise ConfigError(f"setup: {error}; its keys are {', '.join(Setup.__dataclass_fields__)}") from error
-
-
-def render(suite: Suite) -> str:
-    """``suite`` as YAML; :func:`read` returns the same suite."""
-    return to_yaml(suite)

@@ -22,6 +22,7 @@ from vioframe.bench.suites.plan import AnyTask, FlightTask, Plan, Recording, Spe
 from vioframe.bench.suites.store import Store
 from vioframe.errors import PluginError, RunError, VioframeError
 from vioframe.parts.registry import describe
+from vioframe.runs.results import FINGERPRINT, Row, read_rows
 
 if TYPE_CHECKING:
     from distributed import Client, Future
@@ -71,7 +72,7 @@ class Agenda:
 
     @property
     def recordings(self) -> dict[str, Recording]:
-        return {r.name: r for task in self.tasks if isinstance(task, FlightTask) and (r := task.recording)}
+        return {r.name: r for task in self.tasks if (r := _recording_of(task))}
 
     @property
     def cost_s(self) -> float:
@@ -80,8 +81,18 @@ class Agenda:
 
 def agenda(plan: Plan, store: Store) -> Agenda:
     """Every task of ``plan`` that ``store`` has no result of, by the same code on the same data."""
-    left, stale = store.left(plan.tasks)
-    return Agenda(tuple(left), len(plan.tasks) - len(left), stale)
+    kept = read_rows(store.path)
+
+    def same(task: AnyTask, row: Row) -> bool:
+        return all(row[column] == task.about[column] for column in FINGERPRINT)
+
+    def done(task: AnyTask) -> bool:
+        rows = kept.get(task.name, ())
+        return bool(rows) and all(row["status"] != "failed" and same(task, row) for row in rows)
+
+    left = tuple(task for task in plan.tasks if not done(task))
+    stale = sum(not same(task, kept[task.name][0]) for task in left if task.name in kept)
+    return Agenda(left, len(plan.tasks) - len(left), stale)
 
 
 def sweep(
@@ -104,7 +115,7 @@ def sweep(
         with _connected(workers, scheduler) as client:
             if scheduler is not None:
                 _check_code(client, planned=flown[0].about["code"])
-            drive.by_workers(client, flown, renderers_may_help=scheduler is None)
+            drive.by_workers(client, flown, list(left.recordings.values()), renderers_may_help=scheduler is None)
     return drive.tally
 
 
@@ -116,92 +127,97 @@ def _check_code(client: Client, planned: str) -> None:
 
 
 class _Drive:
-    """Hands out tasks one by one as workers become free."""
+    """Hands out jobs one by one as workers become free."""
 
     def __init__(self, store: Store, left: Agenda, on_event: Callable[[Event], None]) -> None:
         self.tally = Tally(reused=left.reused)
         self._store, self._on_event = store, on_event
         self._attempts: Counter[str] = Counter()
-        self._ready: deque[AnyTask] = deque()
-        self._to_record = deque(left.recordings.values())
-        self._needed: dict[str, list[FlightTask]] = defaultdict(list)
+        self._queue: deque[AnyTask | Recording] = deque()
+        """Flights first, recordings last: one that nobody needs any more can go."""
+        self._needed: dict[str, list[AnyTask]] = defaultdict(list)
         """Flights that are not done yet, by recording."""
 
-    def here(self, speeds: list[SpeedTask]) -> None:
+    def here(self, speeds: Sequence[SpeedTask]) -> None:
         for task in speeds:
-            for attempt in range(1, ATTEMPTS + 1):
-                self._attempts[task.name] = attempt
+            self._queue.append(task)
+            while self._queue:
+                self._attempts[task.name] += 1
                 try:
-                    rows, error = tasks.perform(task, self._store, attempt), ""
-                    break
+                    rows, error = tasks.perform(task, self._store, self._attempts[task.name]), ""
                 except Exception as failure:
                     rows, error = [], _one_line(failure)
-            self._ended(task, rows, error)
+                self._finished(self._queue.popleft(), rows, error)
 
-    def by_workers(self, client: Client, flown: Sequence[AnyTask], *, renderers_may_help: bool) -> None:
+    def by_workers(
+        self, client: Client, flown: Sequence[AnyTask], recordings: Sequence[Recording], *, renderers_may_help: bool
+    ) -> None:
         from concurrent.futures import CancelledError
 
         from distributed import wait
 
         for task in flown:
-            if isinstance(task, FlightTask) and task.recording is not None:
-                self._needed[task.recording.name].append(task)
-            else:
-                self._ready.append(task)
+            self._needed[recording.name if (recording := _recording_of(task)) else ""].append(task)
+        self._queue.extend([*self._needed.pop("", ()), *recordings])
         running: dict[Future[Any], AnyTask | Recording] = {}
-        while self._ready or self._to_record or running:
+        while self._queue or running:
             capacity = max(1, len(client.nthreads()))
-            while len(running) < capacity and (self._ready or self._to_record):
-                # Flights first: a recording that nobody needs any more can go.
-                job = self._ready.popleft() if self._ready else self._to_record.popleft()
+            while self._queue and len(running) < capacity:
+                job = self._queue.popleft()
                 self._attempts[job.name] += 1
-                # Where there are fewer recordings than workers, the idle ones help.
-                rendering = 1 + len(self._to_record) + sum(isinstance(each, Recording) for each in running.values())
-                helpers = max(1, capacity // rendering) if renderers_may_help else 1
-                work = tasks.simulate if isinstance(job, Recording) else tasks.perform
-                how = helpers if isinstance(job, Recording) else self._attempts[job.name]
-                key = f"{job.name}-{self._attempts[job.name]}"
-                running[client.submit(work, job, self._store, how, key=key, pure=False)] = job
+                attempt = self._attempts[job.name]
+                how: dict[str, Any] = {"key": f"{job.name}-{attempt}", "pure": False}
+                if isinstance(job, Recording):
+                    # Where there are fewer recordings than workers, the idle ones help.
+                    rendering = 1 + sum(isinstance(each, Recording) for each in (*self._queue, *running.values()))
+                    helpers = max(1, capacity // rendering) if renderers_may_help else 1
+                    future = client.submit(tasks.simulate, job, self._store, helpers, **how)
+                else:
+                    future = client.submit(tasks.perform, job, self._store, attempt, **how)
+                running[future] = job
             try:
                 done = wait(list(running), return_when="FIRST_COMPLETED").done
             except (CancelledError, OSError) as error:
                 raise RunError("the scheduler is gone; the same command goes on where it was") from error
             for future in done:
-                self._take_in(running.pop(future), future)
+                why = "" if future.status == "finished" else _why(future)
+                self._finished(running.pop(future), None if why else future.result(), why)
+                future.release()
 
-    def _take_in(self, job: AnyTask | Recording, future: Future[Any]) -> None:
-        error = "" if future.status == "finished" else _why(future)
-        rows = [] if error or isinstance(job, Recording) else future.result()
-        future.release()
+    def _finished(self, job: AnyTask | Recording, rows: list[tasks.Figures] | None, error: str) -> None:
+        """Take in what came of a job; one that failed is tried again, until it has been often enough."""
         again = bool(error) and self._attempts[job.name] < ATTEMPTS
         if not isinstance(job, Recording):
             if again:
-                self._ready.append(job)
+                self._queue.appendleft(job)
             else:
                 self._ended(job, rows, error)
         elif again:
-            self._to_record.append(job)
+            self._queue.append(job)
         else:
             self._on_event(Event(f"{job.name} simulated", job.cost_s, is_task=False, error=error))
             if not error:
-                self._ready.extend(self._needed[job.name])
-            else:
-                for flight in tuple(self._needed[job.name]):
-                    self._ended(flight, [], f"its recording could not be simulated: {error}")
+                self._queue.extendleft(reversed(self._needed[job.name]))
+                return
+            for flight in tuple(self._needed[job.name]):
+                self._ended(flight, None, f"its recording could not be simulated: {error}")
 
-    def _ended(self, task: AnyTask, rows: list[tasks.Figures], error: str) -> None:
+    def _ended(self, task: AnyTask, rows: list[tasks.Figures] | None, error: str) -> None:
         if error:
-            rows = [tasks.failure(max(1, self._attempts[task.name]), error)]
             self.tally.failed[task.name] = error
         else:
             self.tally.done += 1
-        self._store.keep(task, rows)
+        self._store.keep(task, rows or [tasks.failure(max(1, self._attempts[task.name]), error)])
         self._on_event(Event(task.name, task.cost_s, is_task=True, error=error))
-        if isinstance(task, FlightTask) and task.recording is not None:
-            waiting = self._needed[task.recording.name]
-            waiting.remove(task)
-            if not waiting:
-                self._store.drop(task.recording)
+        if (recording := _recording_of(task)) is not None:
+            self._needed[recording.name].remove(task)
+            if not self._needed[recording.name]:
+                self._store.drop(recording)
+
+
+def _recording_of(task: AnyTask) -> Recording | None:
+    """What must be simulated for ``task``."""
+    return task.recording if isinstance(task, FlightTask) else None
 
 
 def _why(future: Future[Any]) -> str:

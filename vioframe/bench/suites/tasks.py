@@ -5,7 +5,6 @@ A task comes back as rows of the table of results (:mod:`vioframe.runs.results`)
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Mapping
 from pathlib import Path
 from time import perf_counter
@@ -127,13 +126,12 @@ def of_errors(errors: TrajectoryErrors) -> Figures:
 
 
 def _trial(task: TrialTask, folder: Path) -> Figures:
+    import pandas as pd
+
     trial = fly(task.setup, task.backend, task.about["seed"])
     folder.mkdir()
     if len(trial.t_ns):
-        with (folder / NEES_FILE).open("w", encoding="utf-8", newline="") as file:
-            writer = csv.writer(file, lineterminator="\n")
-            writer.writerow(["t_ns", *trial.nees])
-            writer.writerows(zip(trial.t_ns.tolist(), *(each.tolist() for each in trial.nees.values()), strict=True))
+        pd.DataFrame({"t_ns": trial.t_ns, **trial.nees}).to_csv(folder / NEES_FILE, index=False, lineterminator="\n")
     means = {f"nees.{part}": float(values.mean()) for part, values in trial.nees.items() if len(values)}
     return {"failure": trial.failure, "detail": trial.detail, **trial.figures, **means}
 
@@ -157,6 +155,7 @@ def speed(task: SpeedTask) -> list[Figures]:
     timed = time_detectors(lined_up.ready, images, task.rounds)
     settings = speed_settings(source, len(images), task.rounds)
     settings["width"], settings["height"] = settings.pop("resolution")
-    rows = [{**row, **settings} for row in timed]
+    found: list[Any] = timed.astype(object).to_dict("records")
+    rows: list[Figures] = [{**row, **settings} for row in found]
     absent = [{"detector": name, "status": "absent", "error": why} for name, why in lined_up.absent.items()]
     return rows + absent

@@ -1,35 +1,38 @@
-"""``vioframe simulate``: a recording of a flight that never took place, with exact truth."""
+"""``vioframe simulate`` writes a recording of a flight that never took place, ``convert`` one in another format."""
 
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
 from pathlib import Path
 from time import perf_counter
 from typing import Any
 
 import click
-from rich.console import Console
-from rich.progress import Progress
 
+from vioframe.cli.common import FILE, Bar, calibration_option
 from vioframe.errors import DatasetError
+from vioframe.io.convert import FORMATS, format_of
+from vioframe.io.convert import convert as write_converted
 from vioframe.parts import registry
-from vioframe.parts.config import validate
+from vioframe.parts.config import parse_assignments, validate
 from vioframe.parts.options import summary_of
 from vioframe.simulation import config as configuration
 from vioframe.simulation.conditions import CONDITIONS, Conditions
 from vioframe.simulation.config import SimulationConfig
 from vioframe.simulation.record import check_destinations, record
 from vioframe.simulation.recording import DEFAULT_DURATION_S, SimulatedRecording
+from vioframe.types import FrameSet, Measurement
 
-_FILE = click.Path(path_type=Path)
+_COMPRESSIONS = sorted({name for format in FORMATS.values() for name in format.compressions})
 
 
 @click.command("simulate")
-@click.argument("destinations", metavar="DST...", type=_FILE, nargs=-1)
+@click.argument("destinations", metavar="DST...", type=FILE, nargs=-1)
 @click.option("--list", "only_list", is_flag=True, help="List flights, worlds and conditions.")
 @click.option("--flight", metavar="NAME|FILE", help="Flight by name, or a trajectory file (TUM, EuRoC) to fly along.")
 @click.option(
-    "--imu", "recorded", type=_FILE, metavar="SEQ", help="EuRoC sequence, or its imu0/data.csv: its real IMU, motion."
+    "--imu", "recorded", type=FILE, metavar="SEQ", help="EuRoC sequence, or its imu0/data.csv: its real IMU, motion."
 )
 @click.option("--world", metavar="NAME", help="World to fly through.  [default: hall]")
 @click.option("-c", "--condition", "conditions", metavar="NAME=LEVEL", multiple=True, help="Hard condition, 0 to 1.")
@@ -47,14 +50,14 @@ _FILE = click.Path(path_type=Path)
 @click.option("--imu-rate", "imu_rate_hz", type=float, metavar="HZ", help="Of the IMU.  [default: the calibration's]")
 @click.option("--exact-imu", is_flag=True, default=None, help="An IMU without noise and biases.")
 @click.option(
-    "--calibration", type=_FILE, multiple=True, help="Of a rig: file or folder.  [default: EuRoC's left camera]"
+    "--calibration", type=FILE, multiple=True, help="Of a rig: file or folder.  [default: EuRoC's left camera]"
 )
-@click.option("--config", "file", type=_FILE, help="Configuration, or manifest of a recording to make again.")
+@click.option("--config", "file", type=FILE, help="Configuration, or manifest of a recording to make again.")
 @click.option("--compression", type=click.Choice(["bz2", "lz4", "zstd"]), help="Compress bags.  [default: no]")
 @click.option("--workers", type=click.IntRange(1), help="Processes that render.  [default: the number of cores]")
 @click.option("--overwrite", is_flag=True, help="Replace a simulated recording of the same name.")
 @click.option("--quiet", is_flag=True, help="No progress bar and no summary.")
-def command(
+def simulate(
     destinations: tuple[Path, ...],
     only_list: bool,
     compression: str | None,
@@ -76,7 +79,7 @@ def command(
     """
     installed = registry.load()
     if only_list:
-        _list(installed)
+        _list_simulations(installed)
         return
     if not destinations:
         raise DatasetError("no destination given: `vioframe simulate flight.bag`; --list shows what there is")
@@ -84,15 +87,8 @@ def command(
     config = configuration.complete(_configure(installed, **choices), installed)
     begin_s = perf_counter()
     recording = SimulatedRecording(config, installed, workers or os.cpu_count() or 1)
-    with Progress(console=Console(stderr=True), disable=quiet) as progress:
-        task = progress.add_task(recording.name, total=recording.frame_count)
-        record(
-            recording,
-            destinations,
-            compression=compression,
-            overwrite=overwrite,
-            on_frame=lambda _: progress.advance(task),
-        )
+    with Bar(recording.frame_count, recording.name, quiet=quiet) as bar:
+        record(recording, destinations, compression=compression, overwrite=overwrite, on_frame=lambda _: bar())
     if quiet:
         return
     truth, levels = recording.ground_truth, recording.conditions.levels
@@ -131,7 +127,7 @@ def _configure(
     return configuration.override(validate(SimulationConfig, tree, "command line"), installed, options)
 
 
-def _list(installed: registry.Registry) -> None:
+def _list_simulations(installed: registry.Registry) -> None:
     formatter = click.HelpFormatter()
     for kind in (registry.FLIGHT, registry.WORLD):
         with formatter.section(f"{kind.name}s"):
@@ -140,3 +136,61 @@ def _list(installed: registry.Registry) -> None:
     with formatter.section("conditions (level 0 to 1)"):
         formatter.write_dl(list(CONDITIONS.items()))
     click.echo(f"{formatter.getvalue()}\nOptions of a flight or world: `vioframe plugins NAME`.")
+
+
+@click.command("convert")
+@click.argument("source", metavar="SRC", type=FILE)
+@click.argument("destination", metavar="DST", type=FILE)
+@click.option("--format", type=click.Choice(list(FORMATS)), help="Format of DST.  [default: told by its name]")
+@click.option(
+    "--compression", type=click.Choice(_COMPRESSIONS), help="bz2, lz4 (ros1) or zstd (ros2, mcap).  [default: none]"
+)
+@click.option("-o", "--option", "options", metavar="KEY=VALUE", multiple=True, help="Set an option of the reader.")
+@calibration_option
+@click.option("--reader", metavar="NAME", help="Data-set reader, where several accept SRC.")
+def convert(
+    source: Path,
+    destination: Path,
+    format: str | None,
+    compression: str | None,
+    options: tuple[str, ...],
+    calibration: tuple[Path, ...],
+    reader: str | None,
+) -> None:
+    """Write the recording SRC, whatever a reader opens, to DST in another format.
+
+    \b
+    DST tells the format:  NAME.bag    ROS 1 bag
+                           NAME.ros2   ROS 2 bag (a folder; so is rosbag2...)
+                           NAME.mcap   MCAP file
+                           NAME        ASL folder, as EuRoC's
+
+    Every camera is written (or those of `-o cameras=[cam0,cam1]`), the IMU, and the ground truth that SRC itself
+    brings; the calibration goes to the folder DST.calib, or into the ASL folder.
+    """
+    format = format or format_of(destination)
+    installed = registry.load()
+    part = installed.find_reader(source, reader)
+    chosen = {name: value for _, name, value in parse_assignments(options, {part.name: part.options})}
+    if calibration:
+        chosen["calibration"] = list(calibration)
+    dataset = installed.open_dataset(source, part.name, chosen)
+    with Bar(dataset.frame_count, dataset.name, late=True) as bar:
+
+        def watched() -> Iterator[Measurement]:
+            for measurement in dataset.measurements():
+                yield measurement
+                bar(advance=isinstance(measurement, FrameSet))
+
+        truth = dataset.ground_truth
+        done = write_converted(
+            watched(), dataset.calibration, destination, truth=truth, format=format, compression=compression
+        )
+    cameras = len(dataset.calibration.cameras)
+    of_cameras = f" of {cameras} cameras" if cameras > 1 else ""
+    click.echo(
+        f"{destination}: {FORMATS[format].description}, {done.frames} frames{of_cameras}, "
+        f"{done.imu_samples} IMU samples, {done.true_poses or 'no'} true poses"
+    )
+    if done.unreadable:
+        click.echo(f"left out: {done.unreadable} frames or samples of {source} that could not be read")

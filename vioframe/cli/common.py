@@ -1,0 +1,93 @@
+"""What the commands share: options, the progress bar, and how notes and tables are printed."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import TYPE_CHECKING, Self
+
+import click
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+FILE = click.Path(path_type=Path)
+
+runs_argument = click.argument("runs", metavar="RUN...", type=FILE, nargs=-1, required=True)
+ground_truth_option = click.option(
+    "--ground-truth", type=FILE, help="TUM or EuRoC csv; a run folder's own is the default."
+)
+quiet_option = click.option("--quiet", is_flag=True, help="No progress bar.")
+workers_option = click.option(
+    "--workers", type=click.IntRange(1), metavar="N", help="Processes.  [default: one a core]"
+)
+calibration_option = click.option(
+    "--calibration", type=FILE, multiple=True, help="Calibration file; repeat where it is in several."
+)
+
+_WIDE = 1000
+
+
+def print_table(table: Table) -> None:
+    """Into a file or a pipe the table goes whole: rich would fold it at 80 columns."""
+    console = Console()
+    (console if console.is_terminal else Console(width=_WIDE)).print(table)
+
+
+def print_notes(notes: Iterable[str]) -> None:
+    for note in notes:
+        click.echo(f"note: {note}", err=True)
+
+
+class Bar:
+    """A progress bar on standard error: what is done, ``figures``, and the time that is left; a context manager.
+
+    ``total`` None is unknown. Where it is ``late`` it appears when first something is done: an error ahead of that is
+    then one line and nothing else. In ``percent`` it counts no things but an amount of work.
+    """
+
+    def __init__(
+        self, total: float | None, figures: str = "", *, quiet: bool = False, late: bool = False, percent: bool = False
+    ) -> None:
+        self.progress = Progress(
+            BarColumn(bar_width=12),
+            TaskProgressColumn() if percent else MofNCompleteColumn(),
+            TextColumn("{task.fields[figures]}"),
+            TimeRemainingColumn(compact=True),
+            console=Console(stderr=True),
+            disable=quiet,
+        )
+        self._id = self.progress.add_task("", total=total, figures=figures)
+        self._figures, self._late, self._shown = figures, late, False
+
+    def __enter__(self) -> Self:
+        if not self._late:
+            self._show()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._shown:
+            self.progress.stop()
+
+    def __call__(self, figures: str | None = None, *, advance: float = 1, total: float | None = None) -> None:
+        """So much more is done, of a ``total`` that may have become known."""
+        self._show()
+        self._figures = self._figures if figures is None else figures
+        self.progress.update(self._id, advance=advance, total=total, figures=self._figures)
+
+    @property
+    def completed(self) -> float:
+        return self.progress.tasks[self._id].completed
+
+    @property
+    def elapsed_s(self) -> float:
+        """Since it appeared."""
+        return max(self.progress.tasks[self._id].elapsed or 0.0, 1e-3)
+
+    def _show(self) -> None:
+        if not self._shown:
+            self._shown = True
+            self.progress.reset(self._id)
+            self.progress.start()
