@@ -14,7 +14,7 @@ from tempfile import TemporaryDirectory
 import click
 import numpy as np
 from common import benchmark, present
-from vioframe.experiment import prepare, record
+from vioframe.pipeline import prepare, record
 
 from vioframe.bench import Row
 from vioframe.bench.detectors.entrants import line_up, parse_entrants
@@ -54,7 +54,7 @@ def main(data: Path, backend: str, assignments: tuple[str, ...], keep: bool, det
         with TemporaryDirectory() as temporary:
             moving, resting = data / "euroc/MH_01_easy_15s", data / "euroc/V1_01_easy_rest"
             bag = Path(temporary) / "MH_01_easy_15s.bag"
-            source = installed.open_dataset(moving)
+            source = installed.open_dataset(moving, options={"cameras": ["cam0"]})
             convert(source.measurements(), source.calibration, bag)
             for recording, clip in ((bag, moving), (resting, resting)):
                 for detector in names:

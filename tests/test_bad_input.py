@@ -396,8 +396,8 @@ def kind(bad):
     return Spoilt
 
 class Mute:
-    def __init__(self, calibration): pass
-    def process(self, imu, tracks): pass
+    def begin(self, start): pass
+    def process(self, imu, tracks, still): pass
 
 @hookimpl
 def vioframe_detectors(): return {"slow": Slow, **{name: kind(bad) for name, bad in BAD.items()}}
