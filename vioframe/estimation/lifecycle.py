@@ -166,9 +166,9 @@ def warm_up(backend: Backend, calibration: Calibration) -> None:
     Long enough to come through every step of a window of some ten frames once, so that all compiled code is there, or
     loaded from the cache, before the first frame of a flight. A back-end may find this flight too odd to follow.
     """
-    initialization.warm_up(calibration)
     if not calibration.cameras[0].rotation_known:
         calibration = calibration.with_camera(0, R_BC=np.eye(3), rotation_known=True)
+    initialization.warm_up(calibration)
     with suppress(DivergedError, np.linalg.LinAlgError):
         _fly_along_a_wall(backend, calibration)
 
