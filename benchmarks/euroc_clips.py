@@ -14,7 +14,6 @@ from tempfile import TemporaryDirectory
 import click
 import numpy as np
 from common import benchmark, present
-from vioframe.pipeline import prepare, record
 
 from vioframe.bench import Row
 from vioframe.bench.detectors.entrants import line_up, parse_entrants
@@ -24,6 +23,7 @@ from vioframe.parts import config as configuration
 from vioframe.parts import registry
 from vioframe.parts.config import Config, DatasetConfig, PartConfig
 from vioframe.parts.registry import DETECTOR, Registry
+from vioframe.pipeline import prepare, record
 from vioframe.runs.folder import RunFolder
 
 TRUTH = "mav0/state_groundtruth_estimate0/data.csv"
