@@ -20,7 +20,8 @@ from vioframe.bench.detectors.tables import by_degradation
 
 HERE = Path(__file__).resolve().parent
 ROOT = HERE.parent
-PAGES = (ROOT / "README.md", HERE / "README.md", *(ROOT / "docs" / name for name in ("keypointnet.md", "montecarlo.md")))
+_DOCS = ROOT / "docs"
+PAGES = (ROOT / "README.md", HERE / "README.md", _DOCS / "keypointnet.md", _DOCS / "montecarlo.md")
 BLOCK = re.compile(r"(<!-- figures: (\w+) -->\n).*?(<!-- end -->)", re.DOTALL)
 _RENDERED = "MH_05_difficult"
 
