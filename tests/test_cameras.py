@@ -92,7 +92,7 @@ def test_points_beyond_the_fold_of_the_distortion_come_back_as_nan():
 
 
 @pytest.mark.parametrize(
-    "change", [{"fx": 0.0}, {"distortion": (0.1, 0.2)}, {"distortion": (np.nan, 0, 0, 0)}, {"model": "mei"}]
+    "change", [{"fx": 0.0}, {"distortion": (0.1, 0.2)}, {"distortion": (np.nan, 0, 0, 0)}, {"distortion_model": "mei"}]
 )
 def test_impossible_cameras_are_refused(change):
     arguments = {"fx": 400.0, "fy": 400.0, "cx": 320.0, "cy": 240.0, "distortion": (0.0,) * 4, "resolution": (640, 480)}
