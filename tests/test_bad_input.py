@@ -452,7 +452,9 @@ def test_a_detector_that_never_works_ends_the_run(spoilt_detectors, detector, wh
 
 
 def test_a_back_end_that_returns_nothing_is_an_error_of_the_plugin(spoilt_detectors):
-    assert "returned a NoneType, not an Estimate; repair the plug-in" in error_line(*RUN_GOOD, "--backend", "mute")
+    assert "returned a NoneType, not an Estimate; repair the plug-in" in error_line(
+        *RUN_GOOD, "--backend", "mute", "--quiet"
+    )
 
 
 def vioframe_process(*arguments: object, **options) -> subprocess.Popen[str]:
