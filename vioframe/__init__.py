@@ -10,6 +10,9 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
+    from vioframe.interfaces import Dataset
     from vioframe.odometry import Odometry as Odometry
     from vioframe.parts.hooks import hookimpl as hookimpl
 
@@ -25,7 +28,7 @@ def __getattr__(name: str) -> Any:
     raise AttributeError(f"module 'vioframe' has no attribute {name!r}")
 
 
-def open_dataset(path: str, **options: Any) -> Any:
+def open_dataset(path: str | Path, **options: Any) -> Dataset:
     """Open a recording with the installed reader that accepts it; ``options`` are the reader's."""
     from vioframe.parts import registry
 

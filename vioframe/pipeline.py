@@ -59,6 +59,7 @@ class Experiment:
 
     def steps(self) -> Iterator[Step]:
         """The main loop, the loop closer taking part; what a plug-in raises comes out as an error that names it."""
+        # Around all of it, not each frame alone: a loop closer's own thread works between frames.
         with limited_threads(), self.registry.blaming():
             for step in run(
                 self.dataset, self.odometry, start_s=self.config.start_s, duration_s=self.config.duration_s
