@@ -34,14 +34,14 @@ class GateCounts:
         self.wrong_tracks: Counter[int] = Counter()
         self.landmarks = np.zeros(2, int)
         self.wrong = wrong
-        measure, update = updates.msckf_measurement, updates.update_from_landmarks
+        measure, update = updates.msckf_rows, updates.update_from_landmarks
 
-        def measured(state, window, xy, xy_normalised, seen, *arguments):
-            result = measure(state, window, xy, xy_normalised, seen, *arguments)
-            for points, mask, verdict in zip(xy, seen, result.verdict.tolist(), strict=True):
+        def measured(window, xy, xy_normalised, seen, *arguments):
+            *rows, verdicts = measure(window, xy, xy_normalised, seen, *arguments)
+            for points, mask, verdict in zip(xy, seen, verdicts.tolist(), strict=True):
                 spoilt = any(tuple(point) in self.wrong for point in points[mask].tolist())
                 (self.wrong_tracks if spoilt else self.tracks)[verdict] += 1
-            return result
+            return *rows, verdicts
 
         def updated(state, tracks, *arguments):
             offered = int(np.isin(state.landmark_ids, tracks.ids).sum())
@@ -49,7 +49,7 @@ class GateCounts:
             self.landmarks += used, offered
             return used
 
-        monkeypatch.setattr(updates, "msckf_measurement", measured)
+        monkeypatch.setattr(updates, "msckf_rows", measured)
         monkeypatch.setattr(backend_module, "update_from_landmarks", updated)
 
 

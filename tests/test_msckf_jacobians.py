@@ -9,8 +9,7 @@ from scipy.stats import chi2
 
 from vioframe.geometry import kernels, so3
 from vioframe.geometry.cameras import Camera
-from vioframe_msckf import measurement
-from vioframe_msckf.measurement import Window, landmark_rows, mahalanobis, reduce_landmark, track_rows
+from vioframe_msckf.measurement import Window, landmark_rows, mahalanobis, observations, reduce_landmark, track_rows
 from vioframe_msckf.options import MsckfOptions
 from vioframe_msckf.state import CALIBRATION, OFFSET
 from vioframe_msckf.updates import promote_tracks
@@ -40,43 +39,35 @@ def test_observation_jacobian_is_the_derivative_on_the_manifold(camera):
         )[0]
 
     xy = predicted(np.zeros(24)) + np.array([0.3, -0.2])
-    blocks, residual = measurement._observations(
-        R_WB[None],
-        p_WB[None],
-        R_WB[None],
-        p_WB[None],
-        R_BC,
-        p_BC,
-        model,
-        k,
-        np.array([0]),
-        p_WF[None],
-        p_WF[None],
-        xy[None],
-    )
+    window = Window(R_WB[None], p_WB[None], R_WB[None], p_WB[None], R_BC, p_BC, model, k)
+    blocks, residual = observations(window, 0, p_WF[None], p_WF[None], xy[None])
     eps = 1e-6
     numeric = np.stack([(predicted(eps * e) - predicted(-eps * e)) / (2 * eps) for e in np.eye(24)], axis=1)
     np.testing.assert_allclose(residual[0], [0.3, -0.2], atol=1e-9)
     np.testing.assert_allclose(blocks[0], numeric, rtol=1e-6, atol=1e-5)
 
 
+def rows_of(table, row, window, pixel_sigma):
+    """``track_rows`` of one row of the observation table."""
+    return track_rows(window, table.xy[row], table.xy_normalised[row], table.seen[row], pixel_sigma)
+
+
 def test_rows_of_landmarks_predict_how_residuals_change_with_the_state():
     """Column by column, through the filter's own correction; only the offset acts through the clones alone."""
-    state, observations = seeing_state()
-    full = np.flatnonzero(observations.seen.all(axis=1))[:4]
+    state, table = seeing_state()
+    full = np.flatnonzero(table.seen.all(axis=1))[:4]
     for row in full:
-        track = track_rows(Window.of(state, False), observations.xy[row], observations.xy_normalised[row],
-                           observations.seen[row], 1.0)  # fmt: skip
-        assert track is not None
-        state.add_landmark(row, track[0], track[0], np.zeros((3, len(state.cov))), np.eye(3))
-    clone, rows, xy = 3, np.array([3, 0, 2]), observations.xy[full[[3, 0, 2]], 3]
+        ok, p_WF, *_ = rows_of(table, row, Window.of(state, False), 1.0)
+        assert ok
+        state.add_landmark(row, p_WF, p_WF, np.zeros((3, len(state.cov))), np.eye(3))
+    clone, xy = 3, table.xy[full, 3]
 
     def residual(dx):
         moved = copy.deepcopy(state)
         moved._correct(dx)
-        return landmark_rows(moved, Window.of(moved, False), clone, xy, rows, False)[1]
+        return landmark_rows(moved, clone, xy, False)[1]
 
-    H, _ = landmark_rows(state, Window.of(state, False), clone, xy, rows, False)
+    H, _ = landmark_rows(state, clone, xy, False)
     eps, n = 1e-6, len(state.cov)
     numeric = np.stack([(residual(-eps * e) - residual(eps * e)) / (2 * eps) for e in np.eye(n)], axis=1)
     np.testing.assert_allclose(H, numeric, rtol=1e-6, atol=2e-4)
@@ -84,18 +75,16 @@ def test_rows_of_landmarks_predict_how_residuals_change_with_the_state():
 
 
 def test_first_estimates_hold_the_jacobian_and_not_the_residual():
-    state, observations = seeing_state()
-    row = np.flatnonzero(observations.seen.all(axis=1))[0]
-    p_WF, *_ = track_rows(Window.of(state, True), observations.xy[row], observations.xy_normalised[row],
-                          observations.seen[row], 1.0)  # fmt: skip
+    state, table = seeing_state()
+    row = np.flatnonzero(table.seen.all(axis=1))[0]
+    _, p_WF, *_ = rows_of(table, row, Window.of(state, True), 1.0)
     state.add_landmark(row, p_WF, p_WF, np.zeros((3, len(state.cov))), np.eye(3))
     moved, dx = copy.deepcopy(state), 0.01 * np.random.default_rng(0).normal(size=len(state.cov))
     dx[CALIBRATION] = 0.0
     moved._correct(dx)
 
     def rows(of, first_estimates):
-        window = Window.of(of, first_estimates)
-        return landmark_rows(of, window, 2, observations.xy[[row], 2], np.array([0]), first_estimates)
+        return landmark_rows(of, 2, table.xy[[row], 2], first_estimates)
 
     H, residual = rows(state, True)
     np.testing.assert_array_equal(rows(moved, True)[0], H)
@@ -127,12 +116,10 @@ def test_mahalanobis_distance():
 
 
 def test_delayed_initialisation_is_the_joint_update_with_nothing_known_of_the_landmark():
-    state, observations = seeing_state()
+    state, table = seeing_state()
     options = MsckfOptions(pixel_sigma=0.7)
-    row = np.flatnonzero(observations.seen.all(axis=1))[0]
-    p_WF, H, H_f, residual = track_rows(
-        Window.of(state, True), observations.xy[row], observations.xy_normalised[row], observations.seen[row], 0.7
-    )
+    row = np.flatnonzero(table.seen.all(axis=1))[0]
+    _, p_WF, H, H_f, residual = rows_of(table, row, Window.of(state, True), 0.7)
     # In information form the landmark's prior is exactly nothing.
     n = len(state.cov)
     joint = np.zeros((len(residual), n + 3))
@@ -144,22 +131,22 @@ def test_delayed_initialisation_is_the_joint_update_with_nothing_known_of_the_la
 
     before = copy.deepcopy(state)
     gate = chi2.ppf(0.999999, np.arange(1, 40))
-    assert promote_tracks(state, observations, np.array([row]), options, np.r_[0.0, gate]).tolist() == [row]
+    assert promote_tracks(state, table, np.array([row]), options, np.r_[0.0, gate]).tolist() == [row]
     np.testing.assert_allclose(state.cov, cov, rtol=1e-6, atol=1e-9 * np.abs(cov).max())
     np.testing.assert_allclose(state.p_WF[0], p_WF + dx[n:], atol=1e-9)
     np.testing.assert_allclose(state.p_WF_first[0], p_WF, atol=0.0)
     np.testing.assert_allclose(state.p_WB, before.p_WB + dx[3:6], atol=1e-9)
     np.testing.assert_allclose(so3.log(before.R_WB.T @ state.R_WB), dx[:3], atol=1e-9)
     np.testing.assert_allclose(state.clones.p_WB, before.clones.p_WB + dx[30:n].reshape(-1, 6)[:, 3:], atol=1e-9)
-    assert state.landmark_ids.tolist() == [observations.ids[row]]
+    assert state.landmark_ids.tolist() == [table.ids[row]]
 
 
 def test_an_implausible_track_is_used_up_and_changes_nothing():
-    state, observations = seeing_state()
-    row = np.flatnonzero(observations.seen.all(axis=1))[0]
-    observations.xy[row, 2] += 60.0
+    state, table = seeing_state()
+    row = np.flatnonzero(table.seen.all(axis=1))[0]
+    table.xy[row, 2] += 60.0
     cov = state.cov.copy()
     gate = np.r_[0.0, chi2.ppf(0.95, np.arange(1, 40))]
-    assert promote_tracks(state, observations, np.array([row]), MsckfOptions(), gate).tolist() == [row]
+    assert promote_tracks(state, table, np.array([row]), MsckfOptions(), gate).tolist() == [row]
     assert not len(state.landmark_ids)
     np.testing.assert_array_equal(state.cov, cov)

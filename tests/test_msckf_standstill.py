@@ -14,8 +14,8 @@ from vioframe.simulation import simulated_sequence
 from vioframe.simulation.flights import ShapedFlight, levelled
 from vioframe.types import DBA, DBG, DTHETA, DV, Estimate, FrameTracks, ImuNoise, ImuSegment, Status, g_W
 from vioframe_msckf.backend import Msckf
-from vioframe_msckf.standstill import hold_still
 from vioframe_msckf.state import IMU
+from vioframe_msckf.updates import hold_still
 
 NOISE = ImuNoise(gyro_density=1.7e-4, accel_density=2e-3, gyro_walk=2e-5, accel_walk=3e-3, rate_hz=200.0)
 

@@ -14,9 +14,8 @@ from vioframe.estimation.recovery import noise_over
 from vioframe.stopwatch import Stopwatch
 from vioframe.types import Estimate, FrameTracks, ImuSegment, Start, Status
 from vioframe_msckf.options import MsckfOptions
-from vioframe_msckf.standstill import hold_still
 from vioframe_msckf.state import FilterState
-from vioframe_msckf.updates import promote_tracks, select_tracks, update_from_landmarks, update_from_tracks
+from vioframe_msckf.updates import hold_still, promote_tracks, select_tracks, update_from_landmarks, update_from_tracks
 
 
 class Msckf:

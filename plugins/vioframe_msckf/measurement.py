@@ -7,23 +7,21 @@ Derivation: ``docs/derivations/msckf.md``.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from vioframe.geometry.kernels import distort, hat, intrinsics_jacobian, undistort
 from vioframe.geometry.triangulation import triangulate
 from vioframe.jit import kernel
-from vioframe.types import Float, Int
+from vioframe.types import Float
 from vioframe_msckf.state import CALIBRATION, CLONES, FilterState
 
 ACCEPTED, NOT_TRIANGULATED, GATED = 0, 1, 2
 
 
-@dataclass(frozen=True, slots=True)
-class Window:
-    """What the kernels need of the filter: clones, their first estimates, and the camera."""
+class Window(NamedTuple):
+    """What the kernels need of the filter: clones, where Jacobians are taken of them, and the camera."""
 
     R_WB: Float
     p_WB: Float
@@ -34,131 +32,66 @@ class Window:
     camera_model: int
     intrinsics: Float
 
-    @classmethod
-    def of(cls, state: FilterState, first_estimates: bool) -> Window:
+    @staticmethod
+    def of(state: FilterState, first_estimates: bool) -> Window:
         c = state.clones
         first = (c.R_WB_first, c.p_WB_first) if first_estimates else (c.R_WB, c.p_WB)
-        return cls(c.R_WB, c.p_WB, *first, state.R_BC, state.p_BC, state.camera_model, state.intrinsics)
-
-    def arrays(self) -> tuple[Float, Float, Float, Float, Float, Float, int, Float]:
-        """In the order in which every kernel takes them."""
-        return (
-            self.R_WB,
-            self.p_WB,
-            self.R_WB_first,
-            self.p_WB_first,
-            self.R_BC,
-            self.p_BC,
-            self.camera_model,
-            self.intrinsics,
-        )
+        return Window(c.R_WB, c.p_WB, *first, state.R_BC, state.p_BC, state.camera_model, state.intrinsics)
 
 
-@dataclass(frozen=True, slots=True)
-class FeatureUpdate:
-    """The stacked, landmark-free measurement of many tracks over [calibration, clones], and each track's verdict."""
-
-    H: Float
-    residual: Float
-    p_WF: Float
-    verdict: Int
-
-
-def msckf_measurement(
-    state: FilterState,
-    window: Window,
-    xy: Float,
-    xy_normalised: Float,
-    seen: NDArray[np.bool_],
-    pixel_sigma: float,
-    gate: Float,
-) -> FeatureUpdate:
-    """Triangulate (F, C) tracks, linearise them, project out the landmarks, and gate each at ``gate[dof]``."""
-    P = np.ascontiguousarray(
-        state.cov[CALIBRATION.start : state.landmarks_begin, CALIBRATION.start : state.landmarks_begin]
-    )
-    H, residual, p_WF, verdict = _msckf_rows(*window.arrays(), xy, xy_normalised, seen, P, pixel_sigma, gate)
-    return FeatureUpdate(H, residual, p_WF, verdict)
-
-
-def landmark_rows(
-    state: FilterState, window: Window, clone: int, xy: Float, rows: NDArray[np.intp], first_estimates: bool
-) -> tuple[Float, Float]:
-    """Measurements (M, 2) px of the landmarks ``rows`` of the state from one clone: H (2 M, n) and residuals (2 M,)."""
+def landmark_rows(state: FilterState, clone: int, xy: Float, first_estimates: bool) -> tuple[Float, Float]:
+    """Measurements (M, 2) px of the state's landmarks from one clone: H (2 M, n) and residuals (2 M,)."""
     p_first = state.p_WF_first if first_estimates else state.p_WF
-    blocks, residual = _observations(
-        *window.arrays(), np.full(len(rows), clone), np.ascontiguousarray(state.p_WF[rows]), p_first[rows], xy
-    )
-    H = np.zeros((2 * len(rows), len(state.cov)))
-    pairs = np.arange(2 * len(rows)).reshape(-1, 2)
+    blocks, residual = observations(Window.of(state, first_estimates), clone, state.p_WF, p_first, xy)
+    H = np.zeros((2 * len(xy), len(state.cov)))
     H[:, CALIBRATION] = blocks[:, :, :15].reshape(-1, 15)
     H[:, CLONES + 6 * clone : CLONES + 6 * clone + 6] = blocks[:, :, 15:21].reshape(-1, 6)
-    columns = state.landmarks_begin + 3 * rows[:, None] + np.arange(3)
-    H[pairs[:, :, None], columns[:, None, :]] = blocks[:, :, 21:]
+    rows, columns = np.arange(2 * len(xy)).reshape(-1, 2, 1), np.arange(3 * len(xy)).reshape(-1, 1, 3)
+    H[rows, state.landmarks_begin + columns] = blocks[:, :, 21:]
     return H, residual.ravel()
 
 
-def track_rows(
-    window: Window, xy: Float, xy_normalised: Float, seen: NDArray[np.bool_], pixel_sigma: float
-) -> tuple[Float, Float, Float, Float] | None:
-    """One track (C,) -> (p_WF, H over [calibration, clones], H over the landmark, residual), or None untriangulated."""
-    ok, p_WF, H, H_f, residual = _track_rows(*window.arrays(), xy, xy_normalised, seen, pixel_sigma)
-    return (p_WF, H, H_f, residual) if ok else None
-
-
 @kernel
-def _observe(R, p, R_first, p_first, R_BC, p_BC, model, k, p_WF, p_WF_first, xy, block, residual):
+def _observe(w, c, p_WF, p_WF_first, xy, block, residual):
     """One observation: ``block`` (2, 24) over [calibration 15, clone 6, landmark 3] and ``residual`` (2,)."""
-    p_C = R_BC.T @ (R.T @ (p_WF - p) - p_BC)
-    drawn, _ = distort(model, k, p_C[0] / p_C[2], p_C[1] / p_C[2])
+    p_C = w.R_BC.T @ (w.R_WB[c].T @ (p_WF - w.p_WB[c]) - w.p_BC)
+    drawn, _ = distort(w.camera_model, w.intrinsics, p_C[0] / p_C[2], p_C[1] / p_C[2])
     residual[0], residual[1] = xy[0] - drawn[0], xy[1] - drawn[1]
 
-    p_B = R_first.T @ (p_WF_first - p_first)
-    p_C = R_BC.T @ (p_B - p_BC)
+    R_first = w.R_WB_first[c]
+    p_B = R_first.T @ (p_WF_first - w.p_WB_first[c])
+    p_C = w.R_BC.T @ (p_B - w.p_BC)
     x, y = p_C[0] / p_C[2], p_C[1] / p_C[2]
-    _, D = distort(model, k, x, y)
+    _, D = distort(w.camera_model, w.intrinsics, x, y)
     J = np.empty((2, 3))
     for i in range(2):
         J[i, 0], J[i, 1] = D[i, 0] / p_C[2], D[i, 1] / p_C[2]
         J[i, 2] = -(D[i, 0] * x + D[i, 1] * y) / p_C[2]
-    J_B = J @ R_BC.T
+    J_B = J @ w.R_BC.T
     J_W = J_B @ R_first.T
     block[:, 0:3] = J @ hat(p_C)
     block[:, 3:6] = -J_B
     block[:, 6] = 0.0  # the time offset acts through the clone
-    block[:, 7:15] = intrinsics_jacobian(model, k, x, y)
+    block[:, 7:15] = intrinsics_jacobian(w.camera_model, w.intrinsics, x, y)
     block[:, 15:18] = J_B @ hat(p_B)
     block[:, 18:21] = -J_W
     block[:, 21:24] = J_W
 
 
 @kernel
-def _observations(R, p, R_first, p_first, R_BC, p_BC, model, k, clone, p_WF, p_WF_first, xy):
-    m = len(clone)
+def observations(w, clone, p_WF, p_WF_first, xy):
+    """Landmarks (M, 3) seen at (M, 2) px from one clone: blocks (M, 2, 24) and residuals (M, 2)."""
+    m = len(xy)
     blocks = np.empty((m, 2, 24))
     residual = np.empty((m, 2))
     for i in range(m):
-        c = clone[i]
-        _observe(
-            R[c],
-            p[c],
-            R_first[c],
-            p_first[c],
-            R_BC,
-            p_BC,
-            model,
-            k,
-            p_WF[i],
-            p_WF_first[i],
-            xy[i],
-            blocks[i],
-            residual[i],
-        )
+        _observe(w, clone, p_WF[i], p_WF_first[i], xy[i], blocks[i], residual[i])
     return blocks, residual
 
 
 @kernel
-def _track_rows(R, p, R_first, p_first, R_BC, p_BC, model, k, xy, xy_normalised, seen, pixel_sigma):
+def track_rows(w, xy, xy_normalised, seen, pixel_sigma):
+    """One track (C,): whether it was triangulated, p_WF, H over [calibration, clones] and the landmark, residual."""
     C = len(seen)
     clones = np.flatnonzero(seen)
     m = len(clones)
@@ -167,10 +100,12 @@ def _track_rows(R, p, R_first, p_first, R_BC, p_BC, model, k, xy, xy_normalised,
     points = np.empty((m, 2))
     for i in range(m):
         c = clones[i]
-        R_WC[i] = R[c] @ R_BC
-        p_WC[i] = R[c] @ p_BC + p[c]
-        points[i, 0], points[i, 1] = undistort(model, k, xy[c, 0], xy[c, 1], xy_normalised[c, 0], xy_normalised[c, 1])
-    ok, p_WF = triangulate(R_WC, p_WC, points, pixel_sigma / k[0])
+        R_WC[i] = w.R_WB[c] @ w.R_BC
+        p_WC[i] = w.R_WB[c] @ w.p_BC + w.p_WB[c]
+        points[i, 0], points[i, 1] = undistort(
+            w.camera_model, w.intrinsics, xy[c, 0], xy[c, 1], xy_normalised[c, 0], xy_normalised[c, 1]
+        )
+    ok, p_WF = triangulate(R_WC, p_WC, points, pixel_sigma / w.intrinsics[0])
     H = np.zeros((2 * m, 15 + 6 * C))
     H_f = np.empty((2 * m, 3))
     residual = np.empty(2 * m)
@@ -178,10 +113,7 @@ def _track_rows(R, p, R_first, p_first, R_BC, p_BC, model, k, xy, xy_normalised,
         block = np.empty((2, 24))
         for i in range(m):
             c = clones[i]
-            _observe(
-                R[c], p[c], R_first[c], p_first[c], R_BC, p_BC, model, k, p_WF, p_WF, xy[c], block,
-                residual[2 * i : 2 * i + 2],
-            )  # fmt: skip
+            _observe(w, c, p_WF, p_WF, xy[c], block, residual[2 * i : 2 * i + 2])
             H[2 * i : 2 * i + 2, 0:15] = block[:, 0:15]
             H[2 * i : 2 * i + 2, 15 + 6 * c : 21 + 6 * c] = block[:, 15:21]
             H_f[2 * i : 2 * i + 2] = block[:, 21:24]
@@ -237,7 +169,11 @@ def mahalanobis(H, residual, P, variance):
 
 
 @kernel
-def _msckf_rows(R, p, R_first, p_first, R_BC, p_BC, model, k, xy, xy_normalised, seen, P, pixel_sigma, gate):
+def msckf_rows(w, xy, xy_normalised, seen, P, pixel_sigma, gate):
+    """Triangulate (F, C) tracks, linearise them, project out the landmarks, and gate each at ``gate[dof]``.
+
+    The stacked H and residual over [calibration, clones], whose covariance is ``P``; p_WF (F, 3); each one's verdict.
+    """
     F, C = seen.shape
     n = 15 + 6 * C
     H_all = np.empty((2 * seen.sum(), n))
@@ -246,9 +182,7 @@ def _msckf_rows(R, p, R_first, p_first, R_BC, p_BC, model, k, xy, xy_normalised,
     verdict = np.empty(F, dtype=np.int64)
     rows = 0
     for f in range(F):
-        ok, p_WF[f], H, H_f, residual = _track_rows(
-            R, p, R_first, p_first, R_BC, p_BC, model, k, xy[f], xy_normalised[f], seen[f], pixel_sigma
-        )
+        ok, p_WF[f], H, H_f, residual = track_rows(w, xy[f], xy_normalised[f], seen[f], pixel_sigma)
         if not ok:
             verdict[f] = NOT_TRIANGULATED
             continue

@@ -1,4 +1,4 @@
-"""The three visual updates: from finished tracks, from landmarks in the state, and by taking new landmarks in."""
+"""The updates: at standstill; from finished tracks, from landmarks in the state, and by taking new landmarks in."""
 
 from __future__ import annotations
 
@@ -8,18 +8,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vioframe.estimation.factors.tracks import TrackTable
-from vioframe.types import Float, FrameTracks, Int
+from vioframe.estimation.standstill import Standstill
+from vioframe.types import Float, FrameTracks, ImuNoise, ImuSegment, Int
 from vioframe_msckf.measurement import (
     ACCEPTED,
     Window,
     landmark_rows,
     mahalanobis,
-    msckf_measurement,
+    msckf_rows,
     reduce_landmark,
     track_rows,
 )
 from vioframe_msckf.options import MsckfOptions
-from vioframe_msckf.state import CALIBRATION, FilterState, compress
+from vioframe_msckf.state import CALIBRATION, IMU, FilterState, compress
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,6 +29,21 @@ class Selection:
 
     finished: NDArray[np.intp]
     promoted: NDArray[np.intp]
+
+
+def hold_still(state: FilterState, imu: ImuSegment, noise: ImuNoise, first_estimates: bool) -> bool:
+    """Zero-velocity update, if the readings of ``imu`` agree with standstill; else the state is left as it is.
+
+    The readings serve as measurements here and so do not propagate the pose as well.
+    """
+    still = Standstill.over(imu, noise)
+    residual = still.residual(state.R_WB, state.v_WB, state.bias_gyro_B, state.bias_accel_B)
+    H = still.jacobian(state.first[0] if first_estimates else state.R_WB)
+    if not still.agrees(residual, H, state.cov[:IMU, :IMU]):
+        return False
+    state.drift_biases(imu.duration_s, noise)
+    state.update_joseph(H, residual, still.sigma**2)
+    return True
 
 
 def select_tracks(observations: TrackTable, state: FilterState, options: MsckfOptions) -> Selection:
@@ -55,22 +71,21 @@ def update_from_tracks(
     state: FilterState, observations: TrackTable, rows: NDArray[np.intp], options: MsckfOptions, gate: Float
 ) -> tuple[Int, Float]:
     """The multi-state constraint update; returns ids and positions of the landmarks it accepted."""
-    window = Window.of(state, options.first_estimate_jacobians)
-    measured = msckf_measurement(
-        state,
-        window,
+    columns = slice(CALIBRATION.start, state.landmarks_begin)
+    H, residual, p_WF, verdict = msckf_rows(
+        Window.of(state, options.first_estimate_jacobians),
         observations.xy[rows],
         observations.xy_normalised[rows],
         observations.seen[rows],
+        np.ascontiguousarray(state.cov[columns, columns]),
         options.pixel_sigma,
         gate,
     )
-    if len(measured.residual):
-        H, residual = compress(measured.H, measured.residual)
-        columns = slice(CALIBRATION.start, state.landmarks_begin)
+    if len(residual):
+        H, residual = compress(H, residual)
         state.update(H, residual, columns, options.pixel_sigma**2)
-    accepted = measured.verdict == ACCEPTED
-    return observations.ids[rows[accepted]], measured.p_WF[accepted]
+    accepted = verdict == ACCEPTED
+    return observations.ids[rows[accepted]], p_WF[accepted]
 
 
 def update_from_landmarks(state: FilterState, tracks: FrameTracks, options: MsckfOptions, gate: Float) -> int:
@@ -81,11 +96,9 @@ def update_from_landmarks(state: FilterState, tracks: FrameTracks, options: Msck
     state.keep_landmarks(np.isin(state.landmark_ids, tracks.ids))
     if not len(state.landmark_ids):
         return 0
-    window = Window.of(state, options.first_estimate_jacobians)
     order = np.argsort(tracks.ids)
     xy = tracks.xy[order[np.searchsorted(tracks.ids, state.landmark_ids, sorter=order)]]
-    every = np.arange(len(state.landmark_ids))
-    H, residual = landmark_rows(state, window, len(state.clones) - 1, xy, every, options.first_estimate_jacobians)
+    H, residual = landmark_rows(state, len(state.clones) - 1, xy, options.first_estimate_jacobians)
 
     variance = options.pixel_sigma**2
     pairs = H.reshape(-1, 2, H.shape[1])
@@ -113,13 +126,12 @@ def promote_tracks(
     for row in rows:
         # Every promotion updates the state, so each is linearised at the estimate the last one left.
         window = Window.of(state, options.first_estimate_jacobians)
-        track = track_rows(
+        ok, p_WF, H, H_f, residual = track_rows(
             window, observations.xy[row], observations.xy_normalised[row], observations.seen[row], options.pixel_sigma
         )
-        if track is None:
+        if not ok:
             continue
         used.append(row)
-        p_WF, H, H_f, residual = track
         reduce_landmark(H, H_f, residual)
         columns = slice(CALIBRATION.start, state.landmarks_begin)
         P = np.ascontiguousarray(state.cov[columns, columns])

@@ -11,7 +11,7 @@ import numpy as np
 from vioframe.errors import DivergedError
 from vioframe.estimation.inertial.preintegration import join_segments, preintegrate
 from vioframe.estimation.recovery import noise_over
-from vioframe.estimation.standstill import STANDSTILL_GATE, Standstill
+from vioframe.estimation.standstill import Standstill
 from vioframe.stopwatch import Stopwatch
 from vioframe.types import Estimate, FrameTracks, ImuNoise, ImuSegment, NavState, Start, Status
 from vioframe_sliding_window.options import SlidingWindowOptions
@@ -93,9 +93,7 @@ class SlidingWindow:
         assert predicted.cov is not None
         still = Standstill.over(imu, self._noise)
         residual = still.residual(predicted.R_WB, predicted.v_WB, predicted.bias_gyro_B, predicted.bias_accel_B)
-        H = still.jacobian(predicted.R_WB)
-        S = H @ predicted.cov @ H.T + np.diag(still.sigma**2)
-        return bool(residual @ np.linalg.solve(S, residual) < STANDSTILL_GATE)
+        return still.agrees(residual, still.jacobian(predicted.R_WB), predicted.cov)
 
     def _check_jump(self, predicted: NavState, newest: NavState) -> None:
         jump = float(np.linalg.norm(newest.p_WB - predicted.p_WB))

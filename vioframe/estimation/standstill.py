@@ -97,3 +97,8 @@ class Standstill:
         H[3:6, DTHETA], H[3:6, DBA] = so3.hat(-R_WB.T @ g_W), np.eye(3)
         H[6:9, DV] = np.eye(3)
         return H
+
+    def agrees(self, residual: Float, H: Float, cov: Float) -> bool:
+        """Whether the readings bear standstill out, by ``residual`` (9,) and ``H`` (9, 15) of a state with ``cov``."""
+        S = H @ cov @ H.T + np.diag(self.sigma**2)
+        return bool(residual @ np.linalg.solve(S, residual) <= STANDSTILL_GATE)
