@@ -13,6 +13,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from decimal import Decimal, InvalidOperation
+from math import hypot, isfinite
 from pathlib import Path
 from typing import Self
 
@@ -25,7 +26,7 @@ from vioframe.types import NS_PER_S, Float, Int
 
 _GZIP_MAGIC = b"\x1f\x8b"
 _MOTION_CAPTURE = re.compile(r"vicon|leica", re.IGNORECASE)
-_EUROC_COLUMNS = (8, 11, 17)
+_EUROC_COLUMNS, _TUM_COLUMNS = (8, 11, 17), (8,)
 _EUROC_HEADING = (
     "#timestamp",
     *(f" p_RS_R_{axis} [m]" for axis in "xyz"),
@@ -62,20 +63,6 @@ def true_values(trajectory: Trajectory) -> Float:
     return np.hstack([trajectory.p_WB, trajectory.quat_xyzw[:, [3, 0, 1, 2]]])
 
 
-@dataclass(frozen=True)
-class _Table:
-    """The numeric rows of a text file: fields as text, with the line (counted from 1) that each came from."""
-
-    name: str
-    header: str
-    comma_separated: bool
-    lines: list[int]
-    rows: list[list[str]]
-
-    def error(self, row: int, problem: str) -> TrajectoryError:
-        return TrajectoryError(f"{self.name}, line {self.lines[row]}: {problem}")
-
-
 def load_trajectory(
     path: str | Path, *, complete_lines_only: bool = False, keep_first_of_repeats: bool = False
 ) -> Trajectory:
@@ -90,25 +77,36 @@ def load_trajectory(
     text = _read_text(path)
     if complete_lines_only:
         text = text[: text.rfind("\n") + 1]
-    table = _split(path.name, text, keep_first_of_repeats)
-    _refuse_motion_capture(path, table)
-    columns = len(table.rows[0])
-    if table.comma_separated and columns in _EUROC_COLUMNS:
-        unit, quat_columns = 1, [5, 6, 7, 4]
-    elif not table.comma_separated and columns == 8:
-        unit, quat_columns = NS_PER_S, [4, 5, 6, 7]
-    else:
-        raise table.error(0, f"{columns} columns are neither TUM (8, blanks) nor EuRoC (8, 11 or 17, commas)")
-    t_ns = _stamps(table, unit)
-    values = _values(table)
-    _check_order(table, t_ns)
-    quat = values[:, quat_columns]
-    off = np.abs(np.linalg.norm(quat, axis=1) - 1.0) > _QUAT_NORM_TOLERANCE
-    if off.any():
-        raise table.error(int(np.argmax(off)), "the quaternion is not of unit norm; are the columns in order?")
-    if unit == 1:
-        return TrueTrajectory.of(t_ns, values[:, 1:])
-    return Trajectory.from_quat_xyzw(t_ns, values[:, 1:4], quat)
+    heading, commas, lines = _split(text)
+    if not lines:
+        raise TrajectoryError(f"{path.name}: holds no poses; give a TUM or EuRoC trajectory")
+    first, columns = lines[0][0], len(lines[0][1])
+    _refuse_motion_capture(path, heading, commas, columns)
+    if columns not in (_EUROC_COLUMNS if commas else _TUM_COLUMNS):
+        layouts = "neither TUM (8, blanks) nor EuRoC (8, 11 or 17, commas)"
+        raise TrajectoryError(f"{path.name}, line {first}: {columns} columns are {layouts}")
+    t_ns: list[int] = []
+    rows: list[list[float]] = []
+    before = first, ""
+    for number, fields in lines:
+        try:
+            if len(fields) != columns:
+                raise ValueError(f"{len(fields)} columns where line {first} has {columns}")
+            if keep_first_of_repeats and fields[0] == before[1]:
+                continue
+            stamp_ns, row = _pose(fields, is_euroc=commas)
+            if t_ns and stamp_ns <= t_ns[-1]:
+                kind = "repeats" if stamp_ns == t_ns[-1] else "is before"
+                raise ValueError(f"the stamp {fields[0]} {kind} that of line {before[0]}; sort or drop such lines")
+        except ValueError as problem:
+            raise TrajectoryError(f"{path.name}, line {number}: {problem}") from None
+        t_ns.append(stamp_ns)
+        rows.append(row)
+        before = number, fields[0]
+    stamps, values = np.array(t_ns, dtype=np.int64), np.array(rows)
+    if commas:
+        return TrueTrajectory.of(stamps, values)
+    return Trajectory.from_quat_xyzw(stamps, values[:, :3], values[:, 3:7])
 
 
 def tum_line(t_ns: int, R_WB: Float, p_WB: Float) -> str:
@@ -159,38 +157,24 @@ def _read_text(path: Path) -> str:
         raise TrajectoryError(f"{path}: cannot be read ({error}); give a TUM or EuRoC trajectory") from None
 
 
-def _split(name: str, text: str, keep_first_of_repeats: bool) -> _Table:
-    header = ""
-    comma_separated = False
-    lines: list[int] = []
-    rows: list[list[str]] = []
+def _split(text: str) -> tuple[str, bool, list[tuple[int, list[str]]]]:
+    """The heading; whether columns are separated by commas; and the fields of each line, with its number from 1."""
+    heading, commas = "", False
+    lines: list[tuple[int, list[str]]] = []
     for number, raw in enumerate(text.splitlines(), start=1):
         line = raw.strip()
-        if not line:
-            continue
-        if line.startswith(("#", "%")) or (not rows and line[0].isalpha()):
-            header = header or line
-            continue
-        if not rows:
-            comma_separated = "," in line
-        # VINS-Mono ends each line of its csv with a comma.
-        fields = line.rstrip(",").split(",") if comma_separated else line.split()
-        if rows and len(fields) != len(rows[0]):
-            raise TrajectoryError(
-                f"{name}, line {number}: {len(fields)} columns where line {lines[0]} has {len(rows[0])}"
-            )
-        if not (keep_first_of_repeats and rows and fields[0] == rows[-1][0]):
-            rows.append(fields)
-            lines.append(number)
-    if not rows:
-        raise TrajectoryError(f"{name}: holds no poses; give a TUM or EuRoC trajectory")
-    return _Table(name, header, comma_separated, lines, rows)
+        if line.startswith(("#", "%")) or (not lines and line[:1].isalpha()):
+            heading = heading or line
+        elif line:
+            commas = "," in line if not lines else commas
+            # VINS-Mono ends each line of its csv with a comma.
+            lines.append((number, line.rstrip(",").split(",") if commas else line.split()))
+    return heading, commas, lines
 
 
-def _refuse_motion_capture(path: Path, table: _Table) -> None:
-    columns = len(table.rows[0])
+def _refuse_motion_capture(path: Path, heading: str, commas: bool, columns: int) -> None:
     # EuRoC's vicon0/data.csv has the column names of its ground truth, but stops after the quaternion.
-    vicon_columns = table.comma_separated and columns == 8 and "p_RS_R_x" in table.header
+    vicon_columns = commas and columns == 8 and "p_RS_R_x" in heading
     if columns == 4 or vicon_columns or _MOTION_CAPTURE.search(f"{path.parent.name}/{path.name}"):
         raise TrajectoryError(
             f"{path}: raw Vicon or Leica measurements are not a body trajectory in the cameras' clock; "
@@ -198,46 +182,24 @@ def _refuse_motion_capture(path: Path, table: _Table) -> None:
         )
 
 
-def _stamps(table: _Table, unit: int) -> Int:
-    """(N,) ns, from the first column in units of ``unit`` ns."""
-    stamps: list[int] = []
-    for row, fields in enumerate(table.rows):
-        try:
-            value = Decimal(fields[0]) * unit
-        except InvalidOperation:
-            raise table.error(row, f"the stamp {fields[0]!r} is not a number") from None
-        if not value.is_finite() or abs(value) > _INT64_MAX:
-            hint = " seconds; are the stamps nanoseconds? separate EuRoC columns by commas" if unit != 1 else " ns"
-            raise table.error(row, f"the stamp {fields[0]} is not a time in{hint}")
-        if unit == 1 and value != value.to_integral_value():
-            raise table.error(
-                row, f"the stamp {fields[0]} is not integer nanoseconds; TUM files are separated by blanks"
-            )
-        stamps.append(int(value.to_integral_value()))
-    return np.array(stamps, dtype=np.int64)
-
-
-def _check_order(table: _Table, t_ns: Int) -> None:
-    backwards = np.flatnonzero(np.diff(t_ns) <= 0)
-    if backwards.size:
-        row = int(backwards[0]) + 1
-        kind = "repeats" if t_ns[row] == t_ns[row - 1] else "is before"
-        stamp = table.rows[row][0]
-        raise table.error(row, f"the stamp {stamp} {kind} that of line {table.lines[row - 1]}; sort or drop such lines")
-
-
-def _values(table: _Table) -> Float:
-    """(N, columns) as floats; the poses, which are the first eight but the stamp, all finite."""
-    rows: Sequence[Sequence[str]] = table.rows
+def _pose(fields: Sequence[str], is_euroc: bool) -> tuple[int, list[float]]:
+    """Stamp, ns, and the numbers behind it; raises :class:`ValueError` where the first seven are no pose."""
+    stamp = fields[0]
     try:
-        values = np.array(rows, dtype=np.float64)
-    except ValueError:
-        values = np.array([[_float_or_nan(field) for field in fields] for fields in rows])
-    finite = np.isfinite(values[:, :8]).all(axis=1)
-    if not finite.all():
-        row = int(np.argmin(finite))
-        raise table.error(row, f"the pose is not finite: {' '.join(rows[row][1:8])}")
-    return values
+        t_ns = Decimal(stamp) * (1 if is_euroc else NS_PER_S)
+    except InvalidOperation:
+        raise ValueError(f"the stamp {stamp!r} is not a number") from None
+    if not t_ns.is_finite() or abs(t_ns) > _INT64_MAX:
+        hint = " ns" if is_euroc else " seconds; are the stamps nanoseconds? separate EuRoC columns by commas"
+        raise ValueError(f"the stamp {stamp} is not a time in{hint}")
+    if is_euroc and t_ns != t_ns.to_integral_value():
+        raise ValueError(f"the stamp {stamp} is not integer nanoseconds; TUM files are separated by blanks")
+    values = [_float_or_nan(field) for field in fields[1:]]
+    if not all(map(isfinite, values[:7])):
+        raise ValueError(f"the pose is not finite: {' '.join(fields[1:8])}")
+    if abs(hypot(*values[3:7]) - 1.0) > _QUAT_NORM_TOLERANCE:
+        raise ValueError("the quaternion is not of unit norm; are the columns in order?")
+    return int(t_ns.to_integral_value()), values
 
 
 def _float_or_nan(field: str) -> float:
