@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from vioframe.arrays import Bool
 from vioframe.estimation.inertial.preintegration import Preintegrated
 from vioframe.geometry import so3
 from vioframe.types import DBA, DBG, DP, DTHETA, DV, Float, Int, NavState, g_W
@@ -25,38 +26,44 @@ class StateArrays:
     bias_gyro_B: Float
     bias_accel_B: Float
 
+    @property
+    def parts(self) -> tuple[Float, Float, Float, Float, Float]:
+        return self.R_WB, self.p_WB, self.v_WB, self.bias_gyro_B, self.bias_accel_B
+
     @staticmethod
     def stack(states: Sequence[NavState]) -> StateArrays:
-        return StateArrays(
-            np.stack([s.R_WB for s in states]),
-            np.stack([s.p_WB for s in states]),
-            np.stack([s.v_WB for s in states]),
-            np.stack([s.bias_gyro_B for s in states]),
-            np.stack([s.bias_accel_B for s in states]),
-        )
+        return StateArrays(*(np.stack([getattr(s, name) for s in states]) for name in StateArrays.__slots__))
+
+    def unstack(self, t_ns: Int) -> list[NavState]:
+        """One by one again, with their stamps (K,)."""
+        return [NavState(int(t), *state) for t, *state in zip(t_ns, *self.parts, strict=True)]
 
     def __len__(self) -> int:
         return len(self.R_WB)
 
     def __getitem__(self, part: slice) -> StateArrays:
-        return StateArrays(
-            self.R_WB[part], self.p_WB[part], self.v_WB[part], self.bias_gyro_B[part], self.bias_accel_B[part]
-        )
+        return StateArrays(*(values[part] for values in self.parts))
 
     def append(self, other: StateArrays) -> StateArrays:
         """These, then the ``other`` ones."""
-        return StateArrays(
-            np.concatenate([self.R_WB, other.R_WB]),
-            np.concatenate([self.p_WB, other.p_WB]),
-            np.concatenate([self.v_WB, other.v_WB]),
-            np.concatenate([self.bias_gyro_B, other.bias_gyro_B]),
-            np.concatenate([self.bias_accel_B, other.bias_accel_B]),
-        )
+        return StateArrays(*map(np.concatenate, zip(self.parts, other.parts, strict=True)))
 
-    def unstack(self, t_ns: Int) -> list[NavState]:
-        """One by one again, with their stamps (K,)."""
-        parts = (self.R_WB, self.p_WB, self.v_WB, self.bias_gyro_B, self.bias_accel_B)
-        return [NavState(int(t), *state) for t, *state in zip(t_ns, *parts, strict=True)]
+    def with_those_of(self, other: StateArrays, where: Bool) -> StateArrays:
+        """These, with the ``other`` ones in their place ``where`` (K,)."""
+        rows = np.flatnonzero(where)
+        out = StateArrays(*(values.copy() for values in self.parts))
+        for values, others in zip(out.parts, other.parts, strict=True):
+            values[rows] = others[rows]
+        return out
+
+    def turned(self, R: Float) -> StateArrays:
+        """The same in a world turned by ``R`` (3, 3)."""
+        return StateArrays(R @ self.R_WB, self.p_WB @ R.T, self.v_WB @ R.T, self.bias_gyro_B, self.bias_accel_B)
+
+    def difference(self, other: StateArrays) -> Float:
+        """(K, 15) by which :meth:`retract` moves the ``other`` ones here."""
+        rotation = so3.log(np.swapaxes(other.R_WB, -1, -2) @ self.R_WB)
+        return np.hstack([rotation, *(a - b for a, b in zip(self.parts[1:], other.parts[1:], strict=True))])
 
     def retract(self, step: Float) -> StateArrays:
         """Moved by ``step`` (K, 15): rotations by right perturbation, the rest additively."""
@@ -87,21 +94,18 @@ class ImuFactors:
 
     @staticmethod
     def stack(measurements: Sequence[Preintegrated]) -> ImuFactors:
-        if not measurements:
-            none = np.empty((0, 3))
-            return ImuFactors(
-                np.empty(0), np.empty((0, 3, 3)), none, none, none, none, np.empty((0, 9, 6)), np.empty((0, 15, 15))
-            )
-        cov = np.stack([m.cov for m in measurements])
+        def stacked(name: str, *shape: int) -> Float:
+            return np.array([getattr(m, name) for m in measurements]).reshape(-1, *shape)
+
         return ImuFactors(
-            np.array([m.dt_s for m in measurements]),
-            np.stack([m.dR for m in measurements]),
-            np.stack([m.dp for m in measurements]),
-            np.stack([m.dv for m in measurements]),
-            np.stack([m.bias_gyro_B for m in measurements]),
-            np.stack([m.bias_accel_B for m in measurements]),
-            np.stack([m.bias_jacobian for m in measurements]),
-            np.linalg.inv(np.linalg.cholesky(cov)),
+            stacked("dt_s"),
+            stacked("dR", 3, 3),
+            stacked("dp", 3),
+            stacked("dv", 3),
+            stacked("bias_gyro_B", 3),
+            stacked("bias_accel_B", 3),
+            stacked("bias_jacobian", 9, 6),
+            np.linalg.inv(np.linalg.cholesky(stacked("cov", 15, 15))),
         )
 
     def residuals(self, i: StateArrays, j: StateArrays) -> Float:

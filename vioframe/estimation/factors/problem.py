@@ -90,12 +90,7 @@ class Prior:
 
     def difference(self, x: Variables) -> Float:
         """``x`` beyond the first estimates, (n,); zero for states that the prior does not know."""
-        d = np.zeros((len(x.states), STATE_SIZE))
-        d[:, :3] = so3.log(np.swapaxes(self.states.R_WB, -1, -2) @ x.states.R_WB)
-        d[:, 3:6] = x.states.p_WB - self.states.p_WB
-        d[:, 6:9] = x.states.v_WB - self.states.v_WB
-        d[:, 9:12] = x.states.bias_gyro_B - self.states.bias_gyro_B
-        d[:, 12:15] = x.states.bias_accel_B - self.states.bias_accel_B
+        d = x.states.difference(self.states)
         d[~self.frozen] = 0.0
         rotation = so3.log(self.camera.R_BC.T @ x.camera.R_BC)
         offset = x.camera.offset_s - self.camera.offset_s
@@ -103,14 +98,7 @@ class Prior:
 
     def first(self, states: StateArrays) -> StateArrays:
         """``states``, with the first estimates of those that are frozen in their place."""
-        frozen = self.frozen[:, None]
-        return StateArrays(
-            np.where(frozen[..., None], self.states.R_WB, states.R_WB),
-            np.where(frozen, self.states.p_WB, states.p_WB),
-            np.where(frozen, self.states.v_WB, states.v_WB),
-            np.where(frozen, self.states.bias_gyro_B, states.bias_gyro_B),
-            np.where(frozen, self.states.bias_accel_B, states.bias_accel_B),
-        )
+        return states.with_those_of(self.states, self.frozen)
 
 
 @dataclass(frozen=True, slots=True)

@@ -73,11 +73,11 @@ class Sightings(NamedTuple):
 
     def cost(self, poses: Poses, camera: Calibrated, landmarks: Float) -> float:
         """Half the robust sum of squares."""
-        return _cost(poses, camera, self, landmarks)
+        return _evaluate(poses, camera, self, landmarks)[0]
 
     def errors(self, poses: Poses, camera: Calibrated, landmarks: Float) -> Float:
         """(L,) root mean square residual of each landmark, standard deviations; infinite behind a camera."""
-        return _errors(poses, camera, self, landmarks)
+        return _evaluate(poses, camera, self, landmarks)[1]
 
     def linearise(self, poses: Poses, first: Poses, camera: Calibrated, landmarks: Float) -> Linearised:
         """H (n, n), b (n,) of poses and calibration, and V (L, 3, 3), W (L, 3, n), c (L, 3) of the landmarks.
@@ -225,34 +225,13 @@ def _times(A: Float, M: Float, out: Float) -> None:
 
 
 @kernel
-def _cost(poses: Poses, camera: Calibrated, s: Sightings, landmarks: Float) -> float:
+def _evaluate(poses: Poses, camera: Calibrated, s: Sightings, landmarks: Float) -> tuple[float, Float]:
+    """Half the robust sum of squares, and each landmark's root mean square residual."""
     R_BC, p_BC, offset_s = camera
     seen, xy, velocity, to_px, sigma, cauchy, on_sphere = s
     q, b, X, r, T = np.empty(3), np.empty(3), np.empty(3), np.empty(2), np.empty((2, 3))
     count, frames = seen.shape
-    total = 0.0
-    for i in range(count):
-        host = -1
-        _in_body(R_BC, p_BC, landmarks[i], q)
-        for f in range(frames):
-            if not seen[i, f]:
-                continue
-            host = f if host < 0 else host
-            x, y = xy[i, f, 0] - offset_s * velocity[i, f, 0], xy[i, f, 1] - offset_s * velocity[i, f, 1]
-            _in_camera(poses.R_fh[f, host], poses.t_fh[f, host], R_BC, p_BC, landmarks[i, 2], q, b, X)
-            _residual(X, x, y, to_px[i, f], on_sphere, T, r)
-            squared = (r[0] * r[0] + r[1] * r[1]) / (sigma * sigma * cauchy * cauchy)
-            total += 0.5 * cauchy * cauchy * math.log(1.0 + squared)
-    return total
-
-
-@kernel
-def _errors(poses: Poses, camera: Calibrated, s: Sightings, landmarks: Float) -> Float:
-    R_BC, p_BC, offset_s = camera
-    seen, xy, velocity, to_px, sigma, _, on_sphere = s
-    q, b, X, r, T = np.empty(3), np.empty(3), np.empty(3), np.empty(2), np.empty((2, 3))
-    count, frames = seen.shape
-    out = np.empty(count)
+    cost, errors = 0.0, np.empty(count)
     for i in range(count):
         host, views, total = -1, 0, 0.0
         _in_body(R_BC, p_BC, landmarks[i], q)
@@ -263,12 +242,14 @@ def _errors(poses: Poses, camera: Calibrated, s: Sightings, landmarks: Float) ->
             x, y = xy[i, f, 0] - offset_s * velocity[i, f, 0], xy[i, f, 1] - offset_s * velocity[i, f, 1]
             _in_camera(poses.R_fh[f, host], poses.t_fh[f, host], R_BC, p_BC, landmarks[i, 2], q, b, X)
             _residual(X, x, y, to_px[i, f], on_sphere, T, r)
-            total += (r[0] * r[0] + r[1] * r[1]) / (sigma * sigma)
+            squared = r[0] * r[0] + r[1] * r[1]
+            cost += 0.5 * cauchy * cauchy * math.log(1.0 + squared / (sigma * sigma * cauchy * cauchy))
+            total += squared / (sigma * sigma)
             if X[2] <= _LEAST_DEPTH_RATIO:
                 total = np.inf
             views += 1
-        out[i] = math.sqrt(0.5 * total / max(views, 1))
-    return out
+        errors[i] = math.sqrt(0.5 * total / max(views, 1))
+    return cost, errors
 
 
 @kernel

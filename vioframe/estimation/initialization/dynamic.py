@@ -140,13 +140,8 @@ def _start_of_adjustment(
     """States in a world with z up, and landmarks [x y rho] in the first frame that sees them."""
     R_WB0 = level_rotation(-alignment.g_B0)
     count = len(window.t_ns)
-    states = StateArrays(
-        R_WB0 @ alignment.R_B0B,
-        alignment.p_B0B @ R_WB0.T,
-        alignment.v_B0B @ R_WB0.T,
-        np.tile(bias_gyro_B, (count, 1)),
-        np.tile(alignment.bias_accel_B, (count, 1)),
-    )
+    biases = np.tile(bias_gyro_B, (count, 1)), np.tile(alignment.bias_accel_B, (count, 1))
+    states = StateArrays(alignment.R_B0B, alignment.p_B0B, alignment.v_B0B, *biases).turned(R_WB0)
     track = np.arange(len(window.ids))
     host = window.seen.argmax(axis=0)
     inverse_depth = 1.0 / (alignment.scale * structure.depth[host, track])
@@ -194,13 +189,7 @@ def _estimate(window: Window, adjusted: StateArrays, cov: Float, p_WF: Float) ->
     R_new = level_rotation(R_0[2]) @ R_0.T  # R_0[2] is the vertical in the body
     turn = np.eye(15)
     turn[DP, DP] = turn[DV, DV] = R_new
-    states = StateArrays(
-        R_new @ adjusted.R_WB,
-        (adjusted.p_WB - p_0) @ R_new.T,
-        adjusted.v_WB @ R_new.T,
-        adjusted.bias_gyro_B,
-        adjusted.bias_accel_B,
-    ).unstack(window.t_ns)
+    states = replace(adjusted, p_WB=adjusted.p_WB - p_0).turned(R_new).unstack(window.t_ns)
     newest = turn @ cov[-15:, -15:] @ turn.T
     states[-1] = replace(states[-1], cov=0.5 * (newest + newest.T))
     return InitialEstimate("dynamic", tuple(states), window.ids, (p_WF - p_0) @ R_new.T)
