@@ -8,7 +8,7 @@ perpendicular to the translation, whichever it is (Kneip, Lynen, "Direct Optimiz
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,6 +17,10 @@ from vioframe.arrays import Bool
 from vioframe.estimation.inertial.preintegration import Preintegrated
 from vioframe.geometry import so3
 from vioframe.types import Float, Int
+
+CONVERGED = 1e-5
+"""Steps of a refinement below this end a stage, rad and rad/s."""
+_UNOBSERVED = 1e-6  # information, 1/rad^2, far below what any pair of frames brings
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,6 +79,73 @@ class BearingPairs:
         H, b = weighted @ J, (weighted[:, :3] @ r[..., None])[..., 0]
         eliminated = H[:, :3, 3:] @ np.linalg.solve(H[:, 3:, 3:] + np.eye(2), H[:, 3:, :3])
         return RotationEquations(H[:, :3, :3] - eliminated, b, robust / scale**2, np.abs(r))
+
+
+@dataclass(frozen=True, slots=True)
+class Pairs:
+    """P pairs of frames, ``first`` and ``second`` (P,), and their tracks."""
+
+    first: Int
+    second: Int
+    bearings: BearingPairs
+
+
+@dataclass(frozen=True, slots=True)
+class Refined:
+    """The gyroscope's bias (3,) rad/s and ``R_BC`` (3, 3), and how the last iteration left them.
+
+    ``H`` is the information about [bias R_BC], or the bias alone; ``distance`` (P, N) that of each track of the last
+    stage's pairs from its epipolar line, standard deviations; ``last_step`` the length of the last step.
+    """
+
+    bias_gyro_B: Float
+    R_BC: Float
+    H: Float
+    distance: Float
+    last_step: float
+
+
+def refine(
+    stages: Iterable[tuple[Pairs, int, float]],
+    imu: Sequence[Preintegrated],
+    bias: Float,
+    R_BC: Float,
+    sigma: float,
+    bias_sigma: float,
+    *,
+    turn_camera: bool = False,
+) -> Refined:
+    """Turn all pairs together by the gyroscope's bias, and by R_BC where ``turn_camera``, until the tracks fit.
+
+    Each stage is its pairs, its iterations at most and Cauchy's scale (standard deviations). ``imu`` holds the
+    measurements between consecutive frames; ``sigma`` is the noise of an observation on the z = 1 plane, ``bias_sigma``
+    the bias's prior about zero, rad/s.
+    """
+    for pairs, iterations, cauchy in stages:
+        weight = pairs.bearings.common.astype(np.float64)
+        for _ in range(iterations):
+            R_B1B2, by_bias = relative_rotations(imu, bias, pairs.first, pairs.second)
+            R_C1C2 = R_BC.T @ R_B1B2 @ R_BC
+            equations = pairs.bearings.linearise(R_C1C2, weight, sigma, cauchy)
+            # R_CB R_B1B2 Exp(dtheta_B) R_BC = R_C1C2 Exp(R_CB dtheta_B), and turning R_BC on the right by d turns
+            # R_C1C2 into Exp(-d) R_C1C2 Exp(d) = R_C1C2 Exp((I - R_C2C1) d).
+            A = R_BC.T @ by_bias
+            if turn_camera:
+                A = np.concatenate([A, np.eye(3) - np.swapaxes(R_C1C2, -1, -2)], axis=2)
+            transposed = np.swapaxes(A, -1, -2)
+            H = (transposed @ equations.H @ A).sum(axis=0)
+            b = (transposed @ equations.b[..., None]).sum(axis=0)[:, 0]
+            H[:3, :3] += np.eye(3) / bias_sigma**2
+            b[:3] += bias / bias_sigma**2
+            if turn_camera:
+                H[3:, 3:] += np.eye(3) * _UNOBSERVED
+            step = np.linalg.solve(H, -b)
+            bias, weight = bias + step[:3], equations.weight
+            if turn_camera:
+                R_BC = R_BC @ so3.exp(step[3:])
+            if np.linalg.norm(step) < CONVERGED:
+                break
+    return Refined(bias, R_BC, H, equations.distance, float(np.linalg.norm(step)))
 
 
 def relative_rotations(imu: Sequence[Preintegrated], bias: Float, first: Int, second: Int) -> tuple[Float, Float]:

@@ -17,9 +17,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vioframe.arrays import Float, Int
+from vioframe.arrays import Float
 from vioframe.estimation.inertial.preintegration import Preintegrated, join_segments, preintegrate
-from vioframe.estimation.initialization.epipolar_pairs import BearingPairs, relative_rotations
+from vioframe.estimation.initialization.epipolar_pairs import CONVERGED, BearingPairs, Pairs, refine, relative_rotations
 from vioframe.estimation.initialization.window import BIAS_GYRO_SIGMA, LARGEST_IMU_GAP_S, PIXEL_SIGMA, RefusalError
 from vioframe.geometry import so3
 from vioframe.types import Calibration, FrameTracks, ImuSegment
@@ -41,11 +41,9 @@ _STEPS, _COARSE_STEP = (1, 2, 4, 8), 2
 # Iterations and Cauchy's scale (standard deviations) of each stage for a pair on its own ...
 _PAIR_STAGES = ((6, 20.0), (6, 5.0), (6, 2.0))
 _PAIR_PRIOR, _LARGEST_PAIR_STEP = 0.5, 0.2  # rad
-# ... and for all: iterations, the longest step used, Cauchy's scale.
-_STAGES = ((6, 2, 50.0), (6, 4, 20.0), (8, 8, 5.0), (15, 8, 2.0))
-_CONVERGED = 1e-5  # rad and rad/s
+# ... and for all: iterations, how many of the steps are used, Cauchy's scale.
+_STAGES = ((6, 2, 50.0), (6, 3, 20.0), (8, 4, 5.0), (15, 4, 2.0))
 _ALIGNMENT_ITERATIONS, _ALIGNMENT_SIGMA = 10, np.deg2rad(1.0)
-_UNOBSERVED = 1e-6  # information, 1/rad^2, far below what any pair of frames brings
 # The median of |x| for x ~ N(0, 1).
 _MEDIAN = 0.6745
 
@@ -125,32 +123,14 @@ class RotationCalibrator:
         return True
 
     def _attempt(self) -> CameraRotation:
-        chain = Chain(tuple(self._tracks), tuple(self._imu))
+        chain = Chain(list(self._tracks), list(self._imu))
         turned = second_turn(chain)
         if not turned >= _LEAST_SECOND_TURN:
             raise RefusalError(
                 f"turned by {turned:.2f} rad about a second axis, {_LEAST_SECOND_TURN:.2f} are needed; "
                 "turn the vehicle about two axes"
             )
-        return self._judge(_solve(chain, PIXEL_SIGMA / self._focal_px, BIAS_GYRO_SIGMA))
-
-    def _judge(self, solution: _Solution) -> CameraRotation:
-        """Refuse what the tracks contradict; the scatter they show stands in for the noise that was assumed."""
-        if not solution.misfit <= _MAX_MISFIT:
-            raise RefusalError(f"the tracks disagree with the gyroscope by {solution.misfit:.1f} times their noise")
-        bias = float(np.linalg.norm(solution.bias_gyro_B))
-        if not bias <= 3.0 * BIAS_GYRO_SIGMA:
-            raise RefusalError(f"gyroscope bias of {bias:.2f} rad/s is not plausible")
-        scatter = max(solution.misfit, _LEAST_MISFIT) ** 2 * np.linalg.inv(solution.information)
-        found = CameraRotation(solution.R_BC, scatter + np.eye(3) * np.deg2rad(_SYSTEMATIC_DEG) ** 2)
-        if not found.sigma_deg <= _LARGEST_SIGMA_DEG:
-            raise RefusalError(
-                f"the camera's rotation is known to {found.sigma_deg:.2f} deg only (standard deviation); "
-                "turn the vehicle about two axes"
-            )
-        if not solution.settled:
-            raise RefusalError("the refinement of the camera's rotation did not settle")
-        return found
+        return _solve(chain, PIXEL_SIGMA / self._focal_px)
 
 
 @dataclass(frozen=True, slots=True)
@@ -178,36 +158,6 @@ class Chain:
         return Pairs(np.array(first, np.int64), np.array(second, np.int64), BearingPairs.of(xy[0], xy[1], common))
 
 
-@dataclass(frozen=True, slots=True)
-class Pairs:
-    """P pairs of keyframes, ``first`` and ``second`` (P,), and their tracks."""
-
-    first: Int
-    second: Int
-    bearings: BearingPairs
-
-    def up_to(self, step: int) -> Pairs:
-        """Those at most ``step`` keyframes apart."""
-        near = self.second - self.first <= step
-        b = self.bearings
-        return Pairs(self.first[near], self.second[near], BearingPairs(b.f[near], b.g[near], b.common[near]))
-
-
-@dataclass(frozen=True, slots=True)
-class _Solution:
-    """``R_BC`` (3, 3) and ``bias_gyro_B`` (3,) rad/s; ``information`` (3, 3) about R_BC's right perturbation, 1/rad^2.
-
-    ``misfit`` is the typical distance of a track from its epipolar lines over the noise that was assumed. The iteration
-    may not have ``settled``.
-    """
-
-    R_BC: Float
-    bias_gyro_B: Float
-    information: Float
-    misfit: float
-    settled: bool
-
-
 def second_turn(chain: Chain) -> float:
     """How much the body turned about other axes than its main one, rad: without that R_BC cannot be known.
 
@@ -219,43 +169,39 @@ def second_turn(chain: Chain) -> float:
     return float(np.linalg.norm(np.linalg.svd(turns - turns.mean(axis=0), compute_uv=False)[1:]))
 
 
-def _solve(chain: Chain, sigma: float, bias_sigma: float) -> _Solution:
-    """From tracks with noise ``sigma`` on the z = 1 plane; ``bias_sigma`` is the bias's prior about zero, rad/s.
+def _solve(chain: Chain, sigma: float) -> CameraRotation:
+    """From tracks with noise ``sigma`` on the z = 1 plane; the scatter they show stands in for the noise assumed.
 
-    Raises :class:`RefusalError` where there are too few tracks.
+    Raises :class:`RefusalError` where there are too few tracks, or they contradict what comes out.
     """
-    pairs = chain.pairs(_STEPS)
-    if len(pairs.first) < len(chain.tracks):
+    stages = [(chain.pairs(_STEPS[:count]), iterations, cauchy) for iterations, count, cauchy in _STAGES]
+    if len(stages[-1][0].first) < len(chain.tracks):
         raise RefusalError("too few tracks from one keyframe to the next")
-    R_BC, bias = _align_axes(chain, sigma, bias_sigma)
-    for iterations, longest, cauchy in _STAGES:
-        used = pairs.up_to(longest)
-        weight = used.bearings.common.astype(np.float64)
-        for _ in range(iterations):
-            R_B1B2, by_bias = relative_rotations(chain.imu, bias, used.first, used.second)
-            R_C1C2 = R_BC.T @ R_B1B2 @ R_BC
-            equations = used.bearings.linearise(R_C1C2, weight, sigma, cauchy)
-            # R_CB R_B1B2 Exp(dtheta_B) R_BC = R_C1C2 Exp(R_CB dtheta_B), and turning R_BC on the right by d turns
-            # R_C1C2 into Exp(-d) R_C1C2 Exp(d) = R_C1C2 Exp((I - R_C2C1) d).
-            A = np.concatenate([R_BC.T @ by_bias, np.eye(3) - np.swapaxes(R_C1C2, -1, -2)], axis=2)
-            transposed = np.swapaxes(A, -1, -2)
-            H = (transposed @ equations.H @ A).sum(axis=0)
-            b = (transposed @ equations.b[..., None]).sum(axis=0)[:, 0]
-            H[:3, :3] += np.eye(3) / bias_sigma**2
-            H[3:, 3:] += np.eye(3) * _UNOBSERVED
-            b[:3] += bias / bias_sigma**2
-            step = np.linalg.solve(H, -b)
-            bias, R_BC, weight = bias + step[:3], R_BC @ so3.exp(step[3:]), equations.weight
-            if np.linalg.norm(step) < _CONVERGED:
-                break
-    settled = bool(np.linalg.norm(step) < 100.0 * _CONVERGED)
+    R_BC, bias = _align_axes(chain, sigma)
+    found = refine(stages, chain.imu, bias, R_BC, sigma, BIAS_GYRO_SIGMA, turn_camera=True)
+    common = stages[-1][0].bearings.common
+    # The typical distance of a track from its epipolar lines over the noise that was assumed.
+    misfit = float(np.median(found.distance[common])) / _MEDIAN
+    if not misfit <= _MAX_MISFIT:
+        raise RefusalError(f"the tracks disagree with the gyroscope by {misfit:.1f} times their noise")
+    if not np.linalg.norm(found.bias_gyro_B) <= 3.0 * BIAS_GYRO_SIGMA:
+        raise RefusalError(f"gyroscope bias of {np.linalg.norm(found.bias_gyro_B):.2f} rad/s is not plausible")
+    H = found.H
     information = H[3:, 3:] - H[3:, :3] @ np.linalg.solve(H[:3, :3], H[:3, 3:])
-    common = used.bearings.common
-    misfit = float(np.median(equations.distance[common])) / _MEDIAN
-    return _Solution(R_BC, bias, information * _independent_share(chain, int(common.sum())), misfit, settled)
+    information = information * _independent_share(chain, int(common.sum()))
+    scatter = max(misfit, _LEAST_MISFIT) ** 2 * np.linalg.inv(information)
+    rotation = CameraRotation(found.R_BC, scatter + np.eye(3) * np.deg2rad(_SYSTEMATIC_DEG) ** 2)
+    if not rotation.sigma_deg <= _LARGEST_SIGMA_DEG:
+        raise RefusalError(
+            f"the camera's rotation is known to {rotation.sigma_deg:.2f} deg only (standard deviation); "
+            "turn the vehicle about two axes"
+        )
+    if not found.last_step < 100.0 * CONVERGED:
+        raise RefusalError("the refinement of the camera's rotation did not settle")
+    return rotation
 
 
-def _align_axes(chain: Chain, sigma: float, bias_sigma: float) -> tuple[Float, Float]:
+def _align_axes(chain: Chain, sigma: float) -> tuple[Float, Float]:
     """R_BC (3, 3) and the bias (3,) from the turns of pairs: argmin sum w |beta - R_BC gamma - bias dt|^2.
 
     ``beta`` and ``gamma`` (P, 3) are the rotation vectors of body and camera. The bias is eliminated, which leaves an
@@ -269,7 +215,7 @@ def _align_axes(chain: Chain, sigma: float, bias_sigma: float) -> tuple[Float, F
     for _ in range(_ALIGNMENT_ITERATIONS):
         scale = max(_ALIGNMENT_SIGMA, 1.5 * float(np.median(off)))
         weight = 1.0 / (1.0 + (off / scale) ** 2)
-        total = (weight * dt**2).sum() + (_ALIGNMENT_SIGMA / bias_sigma) ** 2
+        total = (weight * dt**2).sum() + (_ALIGNMENT_SIGMA / BIAS_GYRO_SIGMA) ** 2
         beta_dt, gamma_dt = (weight * dt) @ beta, (weight * dt) @ gamma
         R_BC = so3.project((beta * weight[:, None]).T @ gamma - np.outer(beta_dt, gamma_dt) / total)
         bias = (beta_dt - R_BC @ gamma_dt) / total
