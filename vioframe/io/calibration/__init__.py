@@ -6,8 +6,15 @@ from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 from vioframe.errors import CalibrationError
-from vioframe.io.calibration.fields import Fields, read_yaml
-from vioframe.io.calibration.formats import CameraPart, ImuPart, is_calibration, parts_of, write_calibration
+from vioframe.io.calibration.formats import (
+    CameraPart,
+    Document,
+    ImuPart,
+    is_calibration,
+    parts_of,
+    read_yaml,
+    write_calibration,
+)
 from vioframe.types import Calibration
 
 __all__ = [
@@ -86,8 +93,8 @@ def _read(paths: Iterable[str | Path], where: str) -> tuple[list[CameraPart], Im
     """All cameras, in the order of their names, and the IMU."""
     cameras: list[CameraPart] = []
     imus: list[ImuPart] = []
-    for fields, path in _documents(map(Path, paths)):
-        found_cameras, found_imus = parts_of(fields, path)
+    for document, path in _documents(map(Path, paths)):
+        found_cameras, found_imus = parts_of(document, path)
         cameras += found_cameras
         imus += found_imus
     if not cameras:
@@ -99,23 +106,25 @@ def _read(paths: Iterable[str | Path], where: str) -> tuple[list[CameraPart], Im
     return sorted(cameras, key=lambda part: part.name), imus[0]
 
 
-def _documents(paths: Iterable[Path]) -> Iterator[tuple[Fields, Path]]:
+def _documents(paths: Iterable[Path]) -> Iterator[tuple[Document, Path]]:
     """The YAML files behind ``paths``; in a folder those that are no calibration are passed over."""
     for path in paths:
         if path.is_dir():
             for file in _files_in(path):
-                if is_calibration(fields := read_yaml(file)):
-                    yield fields, file
+                if is_calibration(document := read_yaml(file)):
+                    yield document, file
+            continue
+        document = read_yaml(path)
+        if "relative_config_imucam" in document:
+            for key in ("relative_config_imucam", "relative_config_imu"):
+                if key not in document:
+                    raise CalibrationError(f"{path}: {key!r} is missing")
+                file = path.parent / str(document[key])
+                yield read_yaml(file), file
+        elif is_calibration(document):
+            yield document, path
         else:
-            fields = read_yaml(path)
-            if "relative_config_imucam" in fields:
-                for key in ("relative_config_imucam", "relative_config_imu"):
-                    file = path.parent / fields.text(key)
-                    yield read_yaml(file), file
-            elif is_calibration(fields):
-                yield fields, path
-            else:
-                raise fields.fail("not a calibration of a known format (EuRoC, Kalibr, OpenVINS, VINS-Mono)")
+            raise CalibrationError(f"{path}: not a calibration of a known format (EuRoC, Kalibr, OpenVINS, VINS-Mono)")
 
 
 def _files_in(folder: Path) -> list[Path]:

@@ -19,32 +19,32 @@ from __future__ import annotations
 
 import logging
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass
 from math import sqrt
 from pathlib import Path
+from typing import Annotated, Any, Literal, TypeVar
 
 import numpy as np
+from pydantic import AliasChoices, BaseModel, Field, FiniteFloat, PlainValidator, PositiveFloat, PositiveInt
+from pydantic import ValidationError as InvalidError
 
+from vioframe.errors import CalibrationError
 from vioframe.geometry import so3
-from vioframe.geometry.cameras import Camera, DistortionModel
-from vioframe.io.calibration.fields import Fields
+from vioframe.geometry.cameras import Camera
 from vioframe.types import NS_PER_S, Calibration, CameraOnBody, Float, ImuNoise
 
 _log = logging.getLogger("vioframe.io.calibration")
 
-_DISTORTION: dict[str, DistortionModel] = {
-    "radtan": "radtan",
-    "radial-tangential": "radtan",
-    "plumb_bob": "radtan",
-    "none": "radtan",
-    "equidistant": "equidistant",
-    "equi": "equidistant",
-}
+ModelT = TypeVar("ModelT", bound=BaseModel)
+Document = Mapping[str, Any]
+"""A YAML file's top level, or a section of it."""
+
+# OpenCV's dialect: a "%YAML:1.0" directive and "!!opencv-matrix" tags, neither of which is YAML.
+_OPENCV_DIALECT = re.compile(r"^%YAML.*$|!!opencv-[\w-]+", re.MULTILINE)
 # Projection moves the last bits of any rotation: one that is exact but for these is kept, so as to read back equal.
 _ROUNDING = 1e-14
 _CHAIN_CAMERA = re.compile(r"cam\d+")
-# OpenVINS' IMU intrinsics: scale and misalignment matrices, identity where they were not calibrated.
-_IMU_INTRINSICS = ("Tw", "Ta", "R_IMUtoGYRO", "R_IMUtoACC")
 # VINS-Mono's file does not state the rate its noise parameters belong to; this is the one they were tuned for.
 _VINS_MONO_RATE_HZ = 200.0
 
@@ -78,23 +78,52 @@ class ImuPart:
     T_BI: Float
 
 
-def is_calibration(fields: Fields) -> bool:
+def read_yaml(path: Path) -> Document:
+    """The top level of a YAML file, OpenCV's dialect included."""
+    from ruamel.yaml import YAML
+    from ruamel.yaml.error import YAMLError
+
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except (OSError, UnicodeDecodeError) as err:
+        reason = err.strerror if isinstance(err, OSError) else "not a text file"
+        raise CalibrationError(f"cannot read the calibration {path}: {reason}") from None
+    try:
+        values = YAML(typ="safe", pure=True).load(_OPENCV_DIALECT.sub("", text))
+    except YAMLError as err:
+        raise CalibrationError(f"{path} is not valid YAML: {' '.join(str(err).split())}") from None
+    if not isinstance(values, Mapping):
+        raise CalibrationError(f"{path} holds no calibration: expected 'key: value' lines")
+    return {str(key): value for key, value in values.items()}
+
+
+def is_calibration(document: Document) -> bool:
     """Whether a file is of one of the formats."""
-    is_sensor = "sensor_type" in fields and fields.text("sensor_type") in ("camera", "imu")
     known = ("gyroscope_noise_density", "imu0", "projection_parameters")
-    return is_sensor or any(key in fields for key in known) or bool(_chain_cameras(fields))
+    is_sensor = document.get("sensor_type") in ("camera", "imu")
+    return is_sensor or any(key in document for key in known) or bool(_chain_cameras(document))
 
 
-def parts_of(fields: Fields, path: Path) -> tuple[list[CameraPart], list[ImuPart]]:
+def parts_of(document: Document, path: Path) -> tuple[list[CameraPart], list[ImuPart]]:
     """What one file describes. An EuRoC camera is named by its folder, or by its file where that is not sensor.yaml."""
-    if "sensor_type" in fields:
-        if fields.text("sensor_type") == "imu":
-            return [], [ImuPart(_imu_noise(fields, "rate_hz"), _rigid_transform(fields, "T_BS"))]
-        return [_euroc_camera(fields, path.absolute().parent.name if path.stem == "sensor" else path.stem)], []
-    if "projection_parameters" in fields:
-        return [_vins_mono_camera(fields)], [_vins_mono_imu(fields)]
-    cameras = [_kalibr_camera(fields.section(key), key) for key in _chain_cameras(fields)]
-    return cameras, [] if cameras else [_kalibr_imu(fields)]
+    where = str(path)
+    if "sensor_type" in document:
+        if document["sensor_type"] == "imu":
+            return [], [_imu(document, where, placed=True)]
+        return [_camera(document, where, path.absolute().parent.name if path.stem == "sensor" else path.stem)], []
+    if "projection_parameters" in document:
+        camera, imu = _vins_mono(document, where)
+        return [camera], [imu]
+    if cameras := _chain_cameras(document):
+        return [_camera(document[key], f"{where} [{key}]", key) for key in cameras], []
+    # The noise lies at the top level (Kalibr's input) or under imu0 (its result).
+    nested = "imu0" in document
+    return [], [_imu(document["imu0"], f"{where} [imu0]") if nested else _imu(document, where)]
+
+
+def _chain_cameras(document: Document) -> list[str]:
+    """``cam0``, ``cam1`` ...: the cameras of Kalibr's chain; empty where the file is none."""
+    return [key for key in document if _CHAIN_CAMERA.fullmatch(key)]
 
 
 def inverse(T_AB: Float) -> Float:
@@ -152,153 +181,187 @@ def _write(path: Path, *lines: str) -> None:
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
-def _euroc_camera(fields: Fields, name: str) -> CameraPart:
-    known = _is_rotation_known(fields)
-    if known:
-        T_BC = _rigid_transform(fields, "T_BS")
-    else:
-        T_BC = _translation(fields.matrix("T_BS", 4, 4)[:3, 3] if "T_BS" in fields else np.zeros(3))
-    model = _pinhole(fields, "distortion_coefficients")
-    return CameraPart(name, model, T_BC, _nanoseconds(fields, "timeshift_cam_imu"), known)
+def _numbers(*counts: int) -> PlainValidator:
+    """(N,) numbers with N one of ``counts``, from a list, a list of rows, or OpenCV's and EuRoC's rows, cols, data."""
+    expected = " or ".join(map(str, counts))
+
+    def read(value: Any) -> Float:
+        try:
+            array = np.asarray(value["data"] if isinstance(value, Mapping) else value, dtype=np.float64).ravel()
+        except (TypeError, ValueError, KeyError):
+            raise ValueError(f"should be {expected} numbers") from None
+        if array.size not in counts or not np.isfinite(array).all():
+            raise ValueError(f"should be {expected} finite numbers")
+        return array
+
+    return PlainValidator(read)
 
 
-def _chain_cameras(fields: Fields) -> list[str]:
-    """``cam0``, ``cam1`` ...: the cameras of Kalibr's chain; empty where the file is none."""
-    return [key for key in fields if _CHAIN_CAMERA.fullmatch(key)]
+class _PinholeCamera(BaseModel):
+    """A camera of EuRoC's (``T_BS``), of Kalibr's or of OpenVINS' (``T_cam_imu``, ``T_imu_cam``)."""
 
-
-def _kalibr_camera(fields: Fields, name: str) -> CameraPart:
-    known = _is_rotation_known(fields)
-    if not known and "T_cam_imu" in fields:
-        raise fields.fail("T_cam_imu tells no position where the rotation is unknown; give T_imu_cam, or neither")
-    if not known:
-        T_BC = _translation(fields.matrix("T_imu_cam", 4, 4)[:3, 3] if "T_imu_cam" in fields else np.zeros(3))
-    elif "T_imu_cam" in fields:
-        T_BC = _rigid_transform(fields, "T_imu_cam")
-    elif "T_cam_imu" in fields:
-        T_BC = inverse(_rigid_transform(fields, "T_cam_imu"))
-    else:
-        raise fields.fail("T_cam_imu (or T_imu_cam) is missing; use the result of kalibr_calibrate_imu_camera")
-    model, offset_ns = _pinhole(fields, "distortion_coeffs"), _nanoseconds(fields, "timeshift_cam_imu")
-    return CameraPart(name, model, T_BC, offset_ns, known, fields.text("rostopic", "") or None)
-
-
-def _kalibr_imu(fields: Fields) -> ImuPart:
-    """The IMU of a file in which the noise lies at the top level (Kalibr's input) or under ``imu0`` (its result)."""
-    if "imu0" in fields:
-        fields = fields.section("imu0")
-    for key in _IMU_INTRINSICS:
-        if key in fields and not np.allclose(fields.matrix(key, 3, 3), np.eye(3), atol=1e-9):
-            _log.warning("%s: %s is not the identity and is not applied", fields.where, key)
-    return ImuPart(_imu_noise(fields, "update_rate"), np.eye(4))
-
-
-def _vins_mono_camera(fields: Fields) -> CameraPart:
-    known = fields.number("estimate_extrinsic", 0.0) != 2.0
-    has_position = known or "extrinsicTranslation" in fields
-    T_BC = _translation(fields.matrix("extrinsicTranslation", 3, 1)[:, 0] if has_position else np.zeros(3))
-    if known:
-        T_BC[:3, :3] = _rotation(fields, "extrinsicRotation", fields.matrix("extrinsicRotation", 3, 3))
-    topic = fields.text("image_topic", "") or None
-    return CameraPart("cam0", _vins_mono_model(fields), T_BC, _nanoseconds(fields, "td"), known, topic)
-
-
-def _vins_mono_model(fields: Fields) -> Camera:
-    model = fields.text("model_type")
-    projection = fields.section("projection_parameters")
-    resolution = (int(fields.number("image_width")), int(fields.number("image_height")))
-    if model == "PINHOLE":
-        fx, fy, cx, cy = (projection.number(key) for key in ("fx", "fy", "cx", "cy"))
-        distortion = fields.section("distortion_parameters")
-        k1, k2, p1, p2 = (distortion.number(key) for key in ("k1", "k2", "p1", "p2"))
-        return Camera(fx, fy, cx, cy, (k1, k2, p1, p2), resolution, "radtan")
-    if model == "KANNALA_BRANDT":
-        fx, fy, cx, cy = (projection.number(key) for key in ("mu", "mv", "u0", "v0"))
-        k1, k2, k3, k4 = (projection.number(key) for key in ("k2", "k3", "k4", "k5"))
-        return Camera(fx, fy, cx, cy, (k1, k2, k3, k4), resolution, "equidistant")
-    raise fields.fail(f"model_type {model!r} is not supported; recalibrate with PINHOLE or KANNALA_BRANDT")
-
-
-def _vins_mono_imu(fields: Fields) -> ImuPart:
-    scale = 1.0 / sqrt(_VINS_MONO_RATE_HZ)
-    noise = ImuNoise(
-        gyro_density=fields.number("gyr_n") * scale,
-        accel_density=fields.number("acc_n") * scale,
-        gyro_walk=fields.number("gyr_w") * scale,
-        accel_walk=fields.number("acc_w") * scale,
-        rate_hz=_VINS_MONO_RATE_HZ,
+    camera_model: Literal["pinhole"]
+    intrinsics: Annotated[Float, _numbers(4)]
+    distortion_model: Literal["radtan", "radial-tangential", "plumb_bob", "none", "equidistant", "equi"]
+    distortion: Annotated[Float, _numbers(0, 4, 5)] = Field(
+        validation_alias=AliasChoices("distortion_coefficients", "distortion_coeffs")
     )
-    return ImuPart(_checked(fields, noise), np.eye(4))
+    resolution: Annotated[Float, _numbers(2)]
+    timeshift_cam_imu: FiniteFloat = 0.0
+    camera_rotation: Literal["known", "unknown"] = "known"
+    rostopic: str | None = None
+    T_BS: Annotated[Float | None, _numbers(16)] = None
+    T_imu_cam: Annotated[Float | None, _numbers(16)] = None
+    T_cam_imu: Annotated[Float | None, _numbers(16)] = None
 
 
-def _pinhole(fields: Fields, distortion_key: str) -> Camera:
-    """The camera from the keys that EuRoC's and Kalibr's files have in common."""
-    if (projection := fields.text("camera_model")) != "pinhole":
-        raise fields.fail(f"camera model {projection!r} is not supported; recalibrate with a pinhole model")
-    name = fields.text("distortion_model")
-    if name not in _DISTORTION:
-        raise fields.fail(f"distortion model {name!r} is not supported; recalibrate with radtan or equidistant")
-    distortion = np.zeros(4) if name == "none" else fields.numbers(distortion_key, 4, 5)
-    if distortion[4:].any():
-        raise fields.fail(f"{distortion_key!r} has a fifth coefficient (k3); recalibrate with four")
+class _Imu(BaseModel):
+    """EuRoC's or Kalibr's IMU: continuous-time densities, SI units; and OpenVINS' scale and misalignment matrices."""
+
+    gyroscope_noise_density: PositiveFloat
+    accelerometer_noise_density: PositiveFloat
+    gyroscope_random_walk: PositiveFloat
+    accelerometer_random_walk: PositiveFloat
+    rate_hz: PositiveFloat = Field(validation_alias=AliasChoices("rate_hz", "update_rate"))
+    T_BS: Annotated[Float | None, _numbers(16)] = None
+    Tw: Annotated[Float | None, _numbers(9)] = None
+    Ta: Annotated[Float | None, _numbers(9)] = None
+    R_IMUtoGYRO: Annotated[Float | None, _numbers(9)] = None
+    R_IMUtoACC: Annotated[Float | None, _numbers(9)] = None
+
+
+class _VinsMono(BaseModel):
+    """VINS-Mono's file: one camera and the IMU."""
+
+    model_type: Literal["PINHOLE", "KANNALA_BRANDT"]
+    image_width: PositiveInt
+    image_height: PositiveInt
+    projection_parameters: dict[str, FiniteFloat]
+    distortion_parameters: dict[str, FiniteFloat] = {}
+    estimate_extrinsic: int = 0
+    extrinsicRotation: Annotated[Float | None, _numbers(9)] = None
+    extrinsicTranslation: Annotated[Float | None, _numbers(3)] = None
+    td: FiniteFloat = 0.0
+    image_topic: str | None = None
+    gyr_n: PositiveFloat
+    acc_n: PositiveFloat
+    gyr_w: PositiveFloat
+    acc_w: PositiveFloat
+
+
+def _parsed(model: type[ModelT], document: object, where: str) -> ModelT:
+    """The document as ``model``; raises :class:`CalibrationError` naming the file and the first key that is wrong."""
+    try:
+        return model.model_validate(document)
+    except InvalidError as invalid:
+        error = invalid.errors()[0]
+    key = str(error["loc"][-1]) if error["loc"] else "calibration"
+    if error["type"] == "missing":
+        aliases = [field.validation_alias for field in model.model_fields.values()]
+        names = next((a.choices for a in aliases if isinstance(a, AliasChoices) and key in a.choices), [key])
+        raise CalibrationError(f"{where}: {' or '.join(map(repr, names))} is missing")
+    problem = error["msg"].removeprefix("Value error, ").replace("Input should", "should")
+    raise CalibrationError(f"{where}: {key!r} {problem}, not {error['input']!r}")
+
+
+def _camera(document: object, where: str, name: str) -> CameraPart:
+    said = _parsed(_PinholeCamera, document, where)
+    distortion = np.zeros(4) if said.distortion_model == "none" else said.distortion
+    if len(distortion) < 4 or distortion[4:].any():
+        raise CalibrationError(f"{where}: distortion needs four coefficients, and no fifth (k3); recalibrate with four")
+    fx, fy, cx, cy = said.intrinsics.tolist()
     k1, k2, k3, k4 = distortion[:4].tolist()
-    fx, fy, cx, cy = fields.numbers("intrinsics", 4).tolist()
-    width, height = fields.numbers("resolution", 2).tolist()
-    return Camera(fx, fy, cx, cy, (k1, k2, k3, k4), (int(width), int(height)), _DISTORTION[name])
+    width, height = said.resolution.tolist()
+    resolution = int(width), int(height)
+    is_fisheye = said.distortion_model in ("equidistant", "equi")
+    model = Camera(fx, fy, cx, cy, (k1, k2, k3, k4), resolution, "equidistant" if is_fisheye else "radtan")
+    known, offset_ns = said.camera_rotation == "known", _nanoseconds(said.timeshift_cam_imu)
+    return CameraPart(name, model, _T_BC(said, known, where), offset_ns, known, said.rostopic)
 
 
-def _imu_noise(fields: Fields, rate_key: str) -> ImuNoise:
-    """The noise from the keys that EuRoC's and Kalibr's files have in common: continuous-time densities, SI units."""
-    return _checked(
-        fields,
-        ImuNoise(
-            gyro_density=fields.number("gyroscope_noise_density"),
-            accel_density=fields.number("accelerometer_noise_density"),
-            gyro_walk=fields.number("gyroscope_random_walk"),
-            accel_walk=fields.number("accelerometer_random_walk"),
-            rate_hz=fields.number(rate_key),
-        ),
+def _T_BC(said: _PinholeCamera, known: bool, where: str) -> Float:
+    """(4, 4), without rotation where that is not ``known``."""
+    key, T = ("T_BS", said.T_BS) if said.T_BS is not None else ("T_imu_cam", said.T_imu_cam)
+    if T is not None:
+        return _rigid_transform(T, key, where) if known else _transform(np.eye(3), T.reshape(4, 4)[:3, 3])
+    if said.T_cam_imu is None and not known:
+        return np.eye(4)
+    if said.T_cam_imu is None:
+        raise CalibrationError(
+            f"{where}: T_cam_imu (or T_imu_cam, or T_BS) is missing; use the result of kalibr_calibrate_imu_camera"
+        )
+    if not known:
+        raise CalibrationError(
+            f"{where}: T_cam_imu tells no position where the rotation is unknown; give T_imu_cam, or neither"
+        )
+    return inverse(_rigid_transform(said.T_cam_imu, "T_cam_imu", where))
+
+
+def _imu(document: object, where: str, *, placed: bool = False) -> ImuPart:
+    """``placed`` where it has a ``T_BS``; else it is the frame that the cameras refer to."""
+    said = _parsed(_Imu, document, where)
+    for key in ("Tw", "Ta", "R_IMUtoGYRO", "R_IMUtoACC"):
+        matrix = getattr(said, key)
+        if matrix is not None and not np.allclose(matrix.reshape(3, 3), np.eye(3), atol=1e-9):
+            _log.warning("%s: %s is not the identity and is not applied", where, key)
+    if placed and said.T_BS is None:
+        raise CalibrationError(f"{where}: 'T_BS' is missing")
+    noise = ImuNoise(
+        gyro_density=said.gyroscope_noise_density,
+        accel_density=said.accelerometer_noise_density,
+        gyro_walk=said.gyroscope_random_walk,
+        accel_walk=said.accelerometer_random_walk,
+        rate_hz=said.rate_hz,
     )
+    return ImuPart(noise, np.eye(4) if said.T_BS is None else _rigid_transform(said.T_BS, "T_BS", where))
 
 
-def _checked(fields: Fields, noise: ImuNoise) -> ImuNoise:
-    if min(noise.gyro_density, noise.accel_density, noise.gyro_walk, noise.accel_walk, noise.rate_hz) <= 0.0:
-        raise fields.fail("IMU noise densities, random walks and rate must all be positive")
-    return noise
+def _vins_mono(document: Document, where: str) -> tuple[CameraPart, ImuPart]:
+    said = _parsed(_VinsMono, document, where)
+    is_pinhole = said.model_type == "PINHOLE"
+    keys = "fx fy cx cy k1 k2 p1 p2" if is_pinhole else "mu mv u0 v0 k2 k3 k4 k5"
+    parameters = said.distortion_parameters | said.projection_parameters
+    if missing := [key for key in keys.split() if key not in parameters]:
+        raise CalibrationError(f"{where}: {missing[0]!r} is missing")
+    fx, fy, cx, cy, k1, k2, k3, k4 = (parameters[key] for key in keys.split())
+    resolution = said.image_width, said.image_height
+    model = Camera(fx, fy, cx, cy, (k1, k2, k3, k4), resolution, "radtan" if is_pinhole else "equidistant")
+
+    known, R_BC, p_BC = said.estimate_extrinsic != 2, np.eye(3), said.extrinsicTranslation
+    if known and (said.extrinsicRotation is None or p_BC is None):
+        raise CalibrationError(f"{where}: 'extrinsicRotation' or 'extrinsicTranslation' is missing")
+    if known and said.extrinsicRotation is not None:
+        R_BC = _rotation(said.extrinsicRotation.reshape(3, 3), "extrinsicRotation", where)
+    T_BC = _transform(R_BC, np.zeros(3) if p_BC is None else p_BC)
+    camera = CameraPart("cam0", model, T_BC, _nanoseconds(said.td), known, said.image_topic)
+
+    scale = 1.0 / sqrt(_VINS_MONO_RATE_HZ)
+    densities = [scale * value for value in (said.gyr_n, said.acc_n, said.gyr_w, said.acc_w)]
+    return camera, ImuPart(ImuNoise(*densities, _VINS_MONO_RATE_HZ), np.eye(4))
 
 
-def _is_rotation_known(fields: Fields) -> bool:
-    said = fields.text("camera_rotation", "known")
-    if said not in ("known", "unknown"):
-        raise fields.fail(f"'camera_rotation' should be known or unknown, not {said!r}")
-    return said == "known"
-
-
-def _rigid_transform(fields: Fields, key: str) -> Float:
-    """(4, 4) from ``key``, its rotation made exactly orthonormal."""
-    T = fields.matrix(key, 4, 4)
-    R = _rotation(fields, key, T[:3, :3])
+def _rigid_transform(values: Float, key: str, where: str) -> Float:
+    """(4, 4) from the ``values`` (16,) of ``key``, its rotation made exactly orthonormal."""
+    T = values.reshape(4, 4)
     if not np.array_equal(T[3], [0.0, 0.0, 0.0, 1.0]):
-        raise fields.fail(f"the last row of {key!r} should be 0 0 0 1")
-    out = T.copy()
-    out[:3, :3] = R
-    return out
+        raise CalibrationError(f"{where}: the last row of {key!r} should be 0 0 0 1")
+    return _transform(_rotation(T[:3, :3], key, where), T[:3, 3])
 
 
-def _rotation(fields: Fields, key: str, R: Float) -> Float:
+def _rotation(R: Float, key: str, where: str) -> Float:
     """The rotation nearest to ``R`` (3, 3), which must be close to one; ``R`` itself where it is one already."""
     off = np.abs(R @ R.T - np.eye(3)).max()
     if off > 1e-3 or np.linalg.det(R) < 0.0:
-        raise fields.fail(f"{key!r} holds no rotation: its rows are not orthonormal and right-handed")
+        raise CalibrationError(f"{where}: {key!r} holds no rotation: its rows are not orthonormal and right-handed")
     return R if off < _ROUNDING else so3.project(R)
 
 
-def _translation(p_BC: Float) -> Float:
+def _transform(R_BC: Float, p_BC: Float) -> Float:
+    """T_BC, (4, 4)."""
     T_BC = np.eye(4)
-    T_BC[:3, 3] = p_BC
+    T_BC[:3, :3], T_BC[:3, 3] = R_BC, p_BC
     return T_BC
 
 
-def _nanoseconds(fields: Fields, key: str) -> int:
-    """A time offset in seconds, zero where there is none, as integer nanoseconds."""
-    return round(fields.number(key, 0.0) * NS_PER_S)
+def _nanoseconds(seconds: float) -> int:
+    return round(seconds * NS_PER_S)
