@@ -13,6 +13,7 @@ from collections.abc import Iterable, Iterator
 from itertools import pairwise
 from math import inf, isfinite
 from statistics import median
+from typing import Generic, TypeVar
 
 import numpy as np
 
@@ -21,6 +22,7 @@ from vioframe.incidents import Incidents
 from vioframe.types import NS_PER_S, FrameSet, ImuSample, ImuSegment, Measurement
 
 Packet = tuple[ImuSegment, FrameSet]
+T = TypeVar("T")
 
 NS_PER_MS = 1_000_000
 # Frames waiting for an IMU that has fallen silent; bounds the memory that they take.
@@ -54,7 +56,9 @@ class Synchroniser:
         if not wait_ms >= 0.0:
             raise ConfigError(f"wait_ms must be zero or more, got {wait_ms!r}")
         self._imu = _ImuBuffer(time_offset_ns, incidents)
-        self._frames = _FrameBuffer(incidents)
+        self._frames: _Ordered[FrameSet] = _Ordered("frame", incidents)
+        self._last_packet_ns: int | None = None
+        self._periods_ns: deque[int] = deque(maxlen=_PERIOD_SAMPLES)
         self._incidents = incidents
         self._wait_ns = round(wait_ms * NS_PER_MS)
 
@@ -63,39 +67,48 @@ class Synchroniser:
         imu, frames = self._imu, self._frames
         if isinstance(measurement, ImuSample):
             imu.add(measurement)
-            if not frames.waiting:
+            if not frames.items:
                 imu.forget()
         elif isinstance(measurement, FrameSet):
-            frames.add(measurement)
+            frames.put(measurement.t_ns, measurement, frames.last_used_ns)
         else:
             self._incidents.add(measurement.kind, measurement.t_ns, measurement.detail)
-        while frames.waiting and self._is_covered(frames.waiting[0]):
+        while frames.t_ns and self._is_covered(frames.t_ns[0]):
             yield from self._release()
-        if frames.full:
-            dropped = frames.pop()
-            self._incidents.add("frame_without_imu", dropped.t_ns, "dropped: the IMU has fallen silent")
+        if len(frames.t_ns) > _MAX_WAITING_FRAMES:
+            (dropped_ns,), _ = frames.take(1)
+            self._incidents.add("frame_without_imu", dropped_ns, "dropped: the IMU has fallen silent")
 
     def finish(self) -> Iterator[Packet]:
         """The packets of the frames that still wait, as far as readings reach: nothing more will come."""
-        while self._frames.waiting and self._imu.count_from(self._frames.waiting[0].t_ns):
+        while self._frames.t_ns and self._imu.count_from(self._frames.t_ns[0]):
             yield from self._release()
-        for frame in self._frames.waiting:
-            self._incidents.add("frame_after_imu", frame.t_ns, "dropped: no IMU sample at or after it")
-        self._frames.waiting.clear()
+        for t_ns in self._frames.t_ns:
+            self._incidents.add("frame_after_imu", t_ns, "dropped: no IMU sample at or after it")
+        self._frames.take(len(self._frames.t_ns))
 
-    def _is_covered(self, frame: FrameSet) -> bool:
-        """Whether the readings reach far enough behind ``frame``."""
-        if self._wait_ns == 0 or self._frames.full:
-            return self._imu.count_from(frame.t_ns) >= 1
-        return self._imu.count_from(frame.t_ns + self._wait_ns) >= 2
+    def _is_covered(self, t_ns: int) -> bool:
+        """Whether the readings reach far enough behind the frame at ``t_ns``."""
+        if self._wait_ns == 0 or len(self._frames.t_ns) > _MAX_WAITING_FRAMES:
+            return self._imu.count_from(t_ns) >= 1
+        return self._imu.count_from(t_ns + self._wait_ns) >= 2
 
     def _release(self) -> Iterator[Packet]:
-        frame = self._frames.pop()
-        if self._imu.covers(frame.t_ns):
-            self._frames.watch_gap(frame.t_ns)
-            yield self._imu.segment_until(frame.t_ns), frame
+        (t_ns,), (frame,) = self._frames.take(1)
+        if self._imu.covers(t_ns):
+            self._watch_gap(t_ns)
+            yield self._imu.segment_until(t_ns), frame
         else:
-            self._incidents.add("frame_before_imu", frame.t_ns, "dropped: no IMU sample at or before it")
+            self._incidents.add("frame_before_imu", t_ns, "dropped: no IMU sample at or before it")
+
+    def _watch_gap(self, t_ns: int) -> None:
+        """Count a gap before the frame at ``t_ns`` if it is long against the usual period."""
+        if self._last_packet_ns is not None:
+            period_ns = t_ns - self._last_packet_ns
+            if self._periods_ns and period_ns > _CAMERA_GAP_PERIODS * median(self._periods_ns):
+                self._incidents.add("camera_gap", t_ns, f"{period_ns / NS_PER_S:.3f} s without a frame before this one")
+            self._periods_ns.append(period_ns)
+        self._last_packet_ns = t_ns
 
 
 def synchronise(
@@ -141,62 +154,48 @@ def played(
             return
 
 
-class _FrameBuffer:
-    """Frames that wait for their IMU samples, ordered by time."""
+class _Ordered(Generic[T]):
+    """What has come of one sensor, called ``kind`` in incidents, and was not used up yet: ordered by time."""
 
-    def __init__(self, incidents: Incidents) -> None:
-        self.waiting: list[FrameSet] = []
-        self._incidents = incidents
-        self._last_released_ns: int | None = None
+    def __init__(self, kind: str, incidents: Incidents) -> None:
+        self.t_ns: list[int] = []
+        self.items: list[T] = []
+        self.last_used_ns: int | None = None
+        self._kind, self._incidents = kind, incidents
         self._previous_arrival_ns: int | None = None
-        self._last_watched_ns: int | None = None
-        self._periods_ns: deque[int] = deque(maxlen=_PERIOD_SAMPLES)
 
-    @property
-    def full(self) -> bool:
-        return len(self.waiting) > _MAX_WAITING_FRAMES
-
-    def add(self, frame: FrameSet) -> None:
-        last_ns = self._last_released_ns
-        previous_ns, self._previous_arrival_ns = self._previous_arrival_ns, frame.t_ns
-        place = bisect_left(self.waiting, frame.t_ns, key=lambda other: other.t_ns)
-        if frame.t_ns == last_ns or (place < len(self.waiting) and self.waiting[place].t_ns == frame.t_ns):
-            self._incidents.add("frame_duplicate", frame.t_ns, "dropped: a frame with this stamp came before")
+    def put(self, t_ns: int, item: T, end_ns: int | None) -> None:
+        """Sort ``item`` in, unless its stamp came before or lies in what was processed, up to ``end_ns``."""
+        previous_ns, self._previous_arrival_ns = self._previous_arrival_ns, t_ns
+        place = bisect_left(self.t_ns, t_ns)
+        if t_ns == self.last_used_ns or t_ns in self.t_ns[place : place + 1]:
+            self._incidents.add(f"{self._kind}_duplicate", t_ns, "dropped: one with this stamp came before")
             return
-        if last_ns is not None and frame.t_ns < last_ns:
-            self._incidents.add("frame_out_of_order", frame.t_ns, "dropped: a later frame was already processed")
+        if end_ns is not None and t_ns <= end_ns:
+            self._incidents.add(f"{self._kind}_out_of_order", t_ns, "dropped: a later frame was already processed")
             return
-        if previous_ns is not None and frame.t_ns < previous_ns:
-            self._incidents.add("frame_out_of_order", frame.t_ns, "sorted into place")
-        self.waiting.insert(place, frame)
+        if previous_ns is not None and t_ns < previous_ns:
+            self._incidents.add(f"{self._kind}_out_of_order", t_ns, "sorted into place")
+        self.t_ns.insert(place, t_ns)
+        self.items.insert(place, item)
 
-    def pop(self) -> FrameSet:
-        frame = self.waiting.pop(0)
-        self._last_released_ns = frame.t_ns
-        return frame
-
-    def watch_gap(self, t_ns: int) -> None:
-        """Count a gap before the frame at ``t_ns`` if it is long against the usual period."""
-        if self._last_watched_ns is not None:
-            period_ns = t_ns - self._last_watched_ns
-            if self._periods_ns and period_ns > _CAMERA_GAP_PERIODS * median(self._periods_ns):
-                self._incidents.add("camera_gap", t_ns, f"{period_ns / NS_PER_S:.3f} s without a frame before this one")
-            self._periods_ns.append(period_ns)
-        self._last_watched_ns = t_ns
+    def take(self, count: int) -> tuple[list[int], list[T]]:
+        """The ``count`` oldest, with their stamps, which are used up by that."""
+        t_ns, items = self.t_ns[:count], self.items[:count]
+        del self.t_ns[:count], self.items[:count]
+        if t_ns:
+            self.last_used_ns = t_ns[-1]
+        return t_ns, items
 
 
-class _ImuBuffer:
-    """IMU samples on the camera's clock that no segment has used yet, ordered by time."""
+class _ImuBuffer(_Ordered[ImuSample]):
+    """IMU samples on the camera's clock that no segment has used yet."""
 
     def __init__(self, time_offset_ns: int, incidents: Incidents) -> None:
+        super().__init__("imu", incidents)
         self._offset_ns = time_offset_ns
-        self._incidents = incidents
-        self._times: list[int] = []
-        self._samples: list[ImuSample] = []
-        self._previous_arrival_ns: int | None = None
-        # Where the last segment ended: its stamp with the reading there, and the last sample that went into it.
+        # Where the last segment ended: its stamp with the reading there.
         self._end: ImuSample | None = None
-        self._last_used_ns: int | None = None
         self._gap_limit_ns: float | None = None
         self._last_gap_ns: int | None = None
 
@@ -205,46 +204,33 @@ class _ImuBuffer:
         gyro, accel = sample.gyro_B.tolist(), sample.accel_B.tolist()
         if not all(map(isfinite, (*gyro, *accel))):
             self._incidents.add("imu_nan", t_ns, "dropped: a reading is not finite")
-            return
-        if max(map(abs, gyro)) > _MAX_RATE_RAD_S or max(map(abs, accel)) > _MAX_FORCE_M_S2:
+        elif max(map(abs, gyro)) > _MAX_RATE_RAD_S or max(map(abs, accel)) > _MAX_FORCE_M_S2:
             self._incidents.add("imu_out_of_range", t_ns, "dropped: no IMU can measure such a reading")
-            return
-        previous_ns, self._previous_arrival_ns = self._previous_arrival_ns, t_ns
-        place = bisect_left(self._times, t_ns)
-        if t_ns == self._last_used_ns or (place < len(self._times) and self._times[place] == t_ns):
-            self._incidents.add("imu_duplicate", t_ns, "dropped: a sample with this stamp came before")
-            return
-        if self._end is not None and t_ns <= self._end.t_ns:
-            self._incidents.add("imu_out_of_order", t_ns, "dropped: its frame was already processed")
-            return
-        if previous_ns is not None and t_ns < previous_ns:
-            self._incidents.add("imu_out_of_order", t_ns, "sorted into place")
-        self._times.insert(place, t_ns)
-        self._samples.insert(place, sample)
+        else:
+            self.put(t_ns, sample, None if self._end is None else self._end.t_ns)
 
     def forget(self) -> None:
         """Let go of the oldest readings where there are more than any frame may still ask for."""
-        if len(self._times) > 2 * _MOST_IDLE_READINGS:
-            del self._times[:_MOST_IDLE_READINGS], self._samples[:_MOST_IDLE_READINGS]
+        if len(self.t_ns) > 2 * _MOST_IDLE_READINGS:
+            del self.t_ns[:_MOST_IDLE_READINGS], self.items[:_MOST_IDLE_READINGS]
 
     def count_from(self, t_ns: int) -> int:
         """Number of samples at or after ``t_ns``."""
-        return len(self._times) - bisect_left(self._times, t_ns)
+        return len(self.t_ns) - bisect_left(self.t_ns, t_ns)
 
     def covers(self, t_ns: int) -> bool:
         """Whether a reading at ``t_ns`` can be interpolated, given that there is a sample at or after it."""
-        return self._end is not None or self._times[0] <= t_ns
+        return self._end is not None or self.t_ns[0] <= t_ns
 
     def segment_until(self, t_ns: int) -> ImuSegment:
         """The readings from the end of the last segment to ``t_ns``; the samples up to there are used up."""
-        used = bisect_right(self._times, t_ns)
-        times, samples = self._times[:used], self._samples[:used]
-        recorded = times[-1:] if self._last_used_ns is None else [self._last_used_ns, *times]
+        last_used_ns, usual = self.last_used_ns, self.t_ns[:_PERIOD_SAMPLES]
+        times, samples = self.take(bisect_right(self.t_ns, t_ns))
+        recorded = times[-1:] if last_used_ns is None else [last_used_ns, *times]
         if recorded[-1] < t_ns:
-            recorded = [*recorded, self._times[used]]
-        gap_s = self._largest_gap_s(recorded)
-        before = (times[-1], samples[-1]) if times else None
-        end = self._reading_at(t_ns, before, used)
+            recorded = [*recorded, self.t_ns[0]]
+        gap_s = self._largest_gap_s(recorded, usual)
+        end = self._reading_at(t_ns, times, samples)
         if self._end is None:
             times, samples = [t_ns], [end]
         else:
@@ -253,10 +239,7 @@ class _ImuBuffer:
                 samples.pop()
             times = [self._end.t_ns, *times, t_ns]
             samples = [self._end, *samples, end]
-        if before is not None:
-            self._last_used_ns = before[0]
         self._end = end
-        del self._times[:used], self._samples[:used]
         return ImuSegment(
             np.array(times, dtype=np.int64),
             np.array([sample.gyro_B for sample in samples], dtype=np.float64),
@@ -264,15 +247,16 @@ class _ImuBuffer:
             gap_s,
         )
 
-    def _reading_at(self, t_ns: int, before: tuple[int, ImuSample] | None, after: int) -> ImuSample:
-        """Linear between the last reading up to ``t_ns`` and the first sample after it, at place ``after``."""
-        if before is None:
+    def _reading_at(self, t_ns: int, times: list[int], samples: list[ImuSample]) -> ImuSample:
+        """Linear between the last of the readings up to ``t_ns`` and the first one after it."""
+        if times:
+            t_0, sample_0 = times[-1], samples[-1]
+        else:
             assert self._end is not None  # covers() was true
-            before = (self._end.t_ns, self._end)
-        t_0, sample_0 = before
+            t_0, sample_0 = self._end.t_ns, self._end
         if t_0 == t_ns:
             return ImuSample(t_ns, sample_0.gyro_B, sample_0.accel_B)
-        t_1, sample_1 = self._times[after], self._samples[after]
+        t_1, sample_1 = self.t_ns[0], self.items[0]
         fraction = (t_ns - t_0) / (t_1 - t_0)
         return ImuSample(
             t_ns,
@@ -280,11 +264,13 @@ class _ImuBuffer:
             sample_0.accel_B + fraction * (sample_1.accel_B - sample_0.accel_B),
         )
 
-    def _largest_gap_s(self, recorded: list[int]) -> float:
-        """Longest stretch between ``recorded`` stamps; those far beyond the usual period are counted, each once."""
+    def _largest_gap_s(self, recorded: list[int], usual: list[int]) -> float:
+        """Longest stretch between ``recorded`` stamps; those far beyond the usual period are counted, each once.
+
+        The ``usual`` period is taken from the stamps that are there when the first segment is cut.
+        """
         if self._gap_limit_ns is None:
-            # The usual period is taken from what is there when the first segment is cut.
-            periods = [after - before for before, after in pairwise(self._times[:_PERIOD_SAMPLES])]
+            periods = [after - before for before, after in pairwise(usual)]
             self._gap_limit_ns = _IMU_GAP_PERIODS * median(periods) if periods else inf
         longest_ns = 0
         for before_ns, after_ns in pairwise(recorded):
