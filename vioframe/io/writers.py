@@ -13,7 +13,7 @@ import numpy as np
 from vioframe.errors import DatasetError
 from vioframe.geometry.trajectory import Trajectory
 from vioframe.io.trajectories import true_values, write_euroc
-from vioframe.types import NS_PER_S, Float, FrameSet, Image, ImuSample
+from vioframe.types import NS_PER_S, Float, FrameSet, ImuSample
 
 IMU_TOPIC = "/imu0"
 GROUND_TRUTH_TOPIC = "/vioframe/ground_truth"
@@ -125,20 +125,17 @@ class _RosWriter(RecordingWriter):
     def write_frame(self, frames: FrameSet) -> None:
         for name, image in zip(self._camera_names, frames.images, strict=True):
             if image is not None:
-                self._write_image(frames.t_ns, name, image)
-
-    def _write_image(self, t_ns: int, camera_name: str, image: Image) -> None:
-        height, width = image.shape
-        message = self._types[_IMAGE](
-            header=self._header(t_ns, camera_name),
-            height=height,
-            width=width,
-            encoding="mono8",
-            is_bigendian=0,
-            step=width,
-            data=np.ascontiguousarray(image).ravel(),
-        )
-        self._write_in_order(_image_topic(camera_name), t_ns, message)
+                height, width = image.shape
+                message = self._types[_IMAGE](
+                    header=self._header(frames.t_ns, name),
+                    height=height,
+                    width=width,
+                    encoding="mono8",
+                    is_bigendian=0,
+                    step=width,
+                    data=np.ascontiguousarray(image).ravel(),
+                )
+                self._write_in_order(_image_topic(name), frames.t_ns, message)
 
     def write_imu(self, sample: ImuSample) -> None:
         # A first covariance of -1 says that there is no orientation; zeros say that a covariance is not known.
@@ -210,41 +207,35 @@ class Ros1Writer(_RosWriter):
 class Ros2Writer(_RosWriter):
     """A ROS 2 bag: a folder with ``metadata.yaml`` and sqlite3 storage, messages compressed with ``zstd`` or not."""
 
+    _storage, _compressed = "SQLITE3", "MESSAGE"
+
     def __init__(self, path: Path, compression: str | None, camera_names: Sequence[str]) -> None:
         from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
+        from rosbags.typesys import Stores, get_typestore
 
-        bag = Writer(path, version=9, storage_plugin=StoragePlugin.SQLITE3)
+        bag = Writer(path, version=9, storage_plugin=StoragePlugin[self._storage])
         if compression is not None:
-            bag.set_compression(CompressionMode.MESSAGE, CompressionFormat[compression.upper()])
-        super().__init__(bag, camera_names, *_ros2_types())
+            bag.set_compression(CompressionMode[self._compressed], CompressionFormat[compression.upper()])
+        store = get_typestore(Stores.ROS2_HUMBLE)
+        super().__init__(bag, camera_names, store, store.serialize_cdr, {})
 
 
-class McapWriter(_RosWriter):
+class McapWriter(Ros2Writer):
     """A single MCAP file of ROS 2 messages, chunks compressed with ``zstd`` or not."""
 
-    def __init__(self, path: Path, compression: str | None, camera_names: Sequence[str]) -> None:
-        from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
+    _storage, _compressed = "MCAP", "STORAGE"
 
+    def __init__(self, path: Path, compression: str | None, camera_names: Sequence[str]) -> None:
         self._path = path
         # rosbags writes a folder around the file.
         self._folder = path.with_name(f"{path.stem}.folder")
-        bag = Writer(self._folder, version=9, storage_plugin=StoragePlugin.MCAP)
-        if compression is not None:
-            bag.set_compression(CompressionMode.STORAGE, CompressionFormat[compression.upper()])
-        super().__init__(bag, camera_names, *_ros2_types())
+        super().__init__(self._folder, compression, camera_names)
 
     def __exit__(self, *error: object) -> None:
         super().__exit__(*error)
         if error[0] is None:
             next(self._folder.glob("*.mcap")).rename(self._path)
         shutil.rmtree(self._folder)
-
-
-def _ros2_types() -> tuple[Any, Any, dict[str, int]]:
-    from rosbags.typesys import Stores, get_typestore
-
-    store = get_typestore(Stores.ROS2_HUMBLE)
-    return store, store.serialize_cdr, {}
 
 
 def _image_topic(camera_name: str) -> str:

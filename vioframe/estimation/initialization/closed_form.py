@@ -29,7 +29,7 @@ import numpy as np
 from vioframe.arrays import Bool, Float
 from vioframe.estimation.inertial.preintegration import Preintegrated
 from vioframe.estimation.initialization.epipolar_pairs import BearingPairs, Pairs, refine
-from vioframe.estimation.initialization.window import RefusalError, Window
+from vioframe.estimation.initialization.window import Window, refuse_unless
 from vioframe.types import GRAVITY_M_S2
 
 _FEWEST_COMMON = 10
@@ -112,8 +112,7 @@ def solve_structure(window: Window, R_B0C: Float, sigma: float) -> Structure:
     for _ in range(_SOLVES):
         Q = information * (window.seen / depth**2)[..., None, None]
         parallax = _has_parallax(Q.sum(axis=0), (window.seen / depth**2).sum(axis=0) * 2.0 * sigma**2)
-        if not parallax.any():
-            raise RefusalError("no track has enough parallax")
+        refuse_unless(parallax.any(), "no track has enough parallax")
         c, p_F = _null_vector(Q, parallax)
         p_C = np.einsum("kij,klj->kli", R_CB0, p_F - c[:, None])
         if np.median(p_C[..., 2][window.seen & parallax]) < 0.0:

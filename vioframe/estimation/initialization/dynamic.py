@@ -34,9 +34,9 @@ from vioframe.estimation.initialization.window import (
     PIXEL_SIGMA,
     InitialEstimate,
     Packet,
-    RefusalError,
     Window,
     build_window,
+    refuse_unless,
     spread_indices,
 )
 from vioframe.geometry.so3 import level_rotation
@@ -54,7 +54,7 @@ _LOOKAHEAD_S, _LARGEST_LOOKAHEAD_PX, _FEWEST_COMMON = 0.2, 3.0, 8
 _LEAST_PARALLAX_PX, _LARGEST_ERROR_PX = 5.0, 2.0
 # The readings' residuals, per degree of freedom: vibration makes them larger than the data sheet's noise.
 _MAX_INERTIAL = 9.0
-_MAX_BIAS_SIGMAS = 4.0
+_MAX_BIAS_ACCEL = 4.0 * BIAS_ACCEL_SIGMA
 # Largest standard deviations that are accepted: of scale (relative), velocity on any axis, and gravity's direction.
 _SCALE_SIGMA, _VELOCITY_SIGMA, _TILT_SIGMA_DEG = 0.06, 0.05, 1.0
 
@@ -75,8 +75,7 @@ def initialise(packets: Sequence[Packet], calibration: Calibration) -> InitialEs
 
     window, structure = _structure(window, R_B0B @ calibration.cameras[0].R_BC, sigma)
     alignment = align(structure.position, imu[:-1], calibration.cameras[0].p_BC, BIAS_ACCEL_SIGMA)
-    if alignment.scale <= 0.0:
-        raise RefusalError("the readings contradict the direction of the motion in the images")
+    refuse_unless(alignment.scale > 0.0, "the readings contradict the direction of the motion in the images")
     x = _start_of_adjustment(window.without_last(), structure, alignment, bias_gyro, calibration)
     problem, solution = _adjusted(window.without_last(), x, calibration)
     keep = _explained(problem, solution.variables)
@@ -102,8 +101,7 @@ def initialise(packets: Sequence[Packet], calibration: Calibration) -> InitialEs
 
 
 def _require(window: Window, what: str) -> None:
-    if len(window.ids) < _FEWEST_LANDMARKS:
-        raise RefusalError(f"{len(window.ids)} {what}, {_FEWEST_LANDMARKS} are needed")
+    refuse_unless(len(window.ids) >= _FEWEST_LANDMARKS, f"{len(window.ids)} {what}, {_FEWEST_LANDMARKS} are needed")
 
 
 def _preintegrate(
@@ -116,8 +114,8 @@ def _with_gyro_bias(window: Window, calibration: Calibration, sigma: float) -> t
     """The tracks that lie on their epipolar lines, and the gyroscope's bias (3,) that puts them there."""
     imu = _preintegrate(window, np.zeros(3), np.zeros(3), calibration)
     bias, distance = estimate_gyro_bias(window, imu, calibration.cameras[0].R_BC, sigma, BIAS_GYRO_SIGMA)
-    if np.linalg.norm(bias) > 3.0 * BIAS_GYRO_SIGMA:
-        raise RefusalError(f"gyroscope bias of {np.linalg.norm(bias):.2f} rad/s is not plausible")
+    rate = float(np.linalg.norm(bias))
+    refuse_unless(rate <= 3.0 * BIAS_GYRO_SIGMA, f"gyroscope bias of {rate:.2f} rad/s is not plausible")
     window = window.only(distance < _EPIPOLAR_LIMIT)
     _require(window, "tracks lie on their epipolar lines")
     return window, bias
@@ -203,27 +201,24 @@ def _check_parallax(window: Window, R_B0B: Float, calibration: Calibration) -> N
     first = rays_B0[window.seen.argmax(axis=0), np.arange(len(window.ids))]
     angle = np.nanmax(np.linalg.norm(rays_B0 - first, axis=2), axis=0)
     parallax = float(np.median(angle)) * calibration.cameras[0].model.focal_px
-    if not parallax >= _LEAST_PARALLAX_PX:
-        raise RefusalError(f"parallax of {parallax:.1f} px, {_LEAST_PARALLAX_PX:.1f} px are needed")
+    refuse_unless(parallax >= _LEAST_PARALLAX_PX, f"parallax of {parallax:.1f} px, {_LEAST_PARALLAX_PX} px are needed")
 
 
 def _check_fit(problem: Problem, solution: Solution) -> None:
     """Observations, readings and biases must be as the noise and the priors have them."""
-    if not solution.converged:
-        raise RefusalError("the bundle adjustment did not converge")
+    refuse_unless(solution.converged, "the bundle adjustment did not converge")
     x, sightings = solution.variables, problem.sightings
     errors = sightings.errors(x.poses, x.camera, x.landmarks)
     used = ~np.isinf(errors)  # what is behind a camera is let go of, and says nothing of the others
     views = sightings.seen.sum(axis=1)[used]
     rms = sightings.sigma * float(np.sqrt((views * errors[used] ** 2).sum() / views.sum()))
-    if not rms <= _LARGEST_ERROR_PX:
-        raise RefusalError(f"reprojection error of {rms:.1f} px RMS, {_LARGEST_ERROR_PX:.1f} px are allowed")
+    refuse_unless(rms <= _LARGEST_ERROR_PX, f"reprojection error of {rms:.1f} px, {_LARGEST_ERROR_PX} px are allowed")
     inertial = float((problem.reading_residuals(x.states) ** 2).mean())
-    if not inertial <= _MAX_INERTIAL:
-        raise RefusalError(f"the readings disagree with the images: {inertial:.1f} times their noise's variance")
+    refuse_unless(
+        inertial <= _MAX_INERTIAL, f"readings and images disagree by {inertial:.1f} times the noise's variance"
+    )
     bias = float(np.linalg.norm(x.states.bias_accel_B[-1]))
-    if not bias <= _MAX_BIAS_SIGMAS * BIAS_ACCEL_SIGMA:
-        raise RefusalError(f"accelerometer bias of {bias:.2f} m/s^2 is not plausible")
+    refuse_unless(bias <= _MAX_BIAS_ACCEL, f"accelerometer bias of {bias:.2f} m/s^2 is not plausible")
 
 
 def _check_lookahead(
@@ -237,13 +232,11 @@ def _check_lookahead(
     camera = calibration.cameras[0]
     for state, tracks in zip(predicted, seen, strict=True):
         _, a, b = np.intersect1d(ids, tracks.ids, return_indices=True)
-        if len(a) < _FEWEST_COMMON:
-            raise RefusalError(f"only {len(a)} landmarks were still tracked in the frames held back")
+        refuse_unless(len(a) >= _FEWEST_COMMON, f"only {len(a)} landmarks were still tracked in the frames held back")
         p_C = ((p_WF[a] - state.p_WB) @ state.R_WB - camera.p_BC) @ camera.R_BC
         error = np.linalg.norm(p_C[:, :2] / p_C[:, 2:] - tracks.xy_normalised[b], axis=1)
         px = float(np.median(np.where(p_C[:, 2] > 0.0, error, np.inf))) * camera.model.focal_px
-        if not px <= _LARGEST_LOOKAHEAD_PX:
-            raise RefusalError(f"the prediction misses a later frame by {px:.1f} px")
+        refuse_unless(px <= _LARGEST_LOOKAHEAD_PX, f"the prediction misses a later frame by {px:.1f} px")
 
 
 def _check_uncertainty(p_WB: Float, cov: Float) -> None:
@@ -253,14 +246,11 @@ def _check_uncertainty(p_WB: Float, cov: Float) -> None:
     """
     newest = cov[-15:, -15:]
     velocity = float(np.sqrt(np.linalg.eigvalsh(newest[DV, DV])[-1]))
-    if not velocity <= _VELOCITY_SIGMA:
-        raise RefusalError(f"velocity known to {velocity:.3f} m/s only (standard deviation)")
+    refuse_unless(velocity <= _VELOCITY_SIGMA, f"velocity known to {velocity:.3f} m/s only (standard deviation)")
     tilt = float(np.rad2deg(np.sqrt(np.linalg.eigvalsh(newest[DTHETA, DTHETA])[-1])))
-    if not tilt <= _TILT_SIGMA_DEG:
-        raise RefusalError(f"gravity's direction known to {tilt:.2f} deg only (standard deviation)")
+    refuse_unless(tilt <= _TILT_SIGMA_DEG, f"gravity's direction known to {tilt:.2f} deg only (standard deviation)")
     scale = scale_sigma(p_WB, cov)
-    if not scale <= _SCALE_SIGMA:
-        raise RefusalError(f"scale known to {100.0 * scale:.0f} % only (standard deviation)")
+    refuse_unless(scale <= _SCALE_SIGMA, f"scale known to {100.0 * scale:.0f} % only (standard deviation)")
 
 
 def scale_sigma(p_WB: Float, cov: Float) -> float:

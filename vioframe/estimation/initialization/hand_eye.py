@@ -20,7 +20,13 @@ import numpy as np
 from vioframe.arrays import Float
 from vioframe.estimation.inertial.preintegration import Preintegrated, join_segments, preintegrate
 from vioframe.estimation.initialization.epipolar_pairs import CONVERGED, BearingPairs, Pairs, refine, relative_rotations
-from vioframe.estimation.initialization.window import BIAS_GYRO_SIGMA, LARGEST_IMU_GAP_S, PIXEL_SIGMA, RefusalError
+from vioframe.estimation.initialization.window import (
+    BIAS_GYRO_SIGMA,
+    LARGEST_IMU_GAP_S,
+    PIXEL_SIGMA,
+    RefusalError,
+    refuse_unless,
+)
 from vioframe.geometry import so3
 from vioframe.types import Calibration, FrameTracks, ImuSegment
 
@@ -125,11 +131,11 @@ class RotationCalibrator:
     def _attempt(self) -> CameraRotation:
         chain = Chain(list(self._tracks), list(self._imu))
         turned = second_turn(chain)
-        if not turned >= _LEAST_SECOND_TURN:
-            raise RefusalError(
-                f"turned by {turned:.2f} rad about a second axis, {_LEAST_SECOND_TURN:.2f} are needed; "
-                "turn the vehicle about two axes"
-            )
+        refuse_unless(
+            turned >= _LEAST_SECOND_TURN,
+            f"turned by {turned:.2f} rad about a second axis, {_LEAST_SECOND_TURN:.2f} are needed; "
+            "turn the vehicle about two axes",
+        )
         return _solve(chain, PIXEL_SIGMA / self._focal_px)
 
 
@@ -175,29 +181,26 @@ def _solve(chain: Chain, sigma: float) -> CameraRotation:
     Raises :class:`RefusalError` where there are too few tracks, or they contradict what comes out.
     """
     stages = [(chain.pairs(_STEPS[:count]), iterations, cauchy) for iterations, count, cauchy in _STAGES]
-    if len(stages[-1][0].first) < len(chain.tracks):
-        raise RefusalError("too few tracks from one keyframe to the next")
+    refuse_unless(len(stages[-1][0].first) >= len(chain.tracks), "too few tracks from one keyframe to the next")
     R_BC, bias = _align_axes(chain, sigma)
     found = refine(stages, chain.imu, bias, R_BC, sigma, BIAS_GYRO_SIGMA, turn_camera=True)
     common = stages[-1][0].bearings.common
     # The typical distance of a track from its epipolar lines over the noise that was assumed.
     misfit = float(np.median(found.distance[common])) / _MEDIAN
-    if not misfit <= _MAX_MISFIT:
-        raise RefusalError(f"the tracks disagree with the gyroscope by {misfit:.1f} times their noise")
-    if not np.linalg.norm(found.bias_gyro_B) <= 3.0 * BIAS_GYRO_SIGMA:
-        raise RefusalError(f"gyroscope bias of {np.linalg.norm(found.bias_gyro_B):.2f} rad/s is not plausible")
+    refuse_unless(misfit <= _MAX_MISFIT, f"the tracks disagree with the gyroscope by {misfit:.1f} times their noise")
+    rate = float(np.linalg.norm(found.bias_gyro_B))
+    refuse_unless(rate <= 3.0 * BIAS_GYRO_SIGMA, f"gyroscope bias of {rate:.2f} rad/s is not plausible")
     H = found.H
     information = H[3:, 3:] - H[3:, :3] @ np.linalg.solve(H[:3, :3], H[:3, 3:])
     information = information * _independent_share(chain, int(common.sum()))
     scatter = max(misfit, _LEAST_MISFIT) ** 2 * np.linalg.inv(information)
     rotation = CameraRotation(found.R_BC, scatter + np.eye(3) * np.deg2rad(_SYSTEMATIC_DEG) ** 2)
-    if not rotation.sigma_deg <= _LARGEST_SIGMA_DEG:
-        raise RefusalError(
-            f"the camera's rotation is known to {rotation.sigma_deg:.2f} deg only (standard deviation); "
-            "turn the vehicle about two axes"
-        )
-    if not found.last_step < 100.0 * CONVERGED:
-        raise RefusalError("the refinement of the camera's rotation did not settle")
+    refuse_unless(
+        rotation.sigma_deg <= _LARGEST_SIGMA_DEG,
+        f"the camera's rotation is known to {rotation.sigma_deg:.2f} deg only (standard deviation); "
+        "turn the vehicle about two axes",
+    )
+    refuse_unless(found.last_step < 100.0 * CONVERGED, "the refinement of the camera's rotation did not settle")
     return rotation
 
 

@@ -9,7 +9,7 @@ from functools import reduce
 import numpy as np
 
 from vioframe.estimation.inertial.preintegration import join_segments
-from vioframe.estimation.initialization.window import BIAS_ACCEL_SIGMA, InitialEstimate, Packet, RefusalError
+from vioframe.estimation.initialization.window import BIAS_ACCEL_SIGMA, InitialEstimate, Packet, refuse_unless
 from vioframe.geometry import so3
 from vioframe.types import DBA, DBG, DP, DTHETA, DV, GRAVITY_M_S2, Float, ImuNoise, ImuSegment, NavState, g_W
 
@@ -24,7 +24,7 @@ _LARGEST_RATE = 0.5  # rad/s, far beyond any bias
 
 
 def initialise(packets: Sequence[Packet], noise: ImuNoise) -> InitialEstimate:
-    """Estimate from consecutive ``packets``, the newest last; raises :class:`RefusalError` unless they are at rest.
+    """Estimate from consecutive ``packets``, the newest last; refuses unless they are at rest.
 
     At constant velocity an accelerometer sees what it sees at rest, hence the images must stand still too.
     """
@@ -35,8 +35,8 @@ def initialise(packets: Sequence[Packet], noise: ImuNoise) -> InitialEstimate:
     gyro, accel = imu.gyro_B.mean(axis=0), imu.accel_B.mean(axis=0)
     norm = float(np.linalg.norm(accel))
     excess = norm - GRAVITY_M_S2
-    if abs(excess) > 3.0 * BIAS_ACCEL_SIGMA:
-        raise RefusalError(f"the accelerometer's mean is {norm:.2f} m/s^2, too far from gravity's {GRAVITY_M_S2}")
+    apart = f"the accelerometer's mean is {norm:.2f} m/s^2, too far from gravity's {GRAVITY_M_S2}"
+    refuse_unless(abs(excess) <= 3.0 * BIAS_ACCEL_SIGMA, apart)
     R_WB = so3.level_rotation(accel)
     # Of all biases that explain the mean's length the smallest, which is the likeliest, points along gravity.
     bias_accel = excess * accel / norm
@@ -50,13 +50,10 @@ def _check_readings(packets: Sequence[Packet]) -> None:
     """Means over a tenth of a second must be steady: rotors shake a standing vehicle, but do not carry it off."""
     blocks = _block_means([segment for segment, _ in packets[1:]])
     gyro_std, accel_std = blocks[:, :3].std(axis=0).max(), blocks[:, 3:].std(axis=0).max()
-    if gyro_std > _GYRO_STD:
-        raise RefusalError(f"not at rest: the gyroscope varies by {gyro_std:.3f} rad/s")
-    if accel_std > _ACCEL_STD:
-        raise RefusalError(f"not at rest: the accelerometer varies by {accel_std:.2f} m/s^2")
+    refuse_unless(gyro_std <= _GYRO_STD, f"not at rest: the gyroscope varies by {gyro_std:.3f} rad/s")
+    refuse_unless(accel_std <= _ACCEL_STD, f"not at rest: the accelerometer varies by {accel_std:.2f} m/s^2")
     rate = np.linalg.norm(blocks[:, :3].mean(axis=0))
-    if rate > _LARGEST_RATE:
-        raise RefusalError(f"not at rest: turning at {rate:.2f} rad/s")
+    refuse_unless(rate <= _LARGEST_RATE, f"not at rest: turning at {rate:.2f} rad/s")
 
 
 def _block_means(segments: Sequence[ImuSegment]) -> Float:
@@ -74,17 +71,14 @@ def _block_means(segments: Sequence[ImuSegment]) -> Float:
 def _check_images(packets: Sequence[Packet]) -> None:
     """A feature's typical place must be the same in every third of the window: medians quieten noise and outliers."""
     frames = [tracks for _, tracks in packets]
-    if len(frames) < _MIN_FRAMES:
-        raise RefusalError(f"only {len(frames)} frames in the standstill window")
+    refuse_unless(len(frames) >= _MIN_FRAMES, f"only {len(frames)} frames in the standstill window")
     common = reduce(np.intersect1d, (tracks.ids for tracks in frames))
-    if len(common) < _MIN_COMMON:
-        raise RefusalError(f"only {len(common)} features were tracked through the standstill window")
+    refuse_unless(len(common) >= _MIN_COMMON, f"only {len(common)} features were tracked through the standstill window")
     xy = np.stack([t.xy[np.intersect1d(t.ids, common, return_indices=True)[1]] for t in frames])
     first, middle, last = (np.median(third, axis=0) for third in np.array_split(xy, 3))
     for a, b in ((first, middle), (middle, last), (first, last)):
         moved = float(np.median(np.linalg.norm(b - a, axis=1)))
-        if moved > _DISPARITY_PX:
-            raise RefusalError(f"not at rest: features moved by {moved:.1f} px")
+        refuse_unless(moved <= _DISPARITY_PX, f"not at rest: features moved by {moved:.1f} px")
 
 
 def _covariance(imu: ImuSegment, R_WB: Float, noise: ImuNoise) -> Float:

@@ -43,6 +43,12 @@ class RefusalError(Exception):
     """An attempt came to nothing; the message says why in one line. Never leaves the package."""
 
 
+def refuse_unless(good: object, why: str) -> None:
+    """Raise :class:`RefusalError` saying ``why`` where something is not as it must be; a NaN never compares as good."""
+    if not good:
+        raise RefusalError(why)
+
+
 @dataclass(frozen=True, slots=True)
 class Window:
     """K keyframes, the readings between them, and L tracks.
