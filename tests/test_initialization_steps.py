@@ -182,10 +182,10 @@ class TestAlignment:
         R_0, g_B0 = s.truth.R_WB[0], s.truth.R_WB[0].T @ [0.0, 0.0, -GRAVITY_M_S2]
         np.testing.assert_allclose(alignment.scale, 3.7, rtol=1e-3)
         np.testing.assert_allclose(alignment.g_B0, g_B0, atol=5e-3)
-        np.testing.assert_allclose(alignment.bias_accel_B, BIAS_ACCEL, atol=5e-3)
-        np.testing.assert_allclose(alignment.v_B0B, s.truth.v_WB @ R_0, atol=2e-3)
-        np.testing.assert_allclose(alignment.p_B0B, (s.truth.p_WB - s.truth.p_WB[0]) @ R_0, atol=1e-3)
-        np.testing.assert_allclose(alignment.R_B0B, R_0.T @ s.truth.R_WB, atol=1e-5)
+        np.testing.assert_allclose(alignment.states.bias_accel_B[0], BIAS_ACCEL, atol=5e-3)
+        np.testing.assert_allclose(alignment.states.v_WB, s.truth.v_WB @ R_0, atol=2e-3)
+        np.testing.assert_allclose(alignment.states.p_WB, (s.truth.p_WB - s.truth.p_WB[0]) @ R_0, atol=1e-3)
+        np.testing.assert_allclose(alignment.states.R_WB, R_0.T @ s.truth.R_WB, atol=1e-5)
 
     def test_mirrored_path_has_negative_scale(self):
         s = scene()

@@ -9,11 +9,10 @@ from __future__ import annotations
 import numpy as np
 
 from vioframe.errors import DivergedError
-from vioframe.estimation.inertial.preintegration import join_segments, preintegrate
-from vioframe.estimation.recovery import noise_over
+from vioframe.estimation.inertial.preintegration import join_segments
 from vioframe.estimation.standstill import Standstill
 from vioframe.stopwatch import Stopwatch
-from vioframe.types import Estimate, FrameTracks, ImuNoise, ImuSegment, NavState, Start, Status
+from vioframe.types import Estimate, FrameTracks, ImuSegment, NavState, Start, Status
 from vioframe_sliding_window.options import SlidingWindowOptions
 from vioframe_sliding_window.window import Window
 
@@ -45,7 +44,7 @@ class SlidingWindow:
         _check_continuity(before, tracks, imu)
         self._pending.append(imu)
         since = join_segments(self._pending)
-        predicted = _predict(window.newest, since, self._noise)
+        predicted = window.predict(since)
         still = still and self._stands_still(predicted, since)
         due = since.duration_s > 1.0 / options.max_rate_hz - 0.5 * imu.duration_s
         watch.lap("propagate")
@@ -62,7 +61,7 @@ class SlidingWindow:
         if still:
             window.hold_still(tracks.t_ns, Standstill.over(since, self._noise))
         else:
-            window.add_frame(since, tracks)
+            window.add_frame(since, predicted, tracks)
         window.repropagate()
         window.triangulate()
         watch.lap("triangulate")
@@ -121,9 +120,3 @@ def _check_agreement(rejected: int, seen: int) -> None:
     """
     if seen >= _MANY_TRACKS and rejected > _MOST * seen:
         raise DivergedError(f"images and readings contradict each other: {rejected} of {seen} landmarks do not fit")
-
-
-def _predict(state: NavState, imu: ImuSegment, noise: ImuNoise) -> NavState:
-    """Where the readings lead from ``state``, with covariance."""
-    noise = noise_over(imu, noise)
-    return preintegrate(imu, state.bias_gyro_B, state.bias_accel_B, noise).predict(state)

@@ -87,17 +87,21 @@ class Window:
     def prior(self) -> Prior:
         return self._prior
 
-    def add_frame(self, imu: ImuSegment, tracks: FrameTracks) -> None:
+    def predict(self, imu: ImuSegment) -> NavState:
+        """Where the readings lead from the newest state, with covariance."""
+        return self._integrated(imu).predict(self.newest)
+
+    def _integrated(self, imu: ImuSegment) -> Preintegrated:
+        """The readings behind the newest state, at its biases."""
+        newest = self._states[-1:]
+        return preintegrate(imu, newest.bias_gyro_B[0], newest.bias_accel_B[0], noise_over(imu, self._noise))
+
+    def add_frame(self, imu: ImuSegment, predicted: NavState, tracks: FrameTracks) -> None:
         """Append the frame that ``imu`` leads to from the newest one, which gives way if it is no keyframe."""
-        noise = noise_over(imu, self._noise)
-        newest = self.newest
-        predicted = preintegrate(imu, newest.bias_gyro_B, newest.bias_accel_B, noise).predict(newest)
         if not self._newest_is_keyframe:
             imu = join_segments([self._readings[-1].imu, imu])
-            noise = noise_over(imu, self._noise)
             self._drop_newest()
-        base = self._states[-1:]
-        self._readings.append(preintegrate(imu, base.bias_gyro_B[0], base.bias_accel_B[0], noise))
+        self._readings.append(self._integrated(imu))
         self._t_ns.append(predicted.t_ns)
         self._states = self._states.append(StateArrays.stack([predicted]))
         self._gyro_B = np.concatenate([self._gyro_B, imu.gyro_B[-1:]])

@@ -27,6 +27,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from vioframe.arrays import Bool, Float
+from vioframe.estimation.factors.inertial import StateArrays
 from vioframe.estimation.inertial.preintegration import Preintegrated
 from vioframe.estimation.initialization.epipolar_pairs import BearingPairs, Pairs, refine
 from vioframe.estimation.initialization.window import Window, refuse_unless
@@ -153,17 +154,14 @@ def _null_vector(Q: Float, use: Bool) -> tuple[Float, Float]:
 
 @dataclass(frozen=True, slots=True)
 class Alignment:
-    """The motion in the first body frame B0: ``R_B0B`` (K, 3, 3), ``p_B0B`` (K, 3) m, ``v_B0B`` (K, 3) m/s.
+    """The motion in the first body frame B0, as ``states`` of that world with the biases that go with it.
 
     ``g_B0`` (3,) has the norm of gravity; ``scale`` is metres per unit of the path that was aligned, and may come out
     negative where the readings contradict it.
     """
 
-    R_B0B: Float
-    p_B0B: Float
-    v_B0B: Float
+    states: StateArrays
     g_B0: Float
-    bias_accel_B: Float
     scale: float
 
 
@@ -192,7 +190,8 @@ def align(camera: Float, imu: Sequence[Preintegrated], p_BC: Float, bias_sigma: 
     v_0, g, bias = x[:3], x[3:6], x[6:9]
     p = v_0 * t[:, None] + 0.5 * g * t[:, None] ** 2 + p_imu + p_by_bias @ bias
     v = v_0 + g * t[:, None] + v_imu + v_by_bias @ bias
-    return Alignment(R, p, v, g, bias, float(x[9]))
+    biases = np.tile(imu[0].bias_gyro_B, (len(R), 1)), np.tile(bias, (len(R), 1))
+    return Alignment(StateArrays(R, p, v, *biases), g, float(x[9]))
 
 
 def _cumulate(imu: Sequence[Preintegrated], R: Float) -> tuple[Float, Float, Float, Float, Float]:

@@ -76,7 +76,7 @@ def initialise(packets: Sequence[Packet], calibration: Calibration) -> InitialEs
     window, structure = _structure(window, R_B0B @ calibration.cameras[0].R_BC, sigma)
     alignment = align(structure.position, imu[:-1], calibration.cameras[0].p_BC, BIAS_ACCEL_SIGMA)
     refuse_unless(alignment.scale > 0.0, "the readings contradict the direction of the motion in the images")
-    x = _start_of_adjustment(window.without_last(), structure, alignment, bias_gyro, calibration)
+    x = _start_of_adjustment(window.without_last(), structure, alignment, calibration)
     problem, solution = _adjusted(window.without_last(), x, calibration)
     keep = _explained(problem, solution.variables)
     window = window.only(keep)
@@ -133,13 +133,10 @@ def _structure(window: Window, R_B0C: Float, sigma: float) -> tuple[Window, Stru
 
 
 def _start_of_adjustment(
-    window: Window, structure: Structure, alignment: Alignment, bias_gyro_B: Float, calibration: Calibration
+    window: Window, structure: Structure, alignment: Alignment, calibration: Calibration
 ) -> Variables:
     """States in a world with z up, and landmarks [x y rho] in the first frame that sees them."""
-    R_WB0 = level_rotation(-alignment.g_B0)
-    count = len(window.t_ns)
-    biases = np.tile(bias_gyro_B, (count, 1)), np.tile(alignment.bias_accel_B, (count, 1))
-    states = StateArrays(alignment.R_B0B, alignment.p_B0B, alignment.v_B0B, *biases).turned(R_WB0)
+    states = alignment.states.turned(level_rotation(-alignment.g_B0))
     track = np.arange(len(window.ids))
     host = window.seen.argmax(axis=0)
     inverse_depth = 1.0 / (alignment.scale * structure.depth[host, track])

@@ -336,8 +336,8 @@ def _vins_mono(document: Document, where: str) -> tuple[CameraPart, ImuPart]:
     camera = CameraPart("cam0", model, T_BC, _nanoseconds(said.td), known, said.image_topic)
 
     scale = 1.0 / sqrt(_VINS_MONO_RATE_HZ)
-    densities = [scale * value for value in (said.gyr_n, said.acc_n, said.gyr_w, said.acc_w)]
-    return camera, ImuPart(ImuNoise(*densities, _VINS_MONO_RATE_HZ), np.eye(4))
+    noise = ImuNoise(scale * said.gyr_n, scale * said.acc_n, scale * said.gyr_w, scale * said.acc_w, _VINS_MONO_RATE_HZ)
+    return camera, ImuPart(noise, np.eye(4))
 
 
 def _rigid_transform(values: Float, key: str, where: str) -> Float:
