@@ -311,6 +311,8 @@ def test_distortion_models(tmp_path: Path) -> None:
     assert load_calibration(tmp_path).cameras[0].model.distortion_model == "equidistant"
     chain.write_text("cam0:" + kalibr_camera(transform, model="none").replace("-0.28, 0.07, 0.0002, 1.76e-05", ""))
     assert load_calibration(tmp_path).cameras[0].model.distortion == (0.0, 0.0, 0.0, 0.0)
+    chain.write_text(chain.read_text().replace("distortion_coeffs: []", ""))
+    assert load_calibration(tmp_path).cameras[0].model.distortion == (0.0, 0.0, 0.0, 0.0)
     # A third radial coefficient is harmless only where it is zero.
     chain.write_text("cam0:" + kalibr_camera(transform).replace("1.76e-05]", "1.76e-05, 0.0]"))
     assert load_calibration(tmp_path).cameras[0].model == CAMERA
@@ -329,10 +331,18 @@ def test_distortion_models(tmp_path: Path) -> None:
         ("intrinsics: [458.5, ", "intrinsics: [-458.5, ", "fx, fy > 0"),
         ("resolution: [752, 480]", "resolution: wide", "'resolution' should be 2 numbers, not 'wide'"),
         ("resolution: [752, 480]", "", "'resolution' is missing"),
+        ("camera_model: pinhole", "", "'camera_model' is missing"),
         ("T_imu_cam", "T_cn_cnm1", "use the result of kalibr_calibrate_imu_camera"),
         ("[0.0, 0.0, 0.0, 1.0]", "[0.0, 0.0, 0.1, 1.0]", "last row of 'T_imu_cam'"),
         ("    - [", "    - [9.0, ", "'T_imu_cam' should be 16 finite numbers"),
         ("cam0:", "cam0: [", "not valid YAML"),
+        ("cam0:", "cam0: 7\nother:", "chain.yaml [cam0] holds no calibration: expected 'key: value' lines"),
+        (
+            "distortion_coeffs: [-0.28, ",
+            "distortion_coeffs: [",
+            "should be 0 or 4 or 5 finite numbers",
+        ),
+        ("distortion_coeffs:", "coeffs:", "distortion needs four coefficients"),
         ("cam0:\n", "camera:\n", "not a calibration of a known format"),
     ],
 )

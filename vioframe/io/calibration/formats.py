@@ -204,7 +204,7 @@ class _PinholeCamera(BaseModel):
     intrinsics: Annotated[Float, _numbers(4)]
     distortion_model: Literal["radtan", "radial-tangential", "plumb_bob", "none", "equidistant", "equi"]
     distortion: Annotated[Float, _numbers(0, 4, 5)] = Field(
-        validation_alias=AliasChoices("distortion_coefficients", "distortion_coeffs")
+        np.zeros(0), validation_alias=AliasChoices("distortion_coefficients", "distortion_coeffs")
     )
     resolution: Annotated[Float, _numbers(2)]
     timeshift_cam_imu: FiniteFloat = 0.0
@@ -255,7 +255,9 @@ def _parsed(model: type[ModelT], document: object, where: str) -> ModelT:
         return model.model_validate(document)
     except InvalidError as invalid:
         error = invalid.errors()[0]
-    key = str(error["loc"][-1]) if error["loc"] else "calibration"
+    if not error["loc"]:
+        raise CalibrationError(f"{where} holds no calibration: expected 'key: value' lines")
+    key = str(error["loc"][-1])
     if error["type"] == "missing":
         aliases = [field.validation_alias for field in model.model_fields.values()]
         names = next((a.choices for a in aliases if isinstance(a, AliasChoices) and key in a.choices), [key])
