@@ -480,7 +480,7 @@ def test_a_run_that_is_killed_can_be_evaluated_and_drawn(spoilt_detectors, here)
     assert "the run was interrupted; these figures cover what it left" in evaluated.stderr
     drawn = vioframe_("plot", "out")
     assert drawn.exit_code == 0, drawn.output
-    assert Path("out/plots/path_top.png").is_file()
+    assert Path("out/plots/top_view.png").is_file()
 
 
 def test_a_full_disk_is_one_line_and_keeps_what_was_written(here):

@@ -1,3 +1,6 @@
+import json
+
+import matplotlib as mpl
 import numpy as np
 import pytest
 from click.testing import CliRunner
@@ -7,20 +10,14 @@ from vioframe.cli import main
 from vioframe.evaluation import evaluate
 from vioframe.geometry.trajectory import Trajectory
 from vioframe.io.trajectories import write_tum
-from vioframe.report import figures
-from vioframe.report.figures import write_figures
-from vioframe.runs.evaluated import evaluate_path, evaluate_paths
+from vioframe.report.drawing import drawings, write_figures
+from vioframe.report.figures import figures_of_runs
+from vioframe.report.style import RC, colour
+from vioframe.runs.evaluated import Evaluated, evaluate_path, evaluate_paths
 
-EVERYTHING = {
-    "path_3d",
-    "path_top",
-    "path_side",
-    "translation_error",
-    "rotation_error",
-    "relative_error",
-    "timing",
-    "tracks",
-}
+PATHS = {"trajectories_3d", "top_view", "side_view"}
+ERRORS = {"translation_error_per_axis", "rotation_error", "comparison", "relative_error"}
+EVERYTHING = PATHS | ERRORS | {"timing", "tracks"}
 
 
 @pytest.fixture(scope="module")
@@ -37,6 +34,15 @@ def folder(tmp_path_factory):
 @pytest.fixture(scope="module")
 def runs(folder):
     return evaluate_paths([folder / "a", folder / "b"])
+
+
+def drawn(runs, name, half_width_m=0.0):
+    with mpl.rc_context(dict(RC)):
+        return next(canvas for file, canvas in drawings(figures_of_runs(runs, half_width_m), {}) if file == name)
+
+
+def names(runs):
+    return {name for name, _ in drawings(figures_of_runs(runs), {})}
 
 
 def legend(figure):
@@ -59,28 +65,25 @@ def test_one_run_gets_its_plots_in_its_folder(folder):
 
 def test_equal_runs_give_equal_figures(runs, tmp_path):
     for name in ("one", "two"):
-        write_figures(runs, tmp_path / name, formats=("svg", "png"))
+        write_figures(figures_of_runs(runs), tmp_path / name, formats=("svg", "png"))
     for path in (tmp_path / "one").iterdir():
         assert path.read_bytes() == (tmp_path / "two" / path.name).read_bytes(), path.name
 
 
-def test_a_bare_file_is_drawn_as_far_as_it_goes(folder, tmp_path):
+def test_a_bare_file_is_drawn_as_far_as_it_goes(folder):
     truth = evaluate_path(folder / "a", None).ground_truth
-    with_truth = write_figures([evaluate_path(folder / "b.tum", truth)], tmp_path / "1")
-    assert {path.stem for path in with_truth} == EVERYTHING - {"timing", "tracks"}
-    without = write_figures([evaluate_path(folder / "b.tum", None)], tmp_path / "2")
-    assert {path.stem for path in without} == {"path_3d", "path_top", "path_side"}
+    assert names([evaluate_path(folder / "b.tum", truth)]) == PATHS | ERRORS
+    assert names([evaluate_path(folder / "b.tum", None)]) == PATHS
 
 
 def test_a_run_without_a_pose_does_not_spoil_the_others(tmp_path, folder):
     write_run(tmp_path / "never", flight(30), flight(30), waiting=30)
-    written = write_figures(evaluate_paths([tmp_path / "never", folder / "a"]), tmp_path / "plots")
-    assert {path.stem for path in written} == EVERYTHING
+    assert names(evaluate_paths([tmp_path / "never", folder / "a"])) == EVERYTHING
 
 
-@pytest.mark.parametrize(("draw", "axes"), [(figures.path_top, (0, 1)), (figures.path_side, (0, 2))])
-def test_a_metre_is_a_metre_on_both_axes_and_nothing_is_cut_off(runs, draw, axes):
-    ax = draw(runs).axes[0]
+@pytest.mark.parametrize(("view", "axes"), [("top_view", (0, 1)), ("side_view", (0, 2))])
+def test_a_metre_is_a_metre_on_both_axes_and_nothing_is_cut_off(runs, view, axes):
+    ax = drawn(runs, view).axes[0]
     assert ax.get_aspect() == 1.0
     p_WB = runs[0].ground_truth.p_WB
     for k, (low, high) in zip(axes, (ax.get_xlim(), ax.get_ylim()), strict=True):
@@ -91,69 +94,79 @@ def test_a_metre_is_a_metre_on_both_axes_and_nothing_is_cut_off(runs, draw, axes
 
 
 def test_the_3d_axes_are_to_scale(runs):
-    ax = figures.path_3d(runs).axes[0]
+    ax = drawn(runs, "trajectories_3d").axes[0]
     sizes = np.array([np.ptp(limits) for limits in (ax.get_xlim(), ax.get_ylim(), ax.get_zlim())])
     np.testing.assert_allclose(ax._box_aspect / ax._box_aspect[0], sizes / sizes[0], rtol=1e-6)
 
 
 def test_every_run_is_named_and_the_alignment_stated(runs):
-    drawn = [figures.path_3d(runs), figures.path_top(runs), figures.path_side(runs)]
-    for figure in drawn:
-        assert legend(figure) == ["ground truth", "a", "b"]
-    drawn += [figures.translation_error(runs), figures.rotation_error(runs)]
-    for figure in drawn:
-        assert "position + yaw" in figure._supxlabel.get_text()
-        assert set(legend(figure)) >= {"a", "b"}
+    for name in ("trajectories_3d", "top_view", "side_view", "translation_error_per_axis", "rotation_error"):
+        figure = drawn(runs, name)
+        truth = [] if "error" in name else ["ground truth"]
+        assert legend(figure) == [*truth, "a", "b"]
+        assert "position + yaw" in figure.get_supxlabel()
 
 
 def test_the_curves_are_the_errors(runs):
     expected = evaluate(runs[1].estimate, runs[1].ground_truth)
-    for draw, series in [
-        (figures.translation_error, expected.position_m),
-        (figures.rotation_error, expected.rotation_rpy_deg),
+    for name, series in [
+        ("translation_error_per_axis", expected.position_m),
+        ("rotation_error", expected.rotation_rpy_deg),
     ]:
-        figure = draw(runs)
+        figure = drawn(runs, name)
         for k, ax in enumerate(figure.axes):
-            (line,) = [line for line in ax.get_lines() if line.get_label() == "b"]
-            np.testing.assert_array_equal(line.get_ydata(), series[:, k])
+            (line,) = [line for line in ax.get_lines() if line.get_color() == colour(1)]
+            np.testing.assert_array_equal(line.get_ydata(), series[:, k].astype(np.float32))
             # The first ten frames had no estimate; time counts from where the ground truth begins.
             assert line.get_xdata()[0] == pytest.approx(0.5)
 
 
 def test_the_band_is_as_wide_as_asked(runs):
-    with_band = figures.translation_error(runs, band_m=0.2)
-    assert "±20 cm" in with_band._supxlabel.get_text()
+    with_band = drawn(runs, "translation_error_per_axis", half_width_m=0.2)
+    assert "±20 cm" in with_band.get_supxlabel()
     for ax in with_band.axes:
         (band,) = ax.patches
         assert (band.get_y(), band.get_height()) == (-0.2, 0.4)
-    assert all(not ax.patches for ax in figures.translation_error(runs).axes)
+    assert all(not ax.patches for ax in drawn(runs, "translation_error_per_axis").axes)
 
 
 def test_no_line_is_drawn_across_a_gap():
     truth = flight()
-    holed = truth.select(np.r_[0:100, 200:400])
-    (run,) = [evaluate_run(holed, truth)]
-    ax = figures.translation_error([run]).axes[0]
-    (line,) = [line for line in ax.get_lines() if line.get_label() == "holed"]
+    run = evaluate_run(truth.select(np.r_[0:100, 200:400]), truth)
+    (line,) = drawn([run], "translation_error_per_axis").axes[0].get_lines()
     assert np.flatnonzero(np.isnan(line.get_ydata())).tolist() == [100]
 
 
 def evaluate_run(estimate, truth):
-    from vioframe.runs.evaluated import Evaluated
-
     return Evaluated("holed", None, estimate, truth, evaluate(estimate, truth))
+
+
+def test_a_loop_closed_path_has_its_runs_colour_and_other_dashes(tmp_path, folder):
+    for loops in (0, 1):
+        path = tmp_path / f"{loops}"
+        truth = flight()
+        write_run(path, disturbed(truth, 0.02, 0.01), truth)
+        write_tum(disturbed(truth, 0.01, 0.01), path / "trajectory_loop.tum")
+        summary = json.loads((path / "summary.json").read_text())
+        (path / "summary.json").write_text(json.dumps({**summary, "loop_closure": {"loops": loops}}))
+    # Where no loop was accepted it would be drawn on top of its run.
+    runs = evaluate_paths([tmp_path / "0", tmp_path / "1", folder / "a"])
+    assert [run.name for run in runs] == ["0", "1", "1 with loop closure", "a"]
+    lines = drawn(runs, "rotation_error").axes[0].get_lines()
+    assert [line.get_color() for line in lines] == [colour(0), colour(1), colour(1), colour(2)]
+    assert [line.get_linestyle() for line in lines] == ["-", "-", "--", "-"]
 
 
 def test_a_short_path_shows_fractions_of_itself():
     truth = flight()
     short = Trajectory(truth.t_ns, truth.R_WB, truth.p_WB / 20.0)
-    lower = figures.relative_error([evaluate_run(disturbed(short, 0.001, 0.001), short)]).axes[1]
+    lower = drawn([evaluate_run(disturbed(short, 0.001, 0.001), short)], "relative_error").axes[1]
     assert lower.get_xlabel() == "length of the stretch [% of the path]"
     assert [tick.get_text() for tick in lower.get_xticklabels()] == ["10", "20", "30", "40", "50"]
 
 
 def test_the_bars_add_up_to_the_time_a_frame(runs):
-    ax = figures.timing(runs).axes[0]
+    ax = drawn(runs, "timing").axes[0]
     ends = [bar.get_x() + bar.get_width() for bar in ax.patches]
     assert max(ends) == pytest.approx(sum(runs[0].stage_ms().values()), rel=1e-9)
     assert f"{max(ends):.1f} ms" in {text.get_text() for text in ax.texts}
@@ -161,7 +174,7 @@ def test_the_bars_add_up_to_the_time_a_frame(runs):
 
 def test_a_run_without_times_has_no_bar(runs):
     truth = flight()
-    ax = figures.timing([evaluate_run(truth, truth), *runs]).axes[0]
+    ax = drawn([evaluate_run(truth, truth), *runs], "timing").axes[0]
     assert [label.get_text() for label in ax.get_yticklabels()] == [run.name for run in runs]
 
 

@@ -17,10 +17,11 @@ import pytest
 from suite_helpers import MadeUp, comparison, labels, stress
 
 from vioframe.errors import PluginError
+from vioframe.report.figures import inside_band
 from vioframe.report.suite.figures import figures
 from vioframe.report.suite.page import facts, headline, write_page
 from vioframe.report.suite.report import write_report
-from vioframe.report.suite.statistics import inside_band, records
+from vioframe.report.suite.statistics import records
 from vioframe.report.suite.tables import tables
 from vioframe.runs.results import Data
 

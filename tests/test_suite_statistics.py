@@ -16,6 +16,7 @@ from trajectory_helpers import flight
 from vioframe.evaluation import evaluate
 from vioframe.geometry.trajectory import Trajectory
 from vioframe.io.trajectories import write_tum
+from vioframe.report.figures import inside_band
 from vioframe.report.suite.statistics import (
     Study,
     averages,
@@ -23,10 +24,8 @@ from vioframe.report.suite.statistics import (
     data_caption,
     duels,
     groups,
-    inside_band,
     median_flight,
     records,
-    relative_errors,
     seeds_text,
     stage_means,
     wilson,
@@ -167,17 +166,6 @@ def test_the_band_counts_instants():
     assert share["y"] < 50.0
     by_axis = dict(zip("xyz", 100.0 * within.mean(axis=0), strict=True))
     assert share == {**by_axis, "all": 100.0 * within.all(axis=1).mean()}
-
-
-def test_relative_errors_are_pooled_over_the_flights_of_a_contender(compared):
-    pool = relative_errors(compared, compared.flights)
-    assert pool.groupby(["detector", "backend"], sort=False)["task"].nunique().tolist() == [2, 1, 2, 1]
-    _, own = next(iter(groups(compared.flights)))
-    errors = [compared.errors(row) for row in records(own)]
-    at_8m = np.concatenate([e.relative[8.0].translation_percent for e in errors])
-    mine = pool[pool["task"].isin(own["task"]) & (pool["length"] == 8.0)]
-    np.testing.assert_array_equal(mine["translation_percent"], at_8m)
-    assert not pool["of_path"].any()
 
 
 def test_a_stress_curve_begins_in_the_clear_and_counts_failures_against_success(stressed):

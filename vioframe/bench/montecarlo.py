@@ -6,26 +6,22 @@ initialises, diverges or crashes is kept and says so. What the NEES of many tria
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from itertools import product
+from collections.abc import Mapping
 
 import numpy as np
 from pydantic import Field
 
-from vioframe.bench.processes import installed, map_in_processes
+from vioframe.bench.processes import installed
 from vioframe.bench.run import BackendRun, backend_row, run_backend
-from vioframe.errors import ConfigError, TrajectoryError
-from vioframe.estimation.lifecycle import warm_up
+from vioframe.errors import TrajectoryError
 from vioframe.estimation.options import EstimationOptions
 from vioframe.evaluation.alignment import align_first
-from vioframe.evaluation.consistency import PARTS, Trial, Trials
+from vioframe.evaluation.consistency import PARTS, Trial
 from vioframe.evaluation.nees import nees
 from vioframe.geometry.trajectory import Trajectory
-from vioframe.io.calibration import packaged_calibration
 from vioframe.parts import registry
 from vioframe.parts.config import PartConfig, Section
 from vioframe.simulation import TrackSequence, simulated_sequence
-from vioframe.simulation.flights import flight as named_flight
 from vioframe.types import Float, Int
 
 SHORTEST_S = 10.0
@@ -52,48 +48,12 @@ class Setup(Section):
         return simulated_sequence(self.flight, seed=seed, **self.model_dump(exclude={"flight"}))
 
 
-def run_montecarlo(
-    setups: Sequence[Setup],
-    backends: Mapping[str, PartConfig],
-    seeds: int,
-    *,
-    workers: int = 1,
-    on_trial: Callable[[Trial], None] = lambda trial: None,
-) -> list[Trials]:
-    """Every back-end, by what it is called, on every setup with seeds 0 to ``seeds`` - 1.
-
-    The results do not depend on ``workers``. ``on_trial`` is called with each trial as it comes. Raises what
-    :func:`check_montecarlo` does.
-    """
-    check_montecarlo(setups, backends, seeds, workers)
-    cases = list(product(setups, backends))
-    jobs = [(setup, backends[name], seed, name) for setup, name in cases for seed in range(seeds)]
-    flown = map_in_processes(_fly_job, jobs, workers, on_trial)
-    trials = [tuple(flown[k * seeds : (k + 1) * seeds]) for k in range(len(cases))]
-    return [
-        Trials(name, backends[name].name, dict(backends[name].options), setup.model_dump(), own)
-        for (setup, name), own in zip(cases, trials, strict=True)
-    ]
-
-
-def check_montecarlo(setups: Sequence[Setup], backends: Mapping[str, PartConfig], seeds: int, workers: int) -> None:
-    """Raise :class:`ConfigError` or :class:`PluginError` for what can be told before the first trial."""
-    if seeds < 1 or workers < 1:
-        raise ConfigError(f"needs at least one seed and one worker, got {seeds} and {workers}")
-    calibration = packaged_calibration("euroc", cameras=["cam0"])
-    for setup in setups:
-        named_flight(setup.flight, setup.duration_s, calibration.cameras[0].R_BC)
-    for part in backends.values():
-        # Creating one also compiles its kernels, which the workers would do all at once.
-        warm_up(installed().create_backend(part.name, part.options), calibration)
-
-
 # The simulated IMU has the noise that its calibration states: there is no vibration.
 EXACT = EstimationOptions(imu_noise_factor=1.0)
 
 
-def fly(setup: Setup, part: PartConfig, seed: int, name: str = "") -> Trial:
-    """One trial of the back-end ``part``, called ``name``, on one core.
+def fly(setup: Setup, part: PartConfig, seed: int) -> Trial:
+    """One trial of the back-end ``part`` on one core.
 
     What the back-end raises is a failure of the trial, not of the campaign.
     """
@@ -108,29 +68,29 @@ def fly(setup: Setup, part: PartConfig, seed: int, name: str = "") -> Trial:
         except Exception as error:
             if isinstance(error.__cause__, KeyboardInterrupt):
                 raise KeyboardInterrupt from error  # Ctrl-C within compiled code
-            return Trial(seed, setup.flight, name, "crashed", registry.describe(error))
-        return judge(sequence, run, seed, name)
+            return Trial(seed, "crashed", registry.describe(error))
+        return judge(sequence, run, seed)
 
 
-def judge(sequence: TrackSequence, run: BackendRun, seed: int, backend: str) -> Trial:
+def judge(sequence: TrackSequence, run: BackendRun, seed: int) -> Trial:
     """What ``run`` amounts to against the truth of ``sequence``."""
     events = [event for estimate in run.estimates for event in estimate.events]
     if not run.states:
-        return Trial(seed, sequence.name, backend, "never initialised", events[-1] if events else "")
+        return Trial(seed, "never initialised", events[-1] if events else "")
     try:
         row = backend_row(sequence, run)
         stamps, values = nees_by_stretch(run, sequence.ground_truth)
         t_ns = stamps - run.t_ns[0]
     except (TrajectoryError, np.linalg.LinAlgError) as error:
-        return Trial(seed, sequence.name, backend, "diverged", str(error))
+        return Trial(seed, "diverged", str(error))
     figures = {k: v for k, v in row.items() if k not in ("sequence", "nees", "stage_ms")}
     figures["judged"] = len(t_ns) / len(run.states)
     too_far = row["ate_m"] > max(_DIVERGED_M, _DIVERGED_FRACTION * row["path_m"])
     if too_far or row["orientation_deg"] > _DIVERGED_DEG:
         detail = f"ends with {row['ate_m']:.3g} m and {row['orientation_deg']:.3g} deg RMSE"
-        return Trial(seed, sequence.name, backend, "diverged", detail, figures, t_ns, values)
+        return Trial(seed, "diverged", detail, figures, t_ns, values)
     lost = [event for event in events if event.startswith("lost")]
-    return Trial(seed, sequence.name, backend, None, "; ".join(lost), figures, t_ns, values)
+    return Trial(seed, None, "; ".join(lost), figures, t_ns, values)
 
 
 def nees_by_stretch(run: BackendRun, truth: Trajectory) -> tuple[Int, Mapping[str, Float]]:
@@ -145,7 +105,3 @@ def nees_by_stretch(run: BackendRun, truth: Trajectory) -> tuple[Int, Mapping[st
     return t_ns, {
         part: np.concatenate([[], *(n.values for each in pieces for n in each if n.part == part)]) for part in PARTS
     }
-
-
-def _fly_job(job: tuple[Setup, PartConfig, int, str]) -> Trial:
-    return fly(*job)

@@ -7,10 +7,13 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from vioframe.cli.common import FILE, Bar, print_notes, print_table, quiet_option
+from vioframe.cli.common import FILE, Bar, print_notes, print_table, quiet_option, workers_option
 
 if TYPE_CHECKING:
     from vioframe.evaluation.consistency import Trial
+
+MARKER = "montecarlo.json"
+"""The file by which a folder is known as that of a Monte Carlo."""
 
 
 @click.command("montecarlo")
@@ -43,7 +46,7 @@ if TYPE_CHECKING:
     help="Observations that are 5-30 px off.",
 )
 @click.option("--max-points", type=int, default=150, show_default=True, help="Landmarks in view.")
-@click.option("--workers", type=int, help="Processes.  [default: one a core]")
+@workers_option
 @click.option("--out", type=FILE, help="Folder.  [default: runs/montecarlo]")
 @click.option("--overwrite", is_flag=True, help="Replace the results that are in --out.")
 @quiet_option
@@ -62,28 +65,38 @@ def montecarlo(
     Landmarks instead of images, EuRoC's camera and IMU noise, true calibration, the back-end's own initialisation. A
     trial that fails counts and is shown. docs/montecarlo.md says how to read the table and the plots.
     """
-    from vioframe.bench.montecarlo import Setup, check_montecarlo, run_montecarlo
-    from vioframe.bench.processes import usable_cores
+    from vioframe.bench.processes import map_in_processes, usable_cores
     from vioframe.bench.results import record
+    from vioframe.bench.suites.plan import TrialTask, plan
+    from vioframe.bench.suites.suite import Suite
+    from vioframe.bench.suites.tasks import fly_trial
+    from vioframe.evaluation.consistency import notes, over_trials
     from vioframe.parts import registry
-    from vioframe.parts.config import PartConfig, parse_part, validate
+    from vioframe.parts.config import parse_part, validate
     from vioframe.parts.registry import BACKEND
-    from vioframe.report.montecarlo import MARKER, figures, write_files
+    from vioframe.report.drawing import write_figures
+    from vioframe.report.suite.figures import figures
+    from vioframe.report.suite.statistics import Study, groups
+    from vioframe.report.suite.tables import nees_of_trials
     from vioframe.report.tables import to_rich
     from vioframe.runs.recorder import check_run_folder, free_run_folder, new_run_folder
+    from vioframe.runs.results import Reference, Results
 
     if out is not None:
         check_run_folder(out, overwrite=overwrite, marker=MARKER)
-    setups = [validate(Setup, {"flight": each, **sensors}, "command line") for each in dict.fromkeys(flights)]
     installed = registry.load()
     parts = {spec: parse_part(spec, BACKEND, installed) for spec in backends}
-    complete = {
-        spec: PartConfig(name=part.name, options=installed.find(BACKEND, part.name).validate(part.options))
-        for spec, part in parts.items()
+    grid = {
+        "kind": "trials",
+        "backends": [{"label": spec, "name": part.name, "options": part.options} for spec, part in parts.items()],
+        "seeds": seeds,
     }
-    workers = usable_cores() if workers is None else workers
-    check_montecarlo(setups, complete, seeds, workers)  # before there is a bar: an error is one line and nothing else
-    with Bar(len(setups) * len(complete) * seeds, "first trials under way", quiet=quiet) as bar:
+    tasks = []
+    for flight in dict.fromkeys(flights):
+        tree = {"name": flight, "title": flight, **grid, "setup": {"flight": flight, **sensors}}
+        planned = plan(validate(Suite, tree, "command line"), (), installed).tasks
+        tasks += [task for task in planned if isinstance(task, TrialTask)]
+    with Bar(len(tasks), "first trials under way", quiet=quiet) as bar:
         failed = 0
 
         def on_trial(trial: Trial) -> None:
@@ -92,13 +105,27 @@ def montecarlo(
             went = trial.failure or f"{trial.figures['ate_m']:.3f} m, {trial.figures['orientation_deg']:.2f} deg"
             bar(f"{failed} failed, seed {trial.seed}: {went}")
 
-        cases = run_montecarlo(setups, complete, seeds, workers=workers, on_trial=on_trial)
-    print_table(to_rich(figures(cases)))
-    print_notes(note for case in cases for note in case.notes())
+        trials = map_in_processes(fly_trial, tasks, workers or usable_cores(), on_trial)
+    flown = {task.name: (task, trial) for task, trial in zip(tasks, trials, strict=True)}
+    rows = tuple({**task.about, "status": "ok", **trial.to_dict()} for task, trial in flown.values())
+    listed = {"backends": list(parts), "sequences": list(flights)}
+    nees = {name: trial.nees_over_time() for name, (_, trial) in flown.items()}
+    study = Study(Results(Path(), listed, Reference(), rows), nees)
+    print_table(to_rich(nees_of_trials(study).upright(["back-end", "flight"])))
+    by_case = [own for _, own in groups(study.trials, ("sequence", "backend"))]
+    print_notes(note for own in by_case for note in notes(own))
     # Last: what was found is shown even where the disk is full.
     folder = out or free_run_folder(Path("runs"), "montecarlo")
     new_run_folder(folder, overwrite=overwrite, marker=MARKER)
-    write_files(cases, folder)
-    settings = {"backends": backends, "flights": flights, "seeds": seeds, **sensors}
-    record(folder / MARKER, [case.to_dict() for case in cases], settings)
+    study.nees_table().to_csv(folder / "nees.csv", index=False, float_format="%.9g")
+    write_figures(figures(study), folder)
+    cases = []
+    for own in by_case:
+        of_case = [flown[name] for name in own["task"]]
+        task = of_case[0][0]
+        about = {"backend": task.backend.name, "options": task.backend.options, "setup": task.setup.model_dump()}
+        averages = {part: each.to_dict() for part, each in study.nees(own).items()}
+        by_seed = [trial.to_dict() for _, trial in of_case]
+        cases.append({"name": task.about["backend"], **about, **over_trials(own), "nees": averages, "by_seed": by_seed})
+    record(folder / MARKER, cases, {"backends": backends, "flights": flights, "seeds": seeds, **sensors})
     click.echo(f"written to {folder}: {', '.join(sorted(path.name for path in folder.iterdir()))}")

@@ -94,17 +94,19 @@ def plot(
 ) -> None:
     """Draw each RUN, a run folder or a trajectory file, into the same figures.
 
-    Paths in 3-D, from above and from the side; translation and rotation errors over time; relative errors; time by
-    stage; features over time: as far as the runs have what it takes.
+    Paths in 3-D, from above and from the side; translation and rotation errors and NEES over time; relative errors;
+    time by stage; features over time: as far as the runs have what it takes.
     """
-    from vioframe.report.figures import write_figures
+    from vioframe.report.drawing import write_figures
+    from vioframe.report.figures import figures_of_runs
     from vioframe.report.tables import notes
     from vioframe.runs.evaluated import evaluate_paths
 
     evaluated = evaluate_paths(runs, ground_truth, alignment)
     if out is None:
         out = runs[0] / "plots" if len(runs) == 1 and runs[0].is_dir() else Path("plots")
-    for path in write_figures(evaluated, out, formats=("png", "svg") if svg else ("png",), band_m=band):
+    figures = figures_of_runs(evaluated, band or 0.0)
+    for path in write_figures(figures, out, formats=("png", "svg") if svg else ("png",)):
         click.echo(path)
     print_notes(notes(evaluated))
 

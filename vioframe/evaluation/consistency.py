@@ -6,20 +6,24 @@ Statistics of the NEES after Bar-Shalom, Li and Kirubarajan, "Estimation with Ap
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from vioframe.evaluation.nees import band
 from vioframe.types import Float, Int
 
+if TYPE_CHECKING:
+    import pandas as pd
+
 PARTS: Mapping[str, int] = {"orientation": 3, "position": 3, "pose": 6}
 """Parts of the pose and their degrees of freedom, which is what their NEES should be on average."""
 
 FAILURES = ("never initialised", "diverged", "crashed")
+_RMS = ("ate_m", "percent", "orientation_deg")
+_MEANS = ("completion", "initialised_s", "cpu_ms")
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,8 +35,6 @@ class Trial:
     """
 
     seed: int
-    flight: str
-    backend: str
     failure: str | None
     detail: str = ""
     figures: Mapping[str, Any] = field(default_factory=dict)
@@ -40,9 +42,15 @@ class Trial:
     nees: Mapping[str, Float] = field(default_factory=dict)
 
     def to_dict(self) -> dict[str, Any]:
-        means = {part: float(values.mean()) for part, values in self.nees.items() if len(values)}
-        about = {"seed": self.seed, "failure": self.failure, "detail": self.detail}
-        return about | dict(self.figures) | {"nees": means}
+        """What a table has of it: the NEES, by part, as means over time."""
+        means = {f"nees.{part}": float(values.mean()) for part, values in self.nees.items() if len(values)}
+        return {"seed": self.seed, "failure": self.failure, "detail": self.detail, **self.figures, **means}
+
+    def nees_over_time(self) -> pd.DataFrame:
+        """A row an instant; none where there is no covariance."""
+        import pandas as pd
+
+        return pd.DataFrame({"t_ns": self.t_ns, **self.nees})
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,91 +98,51 @@ class AverageNees:
         }
 
 
-@dataclass(frozen=True, eq=False)
-class Trials:
-    """All trials of one back-end, ``name`` with its ``options``, on one ``setup``, in the order of their seeds."""
+def average_nees(trials: Sequence[pd.DataFrame]) -> dict[str, AverageNees]:
+    """By part of the pose, of the NEES over time of several trials; empty where none has a covariance."""
+    import pandas as pd
 
-    name: str
-    backend: str
-    options: Mapping[str, Any]
-    setup: Mapping[str, Any]
-    trials: tuple[Trial, ...]
+    having = [trial for trial in trials if len(trial)]
+    if not having:
+        return {}
+    at = pd.concat(having).groupby("t_ns")
+    counts, t_ns = np.array(at.size(), np.int64), np.array(at.size().index, np.int64)
+    found = {}
+    for part, dof in PARTS.items():
+        bands = {n: average_band(dof, n) for n in np.unique(counts).tolist()}
+        low, high = np.array([bands[n] for n in counts.tolist()]).T
+        mean = float(np.mean([trial[part].mean() for trial in having]))
+        values = at[part].mean().to_numpy()
+        found[part] = AverageNees(part, dof, t_ns, counts, values, low, high, mean, average_band(dof, len(having)))
+    return found
 
-    @property
-    def flight(self) -> str:
-        return str(self.setup["flight"])
 
-    @property
-    def failures(self) -> dict[str, int]:
-        """Trials by kind of failure, all kinds listed."""
-        counts = Counter(trial.failure for trial in self.trials)
-        return {kind: counts[kind] for kind in FAILURES}
+def over_trials(trials: pd.DataFrame) -> dict[str, Any]:
+    """What trials amount to, a row each as :meth:`Trial.to_dict` has it: root mean squares of errors, means of others.
 
-    def values(self, key: str) -> Float:
-        """The figure ``key`` of every trial that has it: those that diverged too, not those without an estimate."""
-        found = [trial.figures.get(key) for trial in self.trials]
-        return np.array([value for value in found if value is not None], dtype=np.float64)
+    Trials that diverged are in it, those without an estimate only among the ``failures``; None is not known.
+    """
+    figures = trials.reindex(columns=[*_RMS, *_MEANS, "resets"]).astype(float)
+    values = {**((figures[[*_RMS]] ** 2).mean() ** 0.5).to_dict(), **figures[[*_MEANS]].mean().to_dict()}
+    return {
+        "trials": len(trials),
+        "failures": {kind: int((trials["failure"] == kind).sum()) for kind in FAILURES},
+        "resets": int(figures["resets"].sum()),
+        **{str(key): None if np.isnan(value) else value for key, value in values.items()},
+    }
 
-    def rms(self, key: str) -> float | None:
-        """Root mean square of a figure over the trials."""
-        values = self.values(key)
-        return float(np.sqrt(np.mean(values**2))) if len(values) else None
 
-    def mean(self, key: str) -> float | None:
-        values = self.values(key)
-        return float(values.mean()) if len(values) else None
-
-    def total(self, key: str) -> int:
-        return int(self.values(key).sum())
-
-    def nees(self, part: str) -> AverageNees | None:
-        """The average NEES of ``part``, or None where no trial has a covariance."""
-        having = [(trial.t_ns, trial.nees[part]) for trial in self.trials if len(trial.t_ns)]
-        if not having:
-            return None
-        t_ns, index = np.unique(np.concatenate([t for t, _ in having]), return_inverse=True)
-        trials = np.bincount(index)
-        values = np.bincount(index, np.concatenate([v for _, v in having])) / trials
-        bands = {n: average_band(PARTS[part], n) for n in np.unique(trials).tolist()}
-        low, high = np.array([bands[n] for n in trials.tolist()]).T
-        mean = float(np.mean([v.mean() for _, v in having]))
-        return AverageNees(
-            part, PARTS[part], t_ns, trials, values, low, high, mean, average_band(PARTS[part], len(having))
-        )
-
-    def to_dict(self) -> dict[str, Any]:
-        """Everything but the time series, ready for JSON; the time that trials took is ``cpu_ms`` and nothing else."""
-        average = {part: self.nees(part) for part in PARTS}
-        return {
-            "name": self.name,
-            "backend": self.backend,
-            "options": dict(self.options),
-            "setup": dict(self.setup),
-            "trials": len(self.trials),
-            "failures": self.failures,
-            "completion": self.mean("completion"),
-            "resets": self.total("resets"),
-            "ate_m": self.rms("ate_m"),
-            "percent": self.rms("percent"),
-            "orientation_deg": self.rms("orientation_deg"),
-            "initialised_s": self.mean("initialised_s"),
-            "cpu_ms": self.mean("cpu_ms"),
-            "nees": {part: found.to_dict() for part, found in average.items() if found},
-            "by_seed": [trial.to_dict() for trial in self.trials],
-        }
-
-    def notes(self) -> Iterator[str]:
-        """One line for each thing that a reader of the figures should know."""
-        where = f"{self.name} on {self.flight}"
-        for trial in self.trials:
-            if trial.failure or trial.detail:
-                what = f"{trial.failure or 'started again'}: {trial.detail or 'no reason given'}"
-                yield f"{where}, seed {trial.seed} {what}"
-        judged = self.values("judged")
-        if len(judged) and judged.max() == 0.0:
-            yield f"{where}: states no covariance, so there is no NEES"
-        elif len(judged) and judged.min() < 0.95:
-            yield f"{where}: at up to {1.0 - judged.min():.0%} of a trial's instants there is no covariance to judge"
+def notes(trials: pd.DataFrame) -> Iterator[str]:
+    """One line for each thing that a reader of trials, of one ``backend`` on one ``sequence``, should know."""
+    where = f"{trials['backend'].iloc[0]} on {trials['sequence'].iloc[0]}"
+    for seed, failure, detail in trials[["seed", "failure", "detail"]].itertuples(index=False):
+        if failure or detail:
+            yield f"{where}, seed {seed} {failure or 'started again'}: {detail or 'no reason given'}"
+    judged = trials.reindex(columns=["judged"])["judged"].astype(float)
+    if judged.max() == 0.0:
+        yield f"{where}: states no covariance, so there is no NEES"
+    elif judged.min() < 0.95:
+        yield f"{where}: at up to {1.0 - judged.min():.0%} of a trial's instants there is no covariance to judge"
 
 
 def average_band(dof: int, trials: int) -> tuple[float, float]:

@@ -1,304 +1,440 @@
-"""The figures of ``vioframe plot``: paths, errors over time and over distance, and what a run cost."""
+"""Figures, each described once, in Plotly's terms: those of runs, and what those of suites are made of.
+
+The page of a report draws them with Plotly (:mod:`.suite.page`); files are drawn from the same traces and layouts with
+matplotlib (:mod:`.drawing`). A trace's ``meta`` says whose it is: ``series`` is its entry in the legend, ``detector``
+and ``backend`` by which the page's filters hide it and by which files have a column a back-end; or ``owners``, one of
+those a point, where the points of a trace have several. ``note`` is a figure of the trace itself, such as its RMSE;
+``x_back`` how many traces before it the one is that has its x, which is then not stored again.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+import pandas as pd
 
-from vioframe.errors import RunError
 from vioframe.evaluation import ALIGNED_BY, TrajectoryErrors
-from vioframe.report.style import PALETTE_SIZE, RC, TRUTH, caption, colour, legend_above, line
+from vioframe.evaluation.consistency import PARTS
+from vioframe.evaluation.metrics import rotation_error_deg
+from vioframe.evaluation.nees import band
+from vioframe.report.style import TRUTH_COLOUR, looks
 from vioframe.runs.evaluated import Evaluated
-from vioframe.types import Float
+from vioframe.types import NS_PER_S, Float, Int
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+BAND_COLOUR = "#009e73"
+"""Of the range that errors are meant to stay in: no run's, as it is only ever drawn as an area."""
+ROW, FRAME = 34, 90
+"""Heights, px: of a row of bars, and of what is around them."""
+POINTS = 2000
+# Lightness tells the stages apart, the hue front-end from back-end.
+_FRONT_END = ("#24415e", "#3f6a94", "#6f9bc4", "#a9c8e4", "#d3e3f2")
+_BACK_END = (
+    *("#7a4a12", "#c9873a", "#ecc48d", "#a0671f", "#dfa863", "#f6e3c9", "#8a6d4d", "#b59a7a", "#d8c6ad", "#5f4326"),
+)
 
-_AXES = "xyz"
-_WIDTH_INCH = 10.0
-_MARGIN = 0.06
-_LONGER_SIDE_INCH = 8.5
-_LABELS_INCH = np.array([0.9, 1.3])
-_LEGEND_INCH = 7.5
-_HATCHES = ("", "///", "...", "xx")
+Trace = dict[str, Any]
+Layout = dict[str, Any]
 
 
-def write_figures(
-    runs: Sequence[Evaluated], out: Path, *, formats: Sequence[str] = ("png",), band_m: float | None = None
-) -> list[Path]:
-    """Draw everything that ``runs`` have data for into the folder ``out``; returns the files written.
+@dataclass(frozen=True)
+class Case:
+    """One of the things that a figure can show: pictures, traces with their layout, side by side with one legend.
 
-    ``formats`` are file endings that matplotlib knows; ``band_m`` shades plus or minus that in the translation errors.
+    ``files`` is what stands before the figure's name in those of its files, None where there are none.
     """
-    import matplotlib as mpl
 
-    written = []
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-        with mpl.rc_context(dict(RC)):
-            for name, draw in _available(runs, band_m).items():
-                figure = draw(runs)
-                for ending in formats:
-                    written.append(out / f"{name}.{ending}")
-                    # Without its date an SVG is the same file for the same runs.
-                    figure.savefig(written[-1], metadata={"Date": None} if ending == "svg" else None)
-    except OSError as error:
-        raise RunError(f"cannot write figures to {out}: {error.strerror}; choose another --out") from error
-    return written
+    pictures: Sequence[tuple[Sequence[Trace], Layout]]
+    caption: str = ""
+    files: str | None = ""
 
 
-def _available(runs: Sequence[Evaluated], band_m: float | None) -> dict[str, Callable[[Sequence[Evaluated]], Figure]]:
-    """Drawings by file name."""
-    errors = [run.errors for run in runs if run.errors]
-    drawings: dict[str, Callable[[Sequence[Evaluated]], Figure]] = {}
-    if any(run.estimate for run in runs):
-        drawings |= {"path_3d": path_3d, "path_top": path_top, "path_side": path_side}
-    if errors:
-        drawings["translation_error"] = lambda runs: translation_error(runs, band_m)
-        drawings["rotation_error"] = rotation_error
-    if any(e.relative or e.relative_by_fraction for e in errors):
-        drawings["relative_error"] = relative_error
-    if any(run.stage_ms() for run in runs):
-        drawings["timing"] = timing
-    if any(run.folder and run.folder.tracks() for run in runs):
-        drawings["tracks"] = tracks
-    return drawings
+@dataclass(frozen=True)
+class Figure:
+    """A figure with a case for each choice of the reader. Heights are in px, ``narrow_height`` is for phones.
+
+    ``views`` is for paths in 3-D, which are to be seen from above and from the side as well.
+    """
+
+    name: str
+    title: str
+    cases: Mapping[str, Case]
+    caption: str = ""
+    choice: str = "Flight"
+    height: int = 460
+    narrow_height: int = 0
+    views: bool = False
 
 
-# Paths
+@dataclass(frozen=True)
+class Line:
+    """A run as it is drawn, and whose it is. ``repeats`` are the errors of all runs that it stands for, its own too."""
+
+    run: Evaluated
+    meta: Mapping[str, Any]
+    colour: str
+    dash: str
+    fill: str
+    repeats: Sequence[TrajectoryErrors]
+    points: int = POINTS
+
+    def style(self, width: float = 1.8) -> dict[str, Any]:
+        return {"color": self.colour, "dash": self.dash, "width": width}
+
+    @property
+    def series(self) -> str:
+        return str(self.meta["series"])
+
+    def shown(self, t_ns: Int, values: Float) -> Float:
+        """``values`` (N, ...) at the stamps (N,), at no more than so many, with NaN wherever no line must be drawn."""
+        return _thinned(values, self.run.breaks(t_ns), self.points)
+
+    def seconds(self, t_ns: Int) -> Float:
+        """Stamps (N,) as they are shown, since the ground truth begins, or the estimate where there is none."""
+        begin_ns = (self.run.ground_truth.t_ns if self.run.ground_truth else t_ns)[0]
+        return self.shown(t_ns, (t_ns - begin_ns) / NS_PER_S)
 
 
-def path_3d(runs: Sequence[Evaluated]) -> Figure:
-    """All paths in perspective, to one scale on the three axes."""
-    from matplotlib.figure import Figure
+@dataclass(frozen=True)
+class Course:
+    """Runs to be drawn into one picture; ``files`` as in :class:`Case`."""
 
-    figure = Figure(figsize=(_WIDTH_INCH, 7.5), layout="constrained")
-    ax: Any = figure.add_subplot(projection="3d", computed_zorder=False)
-    low, high = _draw_paths(figure, ax, runs, (0, 1, 2))
-    ax.set_zlim(low[2], high[2])
-    ax.set_zlabel("z [m]", labelpad=8)
-    ax.set_box_aspect(high - low, zoom=1.15)
-    ax.locator_params(nbins=6)
-    ax.locator_params(axis="z", nbins=4)
-    ax.view_init(elev=28, azim=-58)
-    return figure
+    label: str
+    lines: Sequence[Line]
+    note: str = ""
+    files: str | None = ""
 
+    @property
+    def with_errors(self) -> list[tuple[Line, TrajectoryErrors]]:
+        return [(line, line.run.errors) for line in self.lines if line.run.errors]
 
-def path_top(runs: Sequence[Evaluated]) -> Figure:
-    """The paths from above, along gravity: y over x."""
-    return _projection(runs, 0, 1)
+    def case(self, traces: Sequence[Trace], layout: Layout, *, of_many: bool = False) -> Case:
+        """``of_many`` is for what has files of each recording where there are several."""
+        return Case([(traces, layout)], self.note, self.files if of_many or not self.files else None)
 
 
-def path_side(runs: Sequence[Evaluated]) -> Figure:
-    """The paths from the side: height over x."""
-    return _projection(runs, 0, 2)
+def figures_of_runs(runs: Sequence[Evaluated], half_width_m: float = 0.0) -> list[Figure]:
+    """All that ``runs`` have data for; plus or minus ``half_width_m`` is shaded in the translation errors."""
+    lines = [
+        Line(run, {"series": run.name}, colour, dash, f"{colour}bf", [run.errors] if run.errors else [])
+        for run, (colour, dash) in zip(runs, looks(runs), strict=True)
+    ]
+    found = [*figures_of_courses([Course("all", lines)], half_width_m), _timing(lines), _tracks(lines)]
+    return [figure for figure in found if figure.cases]
 
 
-def _projection(runs: Sequence[Evaluated], *axes: int) -> Figure:
-    from matplotlib.figure import Figure
-
-    figure = Figure(layout="constrained")
-    ax: Any = figure.add_subplot()
-    low, high = _draw_paths(figure, ax, runs, axes)
-    size = (high - low)[[*axes]]
-    width, height = _LONGER_SIDE_INCH * size / size.max() + _LABELS_INCH
-    figure.set_size_inches(max(width, _LEGEND_INCH), height)
-    ax.set_aspect("equal")
-    return figure
-
-
-def _draw_paths(figure: Figure, ax: Any, runs: Sequence[Evaluated], axes: Sequence[int]) -> tuple[Float, Float]:
-    """The ground truth of every flight below, the estimates above it; returns the corners (3,) of what is shown."""
-    truths = {run.ground_truth.t_ns.tobytes(): run.ground_truth.p_WB for run in runs if run.errors and run.ground_truth}
-    estimates = [_estimate(run) for run in runs]
-    low, high = _bounds(np.concatenate([*truths.values(), *estimates]))
-    handles = [ax.plot(*p_W[:, axes].T, **TRUTH, zorder=2)[0] for p_W in truths.values()]
-    for i, (run, p_W) in enumerate(zip(runs, estimates, strict=True)):
-        handles += ax.plot(*p_W[:, axes].T, **line(i), label=run.name, zorder=3 + i)
-        ax.plot(*p_W[:1, axes].T, "o", ms=6, color=colour(i), zorder=10 + i)
-    space = {"labelpad": 8} if len(axes) == 3 else {}
-    ax.set_xlim(low[axes[0]], high[axes[0]])
-    ax.set_ylim(low[axes[1]], high[axes[1]])
-    ax.set_xlabel(f"{_AXES[axes[0]]} [m]", **space)
-    ax.set_ylabel("z (up) [m]" if axes[1] == 2 else f"{_AXES[axes[1]]} [m]", **space)
-    legend_above(figure, handles)
-    how = next((ALIGNED_BY[run.errors.alignment_name] for run in runs if run.errors), None)
-    frame = "No ground truth: each estimate in its own frame"
-    caption(figure, f"{f'Estimates aligned with the ground truth by {how}' if how else frame}. Dots mark the starts.")
-    return low, high
+def figures_of_courses(courses: Sequence[Course], half_width_m: float = 0.0) -> list[Figure]:
+    """Paths, and errors over time and by length, a case a course."""
+    return [
+        trajectories(courses),
+        translation_error(courses, half_width_m),
+        _rotation_error(courses),
+        _comparison(courses),
+        relative_error(courses),
+        _nees(courses),
+    ]
 
 
-def _estimate(run: Evaluated) -> Float:
-    """Positions (N, 3) in the ground truth's world where there is one; NaN between segments, so that no line joins
-    them."""
-    aligned = run.aligned
-    return np.empty((0, 3)) if aligned is None else np.insert(aligned.p_WB, run.breaks(aligned.t_ns), np.nan, axis=0)
+# Paths, and errors over time ------------------------------------------------------------------------------------------
 
 
-def _bounds(points: Float) -> tuple[Float, Float]:
-    """Corners (3,) of a box around points (N, 3), with a margin, and not flat."""
-    low, high = (np.nanmin(points, axis=0), np.nanmax(points, axis=0)) if len(points) else (np.zeros(3), np.zeros(3))
-    size = max(float((high - low).max()), 1e-3)
-    thin = np.maximum(0.12 * size - (high - low), 0.0) / 2.0
-    return low - thin - _MARGIN * size, high + thin + _MARGIN * size
+def trajectories(courses: Sequence[Course]) -> Figure:
+    """Paths in 3-D, each from its dot on."""
+    cases = {}
+    for course in courses:
+        truths = {truth.t_ns.tobytes(): truth for line, _ in course.with_errors if (truth := line.run.ground_truth)}
+        drawn = [(line, estimate) for line in course.lines if (estimate := line.run.aligned)]
+        grey = {"line": {"color": TRUTH_COLOUR, "width": 9}, "opacity": 0.6, "hoverinfo": "skip"}
+        traces = [
+            {**_path(_thinned(truth.p_WB, [])), **grey, "meta": {"series": "ground truth"}} for truth in truths.values()
+        ]
+        for line, estimate in drawn:
+            hover = f"(%{{x:.2f}}, %{{y:.2f}}, %{{z:.2f}}) m at %{{customdata:.1f}} s<extra>{line.series}</extra>"
+            path = {**_path(line.shown(estimate.t_ns, estimate.p_WB)), "line": line.style(4), "meta": line.meta}
+            traces.append({**path, "customdata": line.seconds(estimate.t_ns), "hovertemplate": hover})
+        for line, estimate in drawn:
+            dot = {"mode": "markers", "marker": {"size": 5, "color": line.colour}, "hoverinfo": "skip"}
+            traces.append({**_path(estimate.p_WB[:1]), **dot, "meta": line.meta})
+        scene = {"aspectmode": "data", **{f"{axis}axis": {"title": {"text": f"{axis} [m]"}} for axis in "xyz"}}
+        layout = {"scene": scene, "margin": {"l": 0, "r": 0, "t": 0, "b": 0}}
+        if drawn:
+            cases[course.label] = course.case(traces, layout, of_many=True)
+    how = _aligned_by(courses)
+    about = f"Each estimate is aligned with the ground truth by {how}" if how else "Each estimate in its own frame"
+    heights: dict[str, Any] = {"height": 560, "narrow_height": 400}
+    return Figure("trajectories_3d", "Trajectories", cases, f"{about}. Dots mark the starts.", views=True, **heights)
 
 
-# Errors
+def _path(p_W: Float) -> Trace:
+    return {"type": "scatter3d", "mode": "lines", **dict(zip("xyz", p_W.T, strict=True))}
 
 
-def translation_error(runs: Sequence[Evaluated], band_m: float | None = None) -> Figure:
-    """Position error along each axis of the world over time; ``band_m`` shades the range within plus or minus it."""
-    names = ("x error [m]", "y error [m]", "z (up) error [m]")
-    about = f" Shaded: ±{100 * band_m:g} cm." if band_m else ""
-    what = "Estimate minus ground truth in the world's axes"
-    return _over_time(runs, names, lambda errors: errors.position_m, what, about, band_m)
-
-
-def rotation_error(runs: Sequence[Evaluated]) -> Figure:
-    """Rotation error about each axis of the world over time."""
-    names = ("roll error [deg]", "pitch error [deg]", "yaw error [deg]")
-    return _over_time(runs, names, lambda errors: errors.rotation_rpy_deg, "Roll, pitch, yaw about the world's x, y, z")
+_Series = Callable[[TrajectoryErrors], Sequence[tuple[Int, Float, str]]]
+"""Stamps (N,), values (N,) and a note of each panel; none where an estimate has none."""
 
 
 def _over_time(
-    runs: Sequence[Evaluated],
-    names: Sequence[str],
-    series: Callable[[TrajectoryErrors], Float],
-    what: str,
-    about: str = "",
-    band: float | None = None,
-) -> Figure:
-    figure, panels = _panels(3, 8.0)
-    with_errors = [(i, run, run.errors) for i, run in enumerate(runs) if run.errors]
-    handles: list[Any] = []
-    for k, (ax, name) in enumerate(zip(panels, names, strict=True)):
-        ax.axhline(0.0, color="black", lw=0.8)
-        if band:
-            ax.axhspan(-band, band, color="#56B4E9", alpha=0.15, lw=0)
-        handles = []
-        for i, run, errors in with_errors:
-            # With a NaN at every break, so that no line is drawn where nothing was estimated.
-            begin_ns = (run.ground_truth or errors.truth).t_ns[0]
-            breaks = run.breaks(errors.estimate.t_ns)
-            time_s = np.insert((errors.estimate.t_ns - begin_ns) * 1e-9, breaks, np.nan)
-            values = np.insert(series(errors)[:, k], breaks, np.nan)
-            handles += ax.plot(time_s, values, **line(i), label=run.name)
-        ax.set_ylabel(name)
-        ax.margins(x=0.01)
-    panels[-1].set_xlabel("time since the ground truth begins [s]")
-    figure.align_ylabels(panels)
-    legend_above(figure, handles)
-    how = ALIGNED_BY[with_errors[0][2].alignment_name]
-    caption(figure, f"{what}, aligned by {how} over the whole path.{about}")
-    return figure
-
-
-def relative_error(runs: Sequence[Evaluated]) -> Figure:
-    """Boxes of the relative errors by length of the stretch: translation and yaw."""
-    from matplotlib.patches import Patch
-
-    fixed = any(run.errors.relative for run in runs if run.errors)
-    found = [
-        {} if run.errors is None else run.errors.relative if fixed else run.errors.relative_by_fraction for run in runs
-    ]
-    lengths = sorted(set().union(*found))
-    figure, panels = _panels(2, 8.0)
-    width = 0.8 / len(runs)
-    for i, by_length in enumerate(found):
-        places = [k + (i - 0.5 * (len(runs) - 1)) * width for k, length in enumerate(lengths) if length in by_length]
-        errors = [by_length[length] for length in lengths if length in by_length]
-        for ax, values in (
-            (panels[0], [each.translation_percent for each in errors]),
-            (panels[1], [each.yaw_deg for each in errors]),
-        ):
-            if values:
-                ax.boxplot(
-                    values,
-                    positions=places,
-                    widths=0.85 * width,
-                    whis=(5, 95),
-                    showfliers=False,
-                    patch_artist=True,
-                    manage_ticks=False,
-                    boxprops={"facecolor": colour(i), "edgecolor": colour(i), "alpha": 0.75},
-                    medianprops={"color": "white", "lw": 2},
-                    whiskerprops={"color": colour(i)},
-                    capprops={"color": colour(i)},
+    courses: Sequence[Course],
+    name: str,
+    panel_titles: Sequence[str],
+    series: _Series,
+    bands: Sequence[tuple[float, float]] = (),
+    **y: Any,
+) -> dict[str, Case]:
+    """What there is of each run over time, a panel each, with its band shaded; ``y`` is for every panel's axis."""
+    cases = {}
+    for course in courses:
+        traces: list[Trace] = []
+        for line, errors in course.with_errors:
+            for k, (t_ns, values, note) in enumerate(series(errors)):
+                said = f"%{{y:.3f}} at %{{x:.1f}} s{f', {note}' if note else ''}<extra>{line.series}</extra>"
+                shown = {"x": None if k else line.seconds(t_ns), "y": line.shown(t_ns, values), "line": line.style()}
+                meta = {**line.meta, "note": note, "x_back": k}
+                traces.append(
+                    {"type": "scatter", "mode": "lines", **shown, "hovertemplate": said, "meta": meta, **axes(k)}
                 )
-    panels[0].set_ylabel("translation error [% of length]")
-    panels[1].set_ylabel("yaw error [deg]")
-    panels[1].set_xlabel("length of the stretch [m]" if fixed else "length of the stretch [% of the path]")
-    panels[1].set_xticks(range(len(lengths)), [f"{length if fixed else 100 * length:g}" for length in lengths])
-    for ax in panels:
-        ax.set_ylim(bottom=0.0)
-        ax.grid(visible=False, axis="x")
-    legend_above(figure, [Patch(color=colour(i), label=run.name) for i, run in enumerate(runs) if found[i]])
-    caption(figure, "Every pose starts a stretch, aligned at its first pose. Boxes: quartiles; whiskers: 5 to 95 %.")
-    return figure
+        layout = panels(panel_titles, "time since the ground truth begins [s]", **y)
+        if bands:
+            layout["shapes"] = [_shaded(k, *ends) for k, ends in enumerate(bands)]
+        if traces:
+            cases[course.label] = course.case(traces, layout, of_many=name == "translation_error_per_axis")
+    return cases
 
 
-# Cost
+def translation_error(courses: Sequence[Course], half_width_m: float = 0.0) -> Figure:
+    """Position error along each axis of the world, and how much of it is within the band about zero."""
+
+    def series(errors: TrajectoryErrors) -> list[tuple[Int, Float, str]]:
+        share = inside_band(errors, half_width_m)
+        notes = [f"{share[axis]:.1f} % inside" if half_width_m else "" for axis in "xyz"]
+        return [(errors.estimate.t_ns, errors.position_m[:, k], notes[k]) for k in range(3)]
+
+    name, titles = "translation_error_per_axis", [f"{axis} [m]" for axis in ("x", "y", "z (up)")]
+    bands = [(-half_width_m, half_width_m)] * 3 if half_width_m else []
+    # The band's edges are in sight, however small the errors are.
+    least = {"autorangeoptions": {"include": [-1.2 * half_width_m, 1.2 * half_width_m]}} if half_width_m else {}
+    cases = _over_time(courses, name, titles, series, bands, **least)
+    shaded = f" Shaded: ±{100 * half_width_m:g} cm, beside how much of the estimated time is inside."
+    about = f"Estimate minus ground truth in the world's axes, aligned by {_aligned_by(courses)} over the whole path."
+    about += shaded if half_width_m else ""
+    return Figure(name, "Translation error by axis", cases, about, height=560, narrow_height=520)
 
 
-def timing(runs: Sequence[Evaluated]) -> Figure:
-    """Mean milliseconds a frame, a bar a run, stacked by stage."""
-    from matplotlib.figure import Figure
-    from matplotlib.patches import Patch
+def _rotation_error(courses: Sequence[Course]) -> Figure:
+    def series(errors: TrajectoryErrors) -> list[tuple[Int, Float, str]]:
+        return [(errors.estimate.t_ns, errors.rotation_rpy_deg[:, k], "") for k in range(3)]
 
+    cases = _over_time(courses, "rotation_error", [f"{angle} [deg]" for angle in ("roll", "pitch", "yaw")], series)
+    about = f"Roll, pitch, yaw about the world's x, y, z, aligned by {_aligned_by(courses)} over the whole path."
+    return Figure("rotation_error", "Rotation error", cases, about, height=560, narrow_height=520)
+
+
+def _comparison(courses: Sequence[Course]) -> Figure:
+    def series(errors: TrajectoryErrors) -> list[tuple[Int, Float, str]]:
+        t_ns, metres = errors.estimate.t_ns, np.asarray(np.linalg.norm(errors.position_m, axis=1))
+        degrees = rotation_error_deg(errors.estimate, errors.truth)
+        sizes = ((metres, errors.ate_m.rmse, "m"), (degrees, errors.orientation_deg.rmse, "deg"))
+        return [(t_ns, values, f"RMSE {rmse:.3g} {unit}") for values, rmse, unit in sizes]
+
+    cases = _over_time(courses, "comparison", ("translation error [m]", "rotation error [deg]"), series)
+    about = f"Distance from the truth and angle to it, aligned by {_aligned_by(courses)} over the whole path."
+    return Figure("comparison", "Size of the errors", cases, about, height=380, narrow_height=520)
+
+
+def _nees(courses: Sequence[Course]) -> Figure:
+    def series(errors: TrajectoryErrors) -> list[tuple[Int, Float, str]]:
+        # The first instants are the gauge's own, without error, and nothing to a logarithmic axis.
+        notes = [f"mean {each.mean:.3g}, {100 * each.inside:.0f} % inside" for each in errors.nees]
+        return [(n.t_ns, np.maximum(n.values, 1e-3), note) for n, note in zip(errors.nees, notes, strict=True)]
+
+    titles = [f"{part} (ideally {dof})" for part, dof in PARTS.items()]
+    cases = _over_time(courses, "nees", titles, series, [band(dof) for dof in PARTS.values()])
+    for case in cases.values():
+        for k, dof in enumerate(PARTS.values()):
+            logarithmic = {"type": "log", "dtick": 1, "tickformat": "~g", "minallowed": np.log10(0.03 * dof)}
+            case.pictures[0][1][axis_name("y", k)] |= logarithmic
+    about = (
+        "Shaded: 95 % of the instants of an honest filter; above, the filter is surer of itself than it should be. "
+        "Position and yaw fixed at the first pose. Errors within a flight hang together: no test at a level."
+    )
+    return Figure("nees", "NEES of the flights over time", cases, about, height=560, narrow_height=520)
+
+
+def inside_band(errors: TrajectoryErrors, half_width_m: float) -> dict[str, float]:
+    """Percent of the instants at which |x|, |y|, |z| and all three are within ``half_width_m``."""
+    within = np.abs(errors.position_m) <= half_width_m
+    percent = dict(zip("xyz", (100.0 * within.mean(axis=0)).tolist(), strict=True))
+    return {**percent, "all": 100.0 * float(within.all(axis=1).mean())}
+
+
+def _aligned_by(courses: Sequence[Course]) -> str:
+    names = dict.fromkeys(errors.alignment_name for course in courses for _, errors in course.with_errors)
+    return " or ".join(ALIGNED_BY[name] for name in names)
+
+
+def _thinned(values: Float, breaks: Sequence[int] | Int, points: int = POINTS) -> Float:
+    """No more than so many of ``values`` (N, ...), with NaN ahead of each of ``breaks``."""
+    # What is before and after a break stays, however few of the others do.
+    at = np.asarray(breaks, np.int64)
+    evenly = np.linspace(0, len(values) - 1, min(len(values), points)).astype(np.int64)
+    kept = np.unique(np.concatenate([evenly, at, at - 1]))
+    with_gaps = np.insert(np.asarray(values, float)[kept], np.searchsorted(kept, at), np.nan, axis=0)
+    # As many digits as a screen can show, in half of the page's bytes.
+    return np.asarray(with_gaps, np.float32)
+
+
+# By length, and what it cost ------------------------------------------------------------------------------------------
+
+
+def relative_error(courses: Sequence[Course]) -> Figure:
+    """Boxes by length of the stretch, of all that a line stands for."""
+    cases = {}
+    for course in courses:
+        stretches = stretches_of(course.lines)
+        if stretches.empty:
+            continue
+        of_path = bool(stretches["of_path"].iloc[0])
+        names = {length: f"{100 * length if of_path else length:g}" for length in sorted(stretches["length"].unique())}
+        titles = ("translation error [% of length]", "yaw error [deg]")
+        layout = panels(titles, f"length of the stretch [{'% of the path' if of_path else 'm'}]", rangemode="tozero")
+        for k in range(2):
+            layout[axis_name("x", k)] |= category(list(names.values()))
+        traces = []
+        for number, own in stretches.groupby("line"):
+            line = course.lines[int(str(number))]
+            for k, column in enumerate(("translation_percent", "yaw_deg")):
+                five = own.groupby("length")[column].quantile(np.array([0.05, 0.25, 0.5, 0.75, 0.95])).unstack()
+                keys = ("lowerfence", "q1", "median", "q3", "upperfence")
+                outline = {"color": line.colour, "width": 1.6}
+                box = {"type": "box", "x": [names[length] for length in five.index], "line": outline}
+                box |= dict(zip(keys, five.to_numpy().T, strict=True)) | {"fillcolor": line.fill}
+                box |= {"name": line.series, "offsetgroup": line.series, "hoverinfo": "y+name"}
+                traces.append({**box, "meta": line.meta, **axes(k)})
+        layout |= {"boxmode": "group", "boxgap": 0.25, "boxgroupgap": 0.3}
+        cases[course.label] = course.case(traces, layout, of_many=True)
+    about = (
+        "Every pose of every run starts a stretch, aligned at its first pose; stretches overlap. Boxes: quartiles and "
+        "median; whiskers: 5 to 95 %."
+    )
+    heights: dict[str, Any] = {"height": 520, "narrow_height": 480}
+    return Figure("relative_error", "Relative error by length of the stretch", cases, about, **heights)
+
+
+def stretches_of(lines: Sequence[Line]) -> pd.DataFrame:
+    """A row a stretch of all that the lines stand for: the number of its ``line``, its ``length`` and its errors.
+
+    By length in metres where any path is long enough, else by fraction of the path, which ``of_path`` says.
+    """
+    by_length = any(errors.relative for line in lines for errors in line.repeats)
+    tables = [
+        pd.DataFrame({"translation_percent": each.translation_percent, "yaw_deg": each.yaw_deg}).assign(
+            line=number, length=length, of_path=not by_length
+        )
+        for number, line in enumerate(lines)
+        for errors in line.repeats
+        for length, each in (errors.relative if by_length else errors.relative_by_fraction).items()
+    ]
+    return pd.concat(tables, ignore_index=True) if tables else pd.DataFrame()
+
+
+def _timing(lines: Sequence[Line]) -> Figure:
     # What loop closure made of a run has no times of its own.
-    spent = {run.name: stage_ms for run in runs if (stage_ms := run.stage_ms())}
-    stages = list(dict.fromkeys(stage for each in spent.values() for stage in each))
-    height = 2.6 + 0.75 * len(spent) + 0.25 * (len(stages) // 3)
-    figure = Figure(figsize=(_WIDTH_INCH, height), layout="constrained")
-    ax: Any = figure.subplots()
-    left = np.zeros(len(spent))
-    handles = []
-    for k, stage in enumerate(stages):
-        hatch = _HATCHES[(k // PALETTE_SIZE) % len(_HATCHES)]
-        look: dict[str, Any] = {"facecolor": colour(k), "hatch": hatch, "edgecolor": "white", "lw": 0.5}
-        width = np.array([each.get(stage, 0.0) for each in spent.values()])
-        ax.barh(range(len(spent)), width, left=left, height=0.6, **look)
-        left += width
-        handles.append(Patch(**look, label=stage))
-    for i, total in enumerate(left):
-        ax.annotate(f"{total:.1f} ms", (total, i), xytext=(6, 0), textcoords="offset points", va="center")
-    ax.set_yticks(range(len(spent)), list(spent))
-    ax.invert_yaxis()
-    ax.set_xlim(0.0, 1.12 * max(float(left.max()), 1e-3))
-    ax.set_xlabel("mean time a frame [ms]")
-    ax.grid(visible=False, axis="y")
-    legend_above(figure, handles)
-    caption(figure, "Without reading and decoding the images.")
-    return figure
+    spent = {line.run.name: stage_ms for line in lines if (stage_ms := line.run.stage_ms())}
+    means = pd.DataFrame.from_dict(spent, orient="index").fillna(0.0)
+    return timing({"all": Case([stage_bars(means, [])])} if spent else {}, len(spent))
 
 
-def tracks(runs: Sequence[Evaluated]) -> Figure:
+def timing(cases: Mapping[str, Case], rows: int) -> Figure:
+    """Of what :func:`stage_bars` makes, with no more than so many ``rows``."""
+    about = "Mean over all frames, without reading and decoding images. Blue: front-end; brown: back-end."
+    return Figure("timing", "Time a frame by stage", cases, about, "Recordings", FRAME + (ROW + 8) * rows)
+
+
+def stage_bars(means: pd.DataFrame, owners: Sequence[Mapping[str, str]]) -> tuple[list[Trace], Layout]:
+    """Bars of milliseconds a frame by stage, a column each: a row a run or a contender, by its name."""
+    shades = {False: iter(_FRONT_END * 3), True: iter(_BACK_END * 3)}
+    traces = [
+        {
+            "type": "bar",
+            "orientation": "h",
+            "x": means[stage].tolist(),
+            "y": list(means.index),
+            "marker": {"color": next(shades[str(stage).startswith("backend")])},
+            "text": [str(stage).removeprefix("backend.").replace("_", " ")] * len(means),
+            "textposition": "inside",
+            "insidetextanchor": "middle",
+            "textangle": 0,
+            "hovertemplate": "%{y}: %{x:.2f} ms" + f"<extra>{stage}</extra>",
+            "meta": {"series": stage, "owners": owners},
+        }
+        for stage in means.columns
+    ]
+    layout = {
+        "barmode": "stack",
+        "bargap": 0.3,
+        # A name that does not fit is left to the legend.
+        "uniformtext": {"minsize": 11, "mode": "hide"},
+        "xaxis": {"title": {"text": "mean time a frame [ms]"}, "rangemode": "tozero"},
+        "yaxis": {"autorange": "reversed", "ticks": "", "ticksuffix": "  "},
+    }
+    return traces, layout
+
+
+def _tracks(lines: Sequence[Line]) -> Figure:
     """Features tracked, and new among them, in each frame."""
-    figure, panels = _panels(2, 6.0)
-    handles = []
-    for i, run in enumerate(runs):
-        found = run.folder.tracks() if run.folder else None
-        if found is not None:
-            time_s = (found.frames_ns - found.frames_ns[0]) * 1e-9
-            handles += panels[0].plot(time_s, found.tracked, **line(i), label=run.name)
+    layout = panels(("features in the frame", "new among them"), "time since the first frame [s]", rangemode="tozero")
+    traces = []
+    for line in lines:
+        if found := line.run.folder.tracks() if line.run.folder else None:
+            time_s = (found.frames_ns - found.frames_ns[0]) / NS_PER_S
             # In the first frame every feature is new, which would hide all that follows.
-            panels[1].plot(time_s[1:], found.new[1:], **{**line(i), "lw": 1.0})
-    for ax, name in zip(panels, ("features in the frame", "new among them"), strict=True):
-        ax.set_ylabel(name)
-        ax.set_ylim(bottom=0)
-        ax.margins(x=0.01)
-    panels[1].set_xlabel("time since the first frame [s]")
-    figure.align_ylabels(panels)
-    legend_above(figure, handles)
-    return figure
+            for k, counts in enumerate((found.tracked, found.new[1:])):
+                shown = {"x": time_s[k:], "y": counts, "line": line.style(), "meta": line.meta}
+                traces.append({"type": "scatter", "mode": "lines", **shown, **axes(k)})
+    return Figure("tracks", "Features over time", {"all": Case([(traces, layout)])} if traces else {})
 
 
-def _panels(rows: int, height_inch: float) -> tuple[Figure, Any]:
-    """Panels one above the other that share their x axis."""
-    from matplotlib.figure import Figure
+# Layouts and areas ----------------------------------------------------------------------------------------------------
 
-    figure = Figure(figsize=(_WIDTH_INCH, height_inch), layout="constrained")
-    return figure, figure.subplots(rows, 1, sharex=True)
+
+def panels(titles: Sequence[str], x_title: str, gap: float = 0.07, **y: Any) -> Layout:
+    """Panels above each other that share their x axis; the k-th one's traces are on ``axes(k)``."""
+    height = (1.0 - gap * (len(titles) - 1)) / len(titles)
+    layout: Layout = {}
+    for k, title in enumerate(titles):
+        bottom, last = (len(titles) - 1 - k) * (height + gap), k == len(titles) - 1
+        domain = [max(0.0, bottom), min(1.0, bottom + height)]
+        layout[axis_name("y", k)] = {"domain": domain, "anchor": axes(k)["xaxis"], "title": {"text": title}, **y}
+        shared = {} if k == 0 else {"matches": "x"}
+        about = {"showticklabels": last, "title": {"text": x_title if last else ""}}
+        layout[axis_name("x", k)] = {"anchor": axes(k)["yaxis"], **about, **shared}
+    return layout
+
+
+def axis_name(name: str, k: int) -> str:
+    """What the layout calls an axis of the k-th of :func:`panels`."""
+    return f"{name}axis{k + 1 if k else ''}"
+
+
+def axes(k: int) -> dict[str, str]:
+    """Which axes the traces of the k-th of :func:`panels` belong to."""
+    return {f"{name}axis": f"{name}{k + 1 if k else ''}" for name in "xy"}
+
+
+def category(names: Sequence[str]) -> dict[str, Any]:
+    return {"type": "category", "categoryorder": "array", "categoryarray": list(names)}
+
+
+def area(x: Any, low: Any, high: Any, colour: str, opacity: float = 0.18) -> Trace:
+    outline = {"x": [*x, *x[::-1]], "y": [*high, *low[::-1]], "mode": "lines", "line": {"width": 0, "color": colour}}
+    outline = {key: np.asarray(value, np.float32) if key in "xy" else value for key, value in outline.items()}
+    return {**outline, "fill": "toself", "fillcolor": colour, "opacity": opacity, "hoverinfo": "skip"}
+
+
+def _shaded(k: int, low: float, high: float) -> dict[str, Any]:
+    """All along the k-th panel."""
+    where = {"type": "rect", "xref": f"{axes(k)['xaxis']} domain", "yref": axes(k)["yaxis"], "x0": 0, "x1": 1}
+    look = {"fillcolor": BAND_COLOUR, "opacity": 0.13, "line": {"width": 0}, "layer": "below"}
+    return {**where, "y0": low, "y1": high, **look}

@@ -6,13 +6,12 @@ from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 from typing import Any
 
-# Okabe and Ito's palette, strongest contrasts first; grey is the ground truth's.
-_COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
-PALETTE_SIZE = len(_COLOURS)
-_DASHES = ("-", (0, (6, 2)), (0, (2, 1.5)), (0, (6, 2, 1, 2)))
+from vioframe.runs.evaluated import Evaluated
 
-# A broad grey ribbon stays visible below any number of lines that follow it.
-TRUTH: Mapping[str, Any] = MappingProxyType({"color": "#b0b0b0", "lw": 5.0, "label": "ground truth"})
+# Okabe and Ito's palette, strongest contrasts first; grey is the ground truth's.
+_COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
+TRUTH_COLOUR = "#b0b0b0"
+DASHES = ("solid", "dash", "dot", "dashdot")
 
 RC: Mapping[Any, Any] = MappingProxyType(
     {
@@ -31,29 +30,24 @@ RC: Mapping[Any, Any] = MappingProxyType(
         "legend.frameon": False,
         "legend.fontsize": 11,
         "figure.dpi": 100,
-        "savefig.dpi": 160,
         "svg.hashsalt": "vioframe",
         "svg.fonttype": "none",
     }
 )
 
 
-def line(i: int) -> dict[str, Any]:
-    """Colour and dashes of the i-th run; runs beyond the palette differ by their dashes."""
-    return {"color": colour(i), "ls": _DASHES[(i // PALETTE_SIZE) % len(_DASHES)]}
-
-
 def colour(i: int) -> str:
     """The i-th colour of the palette, which repeats."""
-    return _COLOURS[i % PALETTE_SIZE]
+    return _COLOURS[i % len(_COLOURS)]
 
 
-def caption(figure: Any, text: str) -> None:
-    """A line under the figure that says how to read it."""
-    figure.supxlabel(text, fontsize=10, color="#555555", x=0.01, ha="left")
-
-
-def legend_above(figure: Any, handles: Sequence[Any]) -> None:
-    """One legend for all panels, above them, so that it hides no data."""
-    labels = [handle.get_label() for handle in handles]
-    figure.legend(handles, labels, loc="outside upper left", ncols=min(len(labels), 4), borderaxespad=0.2)
+def looks(runs: Sequence[Evaluated]) -> list[tuple[str, str]]:
+    """Colour and dashes of each run. What loop closure made of one has its colour, as has who is beyond the palette:
+    their dashes differ."""
+    out: list[tuple[str, str]] = []
+    number = -1
+    for run in runs:
+        number += not run.loop_closed
+        dash = 2 * (max(number, 0) // len(_COLOURS)) + run.loop_closed
+        out.append((colour(max(number, 0)), DASHES[dash % len(DASHES)]))
+    return out

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from rich.table import Table
 
 UNKNOWN = "–"
+_STYLES = {"consistent": "green", "overconfident": "red", "pessimistic": "yellow"}
 
 # Cells by section and label, as formats of what `Evaluated.to_dict` holds.
 _RUN = {
@@ -109,7 +110,7 @@ def to_rich(cells: pd.DataFrame) -> Table:
         table.add_row(Text(str(title), style="bold"))
         for label, row in rows.droplevel(0).iterrows():
             # As Text, because rich would read a unit in brackets as markup.
-            table.add_row(Text(f"  {label}"), *(cell if isinstance(cell, Text) else Text(cell) for cell in row))
+            table.add_row(Text(f"  {label}"), *(Text(cell, _STYLES.get(cell, "")) for cell in row))
         table.add_section()
     return table
 

@@ -18,7 +18,7 @@ import numpy as np
 from vioframe.errors import ConfigError, RunError, VioframeError
 from vioframe.evaluation import evaluate
 from vioframe.geometry.meshes import read_mesh
-from vioframe.report.style import TRUTH, colour
+from vioframe.report.style import TRUTH_COLOUR, looks
 from vioframe.runs.evaluated import Evaluated
 from vioframe.runs.folder import RunFolder
 from vioframe.types import DBA, DBG, DP, DTHETA, NS_PER_S, Float, FrameSet, Int
@@ -88,25 +88,20 @@ def view_runs(
 
 @dataclass(frozen=True)
 class _Shown:
-    """A run on its way into ``stream``: its ``number`` in the palette and the stamp at which its time begins.
+    """A run on its way into ``stream``: its colour and the stamp at which its time begins.
 
     ``images_at`` is the body that the images of its recording are shown on: that of the first run that was made on it.
     """
 
     stream: rr.RecordingStream
     run: Evaluated
-    number: int
+    colour: int
     begin_ns: int
     images_at: str
 
     @property
-    def colour(self) -> int:
-        return _rgba(colour(self.number))
-
-    @property
     def faint(self) -> int:
-        """Halfway to white."""
-        return self.colour >> 1 & 0x7F7F7F7F | 0x808080FF
+        return _faint(self.colour)
 
     def in_world(self, *parts: str) -> str:
         """The entity of this run that is called so."""
@@ -280,12 +275,14 @@ def _shown(runs: Sequence[Evaluated], stream: rr.RecordingStream) -> list[_Shown
     first_on: dict[Path, Evaluated] = {}
     begins: dict[str, int] = {}
     out = []
-    for number, run in enumerate(runs):
+    for run, (colour, _) in zip(runs, looks(runs), strict=True):
         flown = None if run.folder is None else run.folder.dataset_config().path
         first = run if flown is None else first_on.setdefault(flown, run)
         begin_ns = begins.setdefault(first.name, _first_stamp_ns(run))
         begin_ns = begin_ns if run.ground_truth is None else int(run.ground_truth.t_ns[0])
-        out.append(_Shown(stream, run, number, begin_ns, _path("world", first.name, "body")))
+        # There are no dashes to tell what loop closure made of a run from the run itself.
+        rgba = _faint(_rgba(colour)) if run.loop_closed else _rgba(colour)
+        out.append(_Shown(stream, run, rgba, begin_ns, _path("world", first.name, "body")))
     return out
 
 
@@ -306,7 +303,7 @@ def _log_truths(shown: Iterable[_Shown]) -> None:
             continue
         seen.append(truth.t_ns.tobytes())
         name = "ground truth" if len(seen) == 1 else f"ground truth {len(seen)}"
-        grey, at = _rgba(TRUTH["color"]), _path("world", name, "body")
+        grey, at = _rgba(TRUTH_COLOUR), _path("world", name, "body")
         each.log(_path("world", name), rr.LineStrips3D([truth.p_WB], colors=grey, radii=_TRUTH))
         each.log(at, rr.Points3D.from_fields(colors=grey, radii=-4.0))
         each.send(at, truth.t_ns, rr.Points3D.columns(positions=truth.p_WB))
@@ -407,6 +404,11 @@ def _broadside(shown: Sequence[_Shown]) -> rrb.EyeControls3D:
 def _rgba(colour: str) -> int:
     """0xRRGGBBAA of ``#RRGGBB``."""
     return int(colour[1:], 16) << 8 | 0xFF
+
+
+def _faint(rgba: int) -> int:
+    """Halfway to white."""
+    return rgba >> 1 & 0x7F7F7F7F | 0x808080FF
 
 
 def _path(*parts: str) -> str:

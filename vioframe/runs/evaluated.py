@@ -47,7 +47,8 @@ class Evaluated:
     ``map_quality`` is there where :func:`~vioframe.report.map_quality.measure_maps` found a world to compare with,
     ``measured`` where :func:`measure_runs` was asked for metrics.
     ``segment_starts_ns`` are the stamps at which tracking began again after a reset. What loop closure made of a run is
-    an evaluation of its own, without a folder. ``kept_in`` is the file of the run folder that an evaluation belongs in.
+    an evaluation of its own, ``loop_closed`` and without a folder. ``kept_in`` is the file of the run folder that an
+    evaluation belongs in.
     """
 
     name: str
@@ -59,6 +60,7 @@ class Evaluated:
     measured: Measured | None = None
     segment_starts_ns: tuple[int, ...] = ()
     kept_in: Path | None = None
+    loop_closed: bool = False
 
     @property
     def summary(self) -> Mapping[str, Any]:
@@ -113,9 +115,12 @@ def evaluate_path(path: Path, ground_truth: Trajectory | None, alignment: str = 
 
 
 def with_loop_closure(run: Evaluated, alignment: str = "posyaw") -> Evaluated | None:
-    """What loop closure made of ``run``, evaluated against the same ground truth; None where it had none."""
+    """What loop closure made of ``run``, evaluated against the same ground truth.
+
+    None where it had none, and where no loop was accepted: it is the same trajectory then.
+    """
     corrected = run.folder.loop_closed() if run.folder else None
-    if corrected is None or run.folder is None:
+    if corrected is None or run.folder is None or not run.summary.get("loop_closure", {}).get("loops", 1):
         return None
     return replace(
         run,
@@ -124,6 +129,7 @@ def with_loop_closure(run: Evaluated, alignment: str = "posyaw") -> Evaluated | 
         estimate=corrected,
         errors=_errors(corrected, run.ground_truth, alignment),
         kept_in=run.folder.path / "evaluation_loop.json",
+        loop_closed=True,
     )
 
 

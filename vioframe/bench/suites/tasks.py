@@ -20,6 +20,7 @@ from vioframe.bench.suites.plan import AnyTask, FlightTask, Recording, SpeedTask
 from vioframe.bench.suites.store import Store
 from vioframe.errors import RunError, TrajectoryError
 from vioframe.evaluation import Comparison, TrajectoryErrors
+from vioframe.evaluation.consistency import Trial
 from vioframe.io.convert import appearing
 from vioframe.parts.registry import describe
 from vioframe.runs import machine
@@ -126,14 +127,16 @@ def of_errors(errors: TrajectoryErrors) -> Figures:
 
 
 def _trial(task: TrialTask, folder: Path) -> Figures:
-    import pandas as pd
-
-    trial = fly(task.setup, task.backend, task.about["seed"])
+    trial = fly_trial(task)
     folder.mkdir()
     if len(trial.t_ns):
-        pd.DataFrame({"t_ns": trial.t_ns, **trial.nees}).to_csv(folder / NEES_FILE, index=False, lineterminator="\n")
-    means = {f"nees.{part}": float(values.mean()) for part, values in trial.nees.items() if len(values)}
-    return {"failure": trial.failure, "detail": trial.detail, **trial.figures, **means}
+        trial.nees_over_time().to_csv(folder / NEES_FILE, index=False, lineterminator="\n")
+    return trial.to_dict()
+
+
+def fly_trial(task: TrialTask) -> Trial:
+    """One trial of a Monte Carlo."""
+    return fly(task.setup, task.backend, task.about["seed"])
 
 
 def speed(task: SpeedTask) -> list[Figures]:

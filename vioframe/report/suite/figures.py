@@ -1,27 +1,38 @@
-"""The figures that a suite's results have data for, each described once, in Plotly's terms.
-
-The page draws them with Plotly (:mod:`.page`), files are drawn from the same traces and layouts with matplotlib
-(:mod:`.drawing`). A trace's ``meta`` says whose it is: ``series`` is its entry in the legend, ``detector`` and
-``backend`` by which the page's filters hide it and by which files have a column a back-end; or ``owners``, one of
-those a point, where the points of a trace have several. ``note`` is a figure of the trace itself, such as its RMSE;
-``x_back`` how many traces before it the one is that has its x, which is then not stored again.
-"""
+"""The figures that a suite's results have data for: those of its runs, contenders compared, speed, and trials."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
-from vioframe.evaluation import ALIGNED_BY, TrajectoryErrors
 from vioframe.evaluation.consistency import PARTS, AverageNees
-from vioframe.evaluation.metrics import rotation_error_deg
-from vioframe.evaluation.nees import band
 from vioframe.report import style
+from vioframe.report.figures import (
+    BAND_COLOUR,
+    FRAME,
+    POINTS,
+    ROW,
+    Case,
+    Course,
+    Figure,
+    Layout,
+    Line,
+    Trace,
+    area,
+    axes,
+    axis_name,
+    category,
+    figures_of_courses,
+    panels,
+    stage_bars,
+    timing,
+)
+from vioframe.report.style import DASHES, TRUTH_COLOUR
 from vioframe.report.suite.statistics import (
     CONTENDER,
     COURSE,
@@ -31,69 +42,23 @@ from vioframe.report.suite.statistics import (
     curves,
     data_caption,
     groups,
-    inside_band,
     median_flight,
-    relative_errors,
+    records,
     seeds_text,
     stage_means,
 )
 from vioframe.report.suite.tables import speed_caption
-from vioframe.runs.evaluated import Evaluated
 from vioframe.runs.results import CLEAR
-from vioframe.types import NS_PER_S, Float, Int
+from vioframe.types import NS_PER_S
 
-TRUTH_COLOUR = str(style.TRUTH["color"])
-BAND_COLOUR = "#009e73"
-"""Of the range that errors are meant to stay in: no detector's, as it is only ever drawn as an area."""
-DASHES = ("solid", "dash", "dot", "dashdot")
 _FILLS = (0.85, 0.25, 0.5, 0.1)
 _SYMBOLS = ("circle", "square", "triangle-up", "diamond")
-# Lightness tells the stages apart, the hue front-end from back-end.
-_FRONT_END = ("#24415e", "#3f6a94", "#6f9bc4", "#a9c8e4", "#d3e3f2")
-_BACK_END = (
-    *("#7a4a12", "#c9873a", "#ecc48d", "#a0671f", "#dfa863", "#f6e3c9", "#8a6d4d", "#b59a7a", "#d8c6ad", "#5f4326"),
-)
-_POINTS, _POINTS_LEAST, _POINTS_IN_ALL = 2000, 300, 30_000
-_ROW, _FRAME = 34, 90
-"""Heights, px: of a row of bars, and of what is around them."""
+_POINTS_LEAST, _POINTS_IN_ALL = 300, 30_000
 _LOGARITHMIC_FROM = 4.0
 """NEES that leaves its bounds by this factor makes the axis logarithmic."""
 _ROOM = 1.8
 """Factor between the outermost errors and the end of a logarithmic axis."""
-_TIME = "time since the estimate begins [s]"
 _LOG = {"type": "log", "dtick": "D2", "tickformat": "~g"}
-
-Trace = dict[str, Any]
-Layout = dict[str, Any]
-
-
-@dataclass(frozen=True)
-class Case:
-    """One of the things that a figure can show: pictures, traces with their layout, side by side with one legend.
-
-    ``files`` is what stands before the figure's name in those of its files, None where there are none.
-    """
-
-    pictures: Sequence[tuple[Sequence[Trace], Layout]]
-    caption: str = ""
-    files: str | None = ""
-
-
-@dataclass(frozen=True)
-class Figure:
-    """A figure with a case for each choice of the reader. Heights are in px, ``narrow_height`` is for phones.
-
-    ``views`` is for paths in 3-D, which are to be seen from above and from the side as well.
-    """
-
-    name: str
-    title: str
-    cases: Mapping[str, Case]
-    caption: str = ""
-    choice: str = "Flight"
-    height: int = 460
-    narrow_height: int = 0
-    views: bool = False
 
 
 @dataclass(frozen=True)
@@ -115,7 +80,7 @@ class Look:
 
     def colour(self, detector: str, backend: str) -> str:
         one = len(self.detectors) < 2
-        return style.colour(self.backends.index(backend) if one else self.detectors.index(detector)).lower()
+        return style.colour(self.backends.index(backend) if one else self.detectors.index(detector))
 
     def line(self, detector: str, backend: str, width: float = 1.8) -> dict[str, Any]:
         dash = DASHES[0 if len(self.detectors) < 2 else self.backends.index(backend) % len(DASHES)]
@@ -141,70 +106,32 @@ class Look:
 
 def figures(study: Study) -> list[Figure]:
     """All that there is data for, with the numbers that somebody else has for them where the reference says so."""
-    look, quoted = Look.of(study), study.results.reference.figures
-    found = [figure for make in _FIGURES if (figure := make(study, look)) is not None and figure.cases]
+    look, reference = Look.of(study), study.results.reference
+    courses = figures_of_courses(_courses(study, look), reference.band.half_width_m if reference.band else 0.0)
+    made = [_detector_fps(study), _stress(study, look), _ate_by_sequence(study, look), *courses, _timing(study, look)]
+    made += [_nees_of_trials(study, look), _trials(study, look)]
+    found = [figure for figure in made if figure is not None and figure.cases]
+    quoted = reference.figures
     return [replace(f, title=f"{quoted[f.name].title}: {f.title}") if f.name in quoted else f for f in found]
 
 
-# Flights: paths, and errors over time ---------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class _Line:
-    """A contender's flight as it is drawn: that of the median ATE."""
-
-    detector: str
-    backend: str
-    errors: TrajectoryErrors
-    run: Evaluated
-    points: int
-
-    def shown(self, t_ns: Int, values: Float) -> Float:
-        """``values`` (N, ...) at the stamps (N,), at no more than so many, with NaN wherever no line must be drawn."""
-        breaks = self.run.breaks(t_ns)
-        # What is before and after a break stays, however few of the others do.
-        evenly = np.linspace(0, len(t_ns) - 1, min(len(t_ns), self.points)).astype(np.int64)
-        kept = np.unique(np.concatenate([evenly, breaks, breaks - 1]))
-        with_gaps = np.insert(np.asarray(values, float)[kept], np.searchsorted(kept, breaks), np.nan, axis=0)
-        # As many digits as a screen can show, in half of the page's bytes.
-        return np.asarray(with_gaps, np.float32)
-
-
-@dataclass(frozen=True)
-class _Course:
-    """All contenders on one recording and condition; ``files`` as in :class:`Case`."""
-
-    label: str
-    lines: Sequence[_Line]
-    note: str
-    files: str | None
-
-    @property
-    def begin_ns(self) -> int:
-        """The first estimate of any: whoever began later stays behind."""
-        return min(int(line.errors.estimate.t_ns[0]) for line in self.lines)
-
-    def case(self, traces: Sequence[Trace], layout: Layout, *, of_many: bool = False) -> Case:
-        """``of_many`` is for what has files of each recording where there are several."""
-        return Case([(traces, layout)], self.note, self.files if of_many or not self.files else None)
-
-
-def _courses(study: Study) -> list[_Course]:
-    """Those on which there is something to draw."""
+def _courses(study: Study, look: Look) -> list[Course]:
+    """All contenders on one recording and condition, where there is something to draw: each one's median flight."""
     flights = study.flights
-    points = max(_POINTS_LEAST, min(_POINTS, _POINTS_IN_ALL // max(1, flights.groupby([*COURSE, *CONTENDER]).ngroups)))
+    points = max(_POINTS_LEAST, min(POINTS, _POINTS_IN_ALL // max(1, flights.groupby([*COURSE, *CONTENDER]).ngroups)))
     several = flights[flights["condition"] == CLEAR].groupby(COURSE).ngroups > 1
     found = []
     for (data, sequence, condition, level), here in groups(flights, COURSE):
         lines, missing = [], []
-        for (detector, backend), own in groups(here, CONTENDER):
+        for contender, own in groups(here, CONTENDER):
             flight = median_flight(own)
-            errors, run = (None, None) if flight is None else (study.errors(flight), study.run(flight))
-            if errors is None or run is None:
-                missing.append(f"{detector} with {backend}")
+            run = None if flight is None else study.evaluated(flight)
+            if run is None or run.errors is None:
+                missing.append(" with ".join(contender))
             else:
-                whole = Evaluated(run.name, run, None, None, errors, segment_starts_ns=run.segment_starts_ns())
-                lines.append(_Line(detector, backend, errors, whole, points))
+                dash, fill = look.line(*contender)["dash"], look.fill(*contender)
+                repeats = [errors for each in records(own) if (errors := study.errors(each))]
+                lines.append(Line(run, look.meta(*contender), look.colour(*contender), dash, fill, repeats, points))
         seeds = here.groupby(CONTENDER).size().max()
         of_two = "one with the larger" if seeds == 2 else "one with the median"
         notes = [_note(here)]
@@ -213,174 +140,11 @@ def _courses(study: Study) -> list[_Course]:
         where = sequence if condition == CLEAR else f"{sequence}, {condition_text(condition, level).replace('_', ' ')}"
         files = None if study.is_stress else _file_name(f"{sequence}_{data}_") if several else ""
         if lines:
-            found.append(_Course(f"{where} ({data})", lines, " ".join(notes), files))
+            found.append(Course(f"{where} ({data})", lines, " ".join(notes), files))
     return found
 
 
-def _trajectories_3d(study: Study, look: Look) -> Figure:
-    cases = {}
-    for course in _courses(study):
-        longest = max(course.lines, key=lambda line: line.errors.truth.path_length_m)
-        grey = {"color": TRUTH_COLOUR, "width": 9}
-        traces = [_path(longest, longest.errors.truth.p_WB, grey, {"series": "ground truth"}, opacity=0.6)]
-        for line in course.lines:
-            meta = look.meta(line.detector, line.backend)
-            t_ns = line.errors.estimate.t_ns
-            hover = f"(%{{x:.2f}}, %{{y:.2f}}, %{{z:.2f}}) m at %{{customdata:.1f}} s<extra>{meta['series']}</extra>"
-            time = {"customdata": line.shown(t_ns, (t_ns - course.begin_ns) / NS_PER_S), "hovertemplate": hover}
-            own = look.line(line.detector, line.backend, width=4)
-            traces.append(_path(line, line.errors.estimate.p_WB, own, meta, **time))
-        scene = {"aspectmode": "data", **{f"{axis}axis": {"title": {"text": f"{axis} [m]"}} for axis in "xyz"}}
-        layout = {"scene": scene, "margin": {"l": 0, "r": 0, "t": 0, "b": 0}}
-        cases[course.label] = course.case(traces, layout, of_many=True)
-    about = f"Each estimate is aligned with the ground truth by {_how(study)} over the whole flight, never scaled."
-    heights: dict[str, Any] = {"height": 560, "narrow_height": 400}
-    return Figure("trajectories_3d", "Trajectories", cases, about, views=True, **heights)
-
-
-def _path(line: _Line, p_W: Float, look: Mapping[str, Any], meta: Mapping[str, Any], **more: Any) -> Trace:
-    x, y, z = line.shown(line.errors.estimate.t_ns, p_W).T
-    more = {"hoverinfo": "skip"} | more if "hovertemplate" not in more else more
-    return {"type": "scatter3d", "x": x, "y": y, "z": z, "mode": "lines", "line": look, "meta": meta, **more}
-
-
-_Series = Callable[[TrajectoryErrors], Sequence[tuple[Int, Float, str]]]
-"""Stamps (N,), values (N,) and a note of each panel; none where an estimate has none."""
-
-
-def _over_time(
-    study: Study, look: Look, name: str, panel_titles: Sequence[str], series: _Series, half_width: float = 0.0
-) -> Figure:
-    """What there is of each flight over time, a panel each; the ``half_width`` of a band about zero is shaded."""
-    cases = {}
-    for course in _courses(study):
-        traces: list[Trace] = []
-        for line in course.lines:
-            found = series(line.errors)
-            for k, (t_ns, values, note) in enumerate(found):
-                meta = look.meta(line.detector, line.backend, note=note, x_back=k)
-                time_s = line.shown(t_ns, (t_ns - course.begin_ns) / NS_PER_S)
-                said = f"%{{y:.3f}} at %{{x:.1f}} s{f', {note}' if note else ''}<extra>{meta['series']}</extra>"
-                own = {"line": look.line(line.detector, line.backend), "hovertemplate": said}
-                shown = {"x": None if k else time_s, "y": line.shown(t_ns, values)}
-                traces.append({"type": "scatter", "mode": "lines", **shown, **own, "meta": meta, **_axes(k)})
-        # The band's edges are in sight, however small the errors are.
-        least: dict[str, Any] = (
-            {"autorangeoptions": {"include": [-1.2 * half_width, 1.2 * half_width]}} if half_width else {}
-        )
-        layout = _panels(panel_titles, _TIME, **least)
-        if half_width:
-            layout["shapes"] = [_shaded(k, -half_width, half_width) for k in range(len(panel_titles))]
-        if traces:
-            cases[course.label] = course.case(traces, layout, of_many=name == "translation_error_per_axis")
-    return Figure(name, "", cases, height=180 * len(panel_titles) + 20, narrow_height=520)
-
-
-def _translation_error(study: Study, look: Look) -> Figure:
-    band = study.results.reference.band
-    half_width = band.half_width_m if band else 0.0
-
-    def series(errors: TrajectoryErrors) -> list[tuple[Int, Float, str]]:
-        share = inside_band(errors, half_width)
-        notes = [f"{share[axis]:.1f} % inside" if band else "" for axis in "xyz"]
-        return [(errors.estimate.t_ns, errors.position_m[:, k], notes[k]) for k in range(3)]
-
-    titles = [f"{axis} [m]" for axis in ("x", "y", "z (up)")]
-    figure = _over_time(study, look, "translation_error_per_axis", titles, series, half_width)
-    shaded = f" Shaded: ±{100 * half_width:g} cm, beside how much of the estimated time is inside." if band else ""
-    about = f"Estimate minus ground truth in the world's axes, aligned by {_how(study)} over the whole path.{shaded}"
-    return replace(figure, title="Translation error by axis", caption=about)
-
-
-def _rotation_error(study: Study, look: Look) -> Figure:
-    def series(errors: TrajectoryErrors) -> list[tuple[Int, Float, str]]:
-        return [(errors.estimate.t_ns, errors.rotation_rpy_deg[:, k], "") for k in range(3)]
-
-    figure = _over_time(study, look, "rotation_error", [f"{angle} [deg]" for angle in ("roll", "pitch", "yaw")], series)
-    about = f"Roll, pitch, yaw about the world's x, y, z, aligned by {_how(study)} over the whole path."
-    return replace(figure, title="Rotation error", caption=about)
-
-
-def _comparison(study: Study, look: Look) -> Figure:
-    def series(errors: TrajectoryErrors) -> list[tuple[Int, Float, str]]:
-        t_ns, metres = errors.estimate.t_ns, np.asarray(np.linalg.norm(errors.position_m, axis=1))
-        degrees = rotation_error_deg(errors.estimate, errors.truth)
-        sizes = ((metres, errors.ate_m.rmse, "m"), (degrees, errors.orientation_deg.rmse, "deg"))
-        return [(t_ns, values, f"RMSE {rmse:.3g} {unit}") for values, rmse, unit in sizes]
-
-    titles = ("translation error [m]", "rotation error [deg]")
-    figure = _over_time(study, look, "comparison", titles, series)
-    about = f"Distance from the truth and angle to it, aligned by {_how(study)} over the whole path."
-    return replace(figure, title="Size of the errors", caption=about)
-
-
-def _nees_of_flights(study: Study, look: Look) -> Figure:
-    def series(errors: TrajectoryErrors) -> list[tuple[Int, Float, str]]:
-        # The first instants are the gauge's own, without error, and nothing to a logarithmic axis.
-        notes = [f"mean {each.mean:.3g}, {100 * each.inside:.0f} % inside" for each in errors.nees]
-        return [(n.t_ns, np.maximum(n.values, 1e-3), note) for n, note in zip(errors.nees, notes, strict=True)]
-
-    titles = [f"{part} (ideally {dof})" for part, dof in PARTS.items()]
-    figure = _over_time(study, look, "nees", titles, series)
-    for case in figure.cases.values():
-        layout = case.pictures[0][1]
-        layout["shapes"] = [_shaded(k, *band(dof)) for k, dof in enumerate(PARTS.values())]
-        for k, dof in enumerate(PARTS.values()):
-            layout[_axis("y", k)] |= {"type": "log", "dtick": 1, "tickformat": "~g", "minallowed": np.log10(0.03 * dof)}
-    about = (
-        "Shaded: 95 % of the instants of an honest filter; above, the filter is surer of itself than it should be. "
-        "Position and yaw fixed at the first pose. Errors within a flight hang together: no test at a level."
-    )
-    return replace(figure, title="NEES of the flights over time", caption=about)
-
-
-def _how(study: Study) -> str:
-    names = dict.fromkeys(each.alignment_name for each in study._errors.values() if each is not None)
-    return " or ".join(ALIGNED_BY[name] for name in names) or ALIGNED_BY["posyaw"]
-
-
 # Contenders compared --------------------------------------------------------------------------------------------------
-
-
-def _relative_error(study: Study, look: Look) -> Figure:
-    """Boxes by length of the stretch."""
-    cases = {}
-    for course, (_, here) in zip(_courses(study), _drawable(study), strict=True):
-        stretches = relative_errors(study, here)
-        if stretches.empty:
-            continue
-        of_path = bool(stretches["of_path"].iloc[0])
-        names = {length: f"{100 * length if of_path else length:g}" for length in sorted(stretches["length"].unique())}
-        titles = ("translation error [% of length]", "yaw error [deg]")
-        unit = "% of the path" if of_path else "m"
-        layout = _panels(titles, f"length of the stretch [{unit}]", rangemode="tozero")
-        for k in range(2):
-            layout[_axis("x", k)] |= _category(list(names.values()))
-        traces = []
-        for (detector, backend), own in groups(stretches, CONTENDER):
-            for k, column in enumerate(("translation_percent", "yaw_deg")):
-                five = own.groupby("length")[column].quantile(np.array([0.05, 0.25, 0.5, 0.75, 0.95])).unstack()
-                keys = ("lowerfence", "q1", "median", "q3", "upperfence")
-                series = look.name(detector, backend)
-                colour = {"color": look.colour(detector, backend), "width": 1.6}
-                box = {"type": "box", "x": [names[length] for length in five.index], "line": colour}
-                box |= dict(zip(keys, five.to_numpy().T, strict=True)) | {"fillcolor": look.fill(detector, backend)}
-                box |= {"name": series, "offsetgroup": series, "hoverinfo": "y+name"}
-                traces.append({**box, "meta": look.meta(detector, backend), **_axes(k)})
-        layout |= {"boxmode": "group", "boxgap": 0.25, "boxgroupgap": 0.3}
-        cases[course.label] = course.case(traces, layout, of_many=True)
-    about = (
-        "Every pose of every seed starts a stretch, aligned at its first pose; stretches overlap. Boxes: quartiles and "
-        "median; whiskers: 5 to 95 %."
-    )
-    heights: dict[str, Any] = {"height": 520, "narrow_height": 480}
-    return Figure("relative_error", "Relative error by length of the stretch", cases, about, **heights)
-
-
-def _drawable(study: Study) -> Iterator[tuple[Any, pd.DataFrame]]:
-    for key, here in groups(study.flights, COURSE):
-        if any(study.errors(f) is not None for _, own in groups(here, CONTENDER) if (f := median_flight(own))):
-            yield key, here
 
 
 def _ate_by_sequence(study: Study, look: Look) -> Figure | None:
@@ -408,7 +172,7 @@ def _ate_by_sequence(study: Study, look: Look) -> Figure | None:
             said = {"text": [f"✗{n}" for n in missing], "textfont": {"color": colour}, "hoverinfo": "skip"}
             traces.append({**shared, "x": list(missing.index), "y": [top] * len(missing), "mode": "text", **said})
     layout = {
-        "xaxis": _category(recordings),
+        "xaxis": category(recordings),
         "yaxis": {"title": {"text": "ATE, position + yaw [m]"}, **_LOG},
         "scattermode": "group",
     }
@@ -426,7 +190,7 @@ def _stress(study: Study, look: Look) -> Figure | None:
         known = here["ate_m"].dropna()
         pictures = []
         for condition, own in groups(here, ("condition",)):
-            layout = _panels(("ATE [m]", "succeeded [%]"), "level", gap=0.09)
+            layout = panels(("ATE [m]", "succeeded [%]"), "level", gap=0.09)
             layout["yaxis"] |= _LOG
             if len(known):
                 # The same for every condition; bands may reach beyond.
@@ -457,12 +221,12 @@ def _curve(curve: pd.DataFrame, contender: tuple[str, str], look: Look) -> list[
     traces = []
     for k, (value, low, high, says) in enumerate(columns):
         known = percent[percent[value].notna()]
-        shared = {"type": "scatter", "meta": look.meta(detector, backend), **_axes(k)}
+        shared = {"type": "scatter", "meta": look.meta(detector, backend), **axes(k)}
         colour = look.colour(detector, backend)
         banded = known[known[low].notna()]
         if len(banded) > 1:
             faint = min(0.14, 0.4 / (len(look.detectors) * len(look.backends)))
-            traces.append({**shared, **_area(banded["level"], banded[low], banded[high], colour, faint)})
+            traces.append({**shared, **area(banded["level"], banded[low], banded[high], colour, faint)})
         whole = [bool(own["complete"].all()) for own in known["flights"]]
         said = [
             f"{says.format(v)}, seeds: {seeds_text(own)}" for v, own in zip(known[value], known["flights"], strict=True)
@@ -483,7 +247,7 @@ def _curve(curve: pd.DataFrame, contender: tuple[str, str], look: Look) -> list[
 # Speed, and trials ----------------------------------------------------------------------------------------------------
 
 
-def _detector_fps(study: Study, look: Look) -> Figure | None:
+def _detector_fps(study: Study) -> Figure | None:
     """Points by detector, the fastest on top: measured with its quartiles, and quoted."""
     measured = study.speeds[study.speeds["status"] == "ok"]
     if measured.empty:
@@ -491,7 +255,7 @@ def _detector_fps(study: Study, look: Look) -> Figure | None:
     reference = study.results.reference.speed
     speeds = reference.detectors if reference else {}
     quoted = {name: speeds[base] for name in measured["detector"] if (base := name.partition(":")[0]) in speeds}
-    blue = style.colour(0).lower()
+    blue = style.colour(0)
     ends = {"array": measured["fps_high"] - measured["fps"], "arrayminus": measured["fps"] - measured["fps_low"]}
     traces: list[Trace] = [
         {
@@ -530,79 +294,70 @@ def _detector_fps(study: Study, look: Look) -> Figure | None:
     names = [_wrapped(name) for name in measured["detector"][::-1]]
     layout = {
         "xaxis": {"title": {"text": "frames a second, logarithmic"}, **_LOG},
-        "yaxis": {**_category(names), "ticks": ""},
+        "yaxis": {**category(names), "ticks": ""},
     }
     theirs = f" Quoted: {reference.title}; not measured on the same machine." if quoted and reference else ""
     about = f"{speed_caption(measured)} The line through a measured point spans its quartiles.{theirs}"
-    height = _FRAME + _ROW * len(names)
+    height = FRAME + ROW * len(names)
     cases = {"all": Case([(traces, layout)])}
     return Figure("detector_fps", "Frames a second", cases, about, height=height)
 
 
 def _timing(study: Study, look: Look) -> Figure | None:
-    """Bars of milliseconds a frame by stage, a row a contender; a case for each kind of data."""
+    """A row a contender; a case for each kind of data."""
     means = stage_means(study.flights)
     if means.empty:
         return None
     cases, kinds = {}, means.index.get_level_values("data").unique()
     for kind in kinds:
         own = means.loc[kind]
-        shades = {False: iter(_FRONT_END * 3), True: iter(_BACK_END * 3)}
-        owners = [{"detector": detector, "backend": backend} for detector, backend in own.index]
-        traces = [
-            {
-                "type": "bar",
-                "orientation": "h",
-                "x": own[stage].tolist(),
-                "y": [look.name(*contender) for contender in own.index],
-                "marker": {"color": next(shades[str(stage).startswith("backend")])},
-                "text": [str(stage).removeprefix("backend.").replace("_", " ")] * len(own),
-                "textposition": "inside",
-                "insidetextanchor": "middle",
-                "textangle": 0,
-                "hovertemplate": "%{y}: %{x:.2f} ms" + f"<extra>{stage}</extra>",
-                "meta": {"series": stage, "owners": owners},
-            }
-            for stage in own.columns
-        ]
-        layout = {
-            "barmode": "stack",
-            "bargap": 0.3,
-            # A name that does not fit is left to the legend.
-            "uniformtext": {"minsize": 11, "mode": "hide"},
-            "xaxis": {"title": {"text": "mean time a frame [ms]"}, "rangemode": "tozero"},
-            "yaxis": {"autorange": "reversed", "ticks": "", "ticksuffix": "  "},
-        }
+        owners = [dict(zip(CONTENDER, contender, strict=True)) for contender in own.index]
+        picture = stage_bars(own.set_axis([look.name(*contender) for contender in own.index]), owners)
         said = data_caption(study.flights[study.flights["data"] == kind])
-        cases[str(kind)] = Case([(traces, layout)], said, "" if len(kinds) == 1 else f"{kind}_")
-    height = _FRAME + (_ROW + 8) * int(means.groupby("data").size().max())
-    about = "Mean over all frames and flights, without reading and decoding images. Blue: front-end; brown: back-end."
-    return Figure("timing", "Time a frame by stage", cases, about, "Recordings", height)
+        cases[str(kind)] = Case([picture], said, "" if len(kinds) == 1 else f"{kind}_")
+    return timing(cases, int(means.groupby("data").size().max()))
 
 
 def _nees_of_trials(study: Study, look: Look) -> Figure:
-    """NEES over time, averaged over the trials, within the bounds of an honest filter; a case a flight."""
-    cases = {}
-    for (flight,), here in groups(study.trials, ("sequence",)):
+    """NEES over time, averaged over the trials, within the bounds of an honest filter."""
+
+    def picture(here: pd.DataFrame) -> tuple[list[Trace], Layout] | None:
         found = {who: nees for who, own in groups(here, CONTENDER) if (nees := study.nees(own))}
-        if found:
-            several = study.trials["sequence"].nunique() > 1
-            cases[flight] = Case([_nees_picture(found, look)], _note(here), _file_name(f"{flight}_") if several else "")
+        return _nees_picture(found, look, study.single_nees(here) if len(found) == 1 else ()) if found else None
+
     about = (
         "Mean of the trials at each instant. Shaded: where 95 % of honest filters' means are. Above it the filter is "
         "surer of itself than it should be."
     )
     heights: dict[str, Any] = {"height": 600, "narrow_height": 540}
-    return Figure("nees_of_trials", "NEES of the trials over time", cases, about, **heights)
+    return Figure("nees_of_trials", "NEES of the trials over time", _by_flight(study, picture), about, **heights)
 
 
-def _nees_picture(found: Mapping[tuple[str, str], Mapping[str, AverageNees]], look: Look) -> tuple[list[Trace], Layout]:
+def _by_flight(study: Study, picture: Callable[[pd.DataFrame], tuple[list[Trace], Layout] | None]) -> dict[str, Case]:
+    """A case for each flight that there is a picture of trials on."""
+    several = study.trials["sequence"].nunique() > 1
+    return {
+        flight: Case([drawn], _note(here), _file_name(f"{flight}_") if several else "")
+        for (flight,), here in groups(study.trials, ("sequence",))
+        if (drawn := picture(here)) is not None
+    }
+
+
+def _nees_picture(
+    found: Mapping[tuple[str, str], Mapping[str, AverageNees]], look: Look, single: Sequence[pd.DataFrame]
+) -> tuple[list[Trace], Layout]:
     titles = [f"{part} (ideally {dof})" for part, dof in PARTS.items()]
-    layout, traces = _panels(titles, "time since the first frame [s]"), []
+    layout, traces = panels(titles, "time since the first frame [s]"), []
     for k, part in enumerate(PARTS):
         widest = max((each[part] for each in found.values()), key=lambda nees: int(nees.trials.max()))
-        bounds = _area(widest.t_ns / NS_PER_S, widest.low, widest.high, BAND_COLOUR)
-        traces.append({"type": "scatter", **bounds, "meta": {"series": "95 % if honest"}, **_axes(k)})
+        bounds = area(widest.t_ns / NS_PER_S, widest.low, widest.high, BAND_COLOUR)
+        traces.append({"type": "scatter", **bounds, "meta": {"series": "95 % if honest"}, **axes(k)})
+        if single:
+            gap = pd.DataFrame({"t_ns": [np.nan], part: [np.nan]})
+            joined = pd.concat([each for trial in single for each in (trial[:: 1 + len(trial) // _POINTS_LEAST], gap)])
+            shown: Trace = {"x": joined["t_ns"].to_numpy(np.float32) / NS_PER_S, "y": joined[part].to_numpy(np.float32)}
+            thin = {"line": {"color": TRUTH_COLOUR, "width": 0.6}, "opacity": 0.5, "hoverinfo": "skip", "mode": "lines"}
+            traces.append({"type": "scatter", **shown, **thin, "meta": {"series": "single trials"}, **axes(k)})
         for (detector, backend), parts in found.items():
             time_s, values = (
                 np.asarray(each, np.float32) for each in (parts[part].t_ns / NS_PER_S, parts[part].values)
@@ -612,96 +367,38 @@ def _nees_picture(found: Mapping[tuple[str, str], Mapping[str, AverageNees]], lo
             hover = f"%{{y:.2f}} at %{{x:.1f}} s, {note}<extra>{backend}</extra>"
             own = {"line": look.line(detector, backend), "hovertemplate": hover}
             meta = {"series": backend, "backend": backend, "note": note}
-            traces.append({"type": "scatter", **shown, **own, "meta": meta, **_axes(k)})
+            traces.append({"type": "scatter", **shown, **own, "meta": meta, **axes(k)})
         highest = max(float(each[part].values.max()) for each in found.values())
         if highest > _LOGARITHMIC_FROM * widest.mean_band[1]:
             # The first pose is the gauge, where the error is nothing.
             ends = [np.log10(0.1 * widest.dof), np.log10(1.5 * highest)]
-            layout[_axis("y", k)] |= {"type": "log", "dtick": 1, "tickformat": "~g", "range": ends}
+            layout[axis_name("y", k)] |= {"type": "log", "dtick": 1, "tickformat": "~g", "range": ends}
         else:
-            layout[_axis("y", k)] |= {"rangemode": "tozero"}
+            layout[axis_name("y", k)] |= {"range": [0.0, 1.15 * max(highest, widest.mean_band[1])]}
     return traces, layout
 
 
-def _trials(study: Study, look: Look) -> Figure | None:
+def _trials(study: Study, look: Look) -> Figure:
     """Every trial's errors, by back-end; those without an estimate are counted below."""
-    if not study.trials["ate_m"].notna().any():
-        return None
-    backends = list(study.trials["backend"].unique())
-    layout, traces = _panels(("ATE, position + yaw [m]", "orientation [deg]"), "", rangemode="tozero"), []
-    for k, column in enumerate(("ate_m", "orientation_deg")):
-        layout[_axis("x", k)] |= _category(backends)
-        for (detector, backend), own in groups(study.trials, CONTENDER):
-            dots = {"size": 8, "symbol": "circle-open", "color": look.colour(detector, backend), "line": {"width": 1.4}}
-            shown = {"x": own["backend"].tolist(), "y": own[column].astype(float).tolist(), "mode": "markers"}
-            hover = {"customdata": own["seed"].tolist(), "hovertemplate": "%{y:.3f}, seed %{customdata}<extra></extra>"}
-            meta = {"series": backend, "backend": backend}
-            traces.append({"type": "scatter", **shown, **hover, "marker": dots, "meta": meta, **_axes(k)})
+    columns = {"ate_m": "ATE, position + yaw [m]", "orientation_deg": "orientation [deg]", "nees.pose": "pose NEES"}
+    shown = {column: title for column, title in columns.items() if column in study.trials}
+
+    def picture(here: pd.DataFrame) -> tuple[list[Trace], Layout] | None:
+        layout, traces = panels(list(shown.values()), "", rangemode="tozero"), []
+        for k, column in enumerate(shown):
+            layout[axis_name("x", k)] |= category(list(here["backend"].unique()))
+            for (detector, backend), own in groups(here, CONTENDER):
+                dots = {"size": 8, "symbol": "circle-open", "color": look.colour(detector, backend)}
+                values = {"x": own["backend"].tolist(), "y": own[column].astype(float).tolist(), "mode": "markers"}
+                hover = "%{y:.3f}, seed %{customdata}<extra></extra>"
+                told = {"customdata": own["seed"].tolist(), "hovertemplate": hover, "marker": dots}
+                meta = {"series": backend, "backend": backend}
+                traces.append({"type": "scatter", **values, **told, "meta": meta, **axes(k)})
+        return (traces, layout) if here["ate_m"].notna().any() else None
+
     missing = int(study.trials["ate_m"].isna().sum())
-    about = (
-        f"A mark a trial. {missing} of {len(study.trials)} without an estimate to measure."
-        if missing
-        else "A mark a trial."
-    )
-    return Figure("trials", "Errors of the trials", {"all": Case([(traces, layout)], _note(study.trials))}, about)
-
-
-_FIGURES: tuple[Callable[[Study, Look], Figure | None], ...] = (
-    *(_detector_fps, _stress, _ate_by_sequence, _trajectories_3d, _translation_error, _rotation_error, _comparison),
-    *(_relative_error, _timing, _nees_of_flights, _nees_of_trials, _trials),
-)
-
-
-# Layouts and areas ----------------------------------------------------------------------------------------------------
-
-
-def _panels(titles: Sequence[str], x_title: str, gap: float = 0.07, **y: Any) -> Layout:
-    """Panels above each other that share their x axis; the k-th one's traces are on ``_axes(k)``."""
-    height = (1.0 - gap * (len(titles) - 1)) / len(titles)
-    layout: Layout = {}
-    for k, title in enumerate(titles):
-        bottom, last = (len(titles) - 1 - k) * (height + gap), k == len(titles) - 1
-        domain = [max(0.0, bottom), min(1.0, bottom + height)]
-        layout[_axis("y", k)] = {"domain": domain, "anchor": _axes(k)["xaxis"], "title": {"text": title}, **y}
-        shared = {} if k == 0 else {"matches": "x"}
-        about = {"showticklabels": last, "title": {"text": x_title if last else ""}}
-        layout[_axis("x", k)] = {"anchor": _axes(k)["yaxis"], **about, **shared}
-    return layout
-
-
-def _axis(name: str, k: int) -> str:
-    """What the layout calls an axis of the k-th of :func:`_panels`."""
-    return f"{name}axis{k + 1 if k else ''}"
-
-
-def _axes(k: int) -> dict[str, str]:
-    """Which axes the traces of the k-th of :func:`_panels` belong to."""
-    return {f"{name}axis": f"{name}{k + 1 if k else ''}" for name in "xy"}
-
-
-def _category(names: Sequence[str]) -> dict[str, Any]:
-    return {"type": "category", "categoryorder": "array", "categoryarray": list(names)}
-
-
-def _shaded(k: int, low: float, high: float) -> dict[str, Any]:
-    """All along the k-th panel."""
-    axes = _axes(k)
-    where = {"type": "rect", "xref": f"{axes['xaxis']} domain", "yref": axes["yaxis"], "x0": 0, "x1": 1}
-    return {
-        **where,
-        "y0": low,
-        "y1": high,
-        "fillcolor": BAND_COLOUR,
-        "opacity": 0.13,
-        "line": {"width": 0},
-        "layer": "below",
-    }
-
-
-def _area(x: Any, low: Any, high: Any, colour: str, opacity: float = 0.18) -> Trace:
-    outline = {"x": [*x, *x[::-1]], "y": [*high, *low[::-1]], "mode": "lines", "line": {"width": 0, "color": colour}}
-    outline = {key: np.asarray(value, np.float32) if key in "xy" else value for key, value in outline.items()}
-    return {**outline, "fill": "toself", "fillcolor": colour, "opacity": opacity, "hoverinfo": "skip"}
+    counted = f" {missing} of {len(study.trials)} without an estimate to measure." if missing else ""
+    return Figure("trials", "Errors of the trials", _by_flight(study, picture), f"A mark a trial.{counted}", height=560)
 
 
 def _note(flights: pd.DataFrame) -> str:

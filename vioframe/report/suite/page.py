@@ -16,14 +16,15 @@ from markupsafe import Markup
 from plotly.offline import get_plotlyjs
 
 from vioframe.evaluation.consistency import PARTS
-from vioframe.report.suite.figures import TRUTH_COLOUR, Figure, Look
+from vioframe.report.figures import Figure, inside_band
+from vioframe.report.style import TRUTH_COLOUR
+from vioframe.report.suite.figures import Look
 from vioframe.report.suite.statistics import (
     WHAT,
     Study,
     averages,
     duels,
     groups,
-    inside_band,
     records,
     seeds_text,
 )

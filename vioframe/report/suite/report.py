@@ -33,7 +33,7 @@ def write_report(results: Results, out: Path | None = None, *, page: bool = True
     cannot be written, and :class:`PluginError` where the extra that it needs is not installed.
     """
     try:
-        from vioframe.report.suite.drawing import write_figures
+        from vioframe.report.drawing import write_figures
         from vioframe.report.suite.figures import figures
         from vioframe.report.suite.page import write_page
         from vioframe.report.suite.statistics import Study
@@ -51,7 +51,7 @@ def write_report(results: Results, out: Path | None = None, *, page: bool = True
     try:
         with _appearing(out) as folder:
             files = write_tables(made, folder / "tables", f"../{to_results}")
-            files += write_figures(drawn, folder / "figures", quoted)
+            files += write_figures(drawn, folder / "figures", formats=("png", "svg"), names=quoted)
             if page:
                 files.append(write_page(study, made, drawn, folder / "index.html", to_results))
             relative = tuple(file.relative_to(folder) for file in files)

@@ -15,12 +15,13 @@ from typing import Any, NamedTuple
 import numpy as np
 import pandas as pd
 
-from vioframe.evaluation import TrajectoryErrors, evaluate
+from vioframe.evaluation import TrajectoryErrors
 from vioframe.evaluation.alignment import align_sim3
-from vioframe.evaluation.consistency import PARTS, AverageNees, Trial, Trials
+from vioframe.evaluation.consistency import AverageNees, average_nees
 from vioframe.evaluation.metrics import position_error_W
-from vioframe.runs.folder import RunFolder
-from vioframe.runs.results import CELL, CLEAR, NEES_FILE, Data, Results
+from vioframe.runs.evaluated import Evaluated, evaluate_path, with_loop_closure
+from vioframe.runs.results import CELL, CLEAR, NEES_FILE, TASK_COLUMNS, Data, Results
+from vioframe.types import NS_PER_S
 
 COMPLETE_FROM = 0.95
 """A flight is complete where at least this part of its frames is tracked, from initialisation on."""
@@ -50,10 +51,14 @@ _ALWAYS = (
 
 @dataclass(frozen=True)
 class Study:
-    """The tables behind a report, each in the order of the suite's own lists, and what is looked up for them."""
+    """The tables behind a report, each in the order of the suite's own lists, and what is looked up for them.
+
+    ``flown_nees`` is the NEES over time by task of trials that were flown just now and have no files.
+    """
 
     results: Results
-    _errors: dict[str, TrajectoryErrors | None] = field(default_factory=dict)
+    flown_nees: Mapping[str, pd.DataFrame] = field(default_factory=dict)
+    _evaluated: dict[str, Evaluated | None] = field(default_factory=dict)
 
     @cached_property
     def flights(self) -> pd.DataFrame:
@@ -94,36 +99,47 @@ class Study:
         return str(names[0]) if len(names) > 1 else None
 
     def errors(self, flight: Mapping[str, Any]) -> TrajectoryErrors | None:
-        """Errors over time of a flight: of the loop-closed trajectory where it has one; None where there are none."""
-        name = flight["task"]
-        if name not in self._errors:
-            run = self.run(flight) if flight["evaluated"] else None
-            estimate = None if run is None else run.loop_closed() if flight["loop_closed"] is True else run.trajectory()
-            truth = None if run is None else run.ground_truth()
-            self._errors[name] = None if estimate is None or truth is None else evaluate(estimate, truth)
-        return self._errors[name]
+        """Errors over time of a flight; None where there are none."""
+        run = self.evaluated(flight)
+        return None if run is None else run.errors
 
-    def run(self, flight: Mapping[str, Any]) -> RunFolder | None:
-        """The run folder of a flight; None where it never began."""
-        path = None if flight["folder"] is None else self.results.path / flight["folder"]
-        return None if path is None or not (path / "trajectory.tum").is_file() else RunFolder.open(path)
+    def evaluated(self, flight: Mapping[str, Any]) -> Evaluated | None:
+        """A flight, with loop closure where it has that; None where there is no error to show."""
+        name = flight["task"]
+        if name not in self._evaluated:
+            path = self.results.path / flight["folder"] if flight["evaluated"] else None
+            run = evaluate_path(path, None) if path and (path / "trajectory.tum").is_file() else None
+            closed = with_loop_closure(run) if run and flight["loop_closed"] is True else None
+            self._evaluated[name] = closed or run
+        return self._evaluated[name]
 
     def nees(self, own: pd.DataFrame) -> dict[str, AverageNees]:
         """NEES over time by part of the pose, averaged over trials; empty where no trial has a covariance."""
-        trials = []
-        for row in records(own[own["folder"].notna()]):
-            if (file := self.results.path / row["folder"] / NEES_FILE).is_file():
-                table = pd.read_csv(file)
-                values = {part: table[part].to_numpy() for part in PARTS}
-                about = (row["seed"], row["sequence"], row["backend"], row["failure"])
-                trials.append(Trial(*about, t_ns=table["t_ns"].to_numpy(), nees=values))
-        together = Trials("", "", {}, {}, tuple(trials))
-        return {part: nees for part in PARTS if (nees := together.nees(part)) is not None}
+        return average_nees(self.single_nees(own))
+
+    def single_nees(self, own: pd.DataFrame) -> list[pd.DataFrame]:
+        """The same of every trial that has one: ``t_ns``, and a column a part."""
+        if self.flown_nees:
+            return [self.flown_nees[task] for task in own["task"]]
+        files = [self.results.path / folder / NEES_FILE for folder in own["folder"].dropna()]
+        return [pd.read_csv(file) for file in files if file.is_file()]
+
+    def nees_table(self) -> pd.DataFrame:
+        """A row an instant of each back-end's trials on each flight, with how many trials it is of."""
+        tables = [pd.DataFrame()]
+        for (flight, backend), own in groups(self.trials, ("sequence", "backend")):
+            if found := self.nees(own):
+                nees = found["pose"]
+                about = {"backend": backend, "flight": flight, "t_s": nees.t_ns / NS_PER_S, "trials": nees.trials}
+                for part, each in found.items():
+                    about |= {part: each.values, f"{part}_low": each.low, f"{part}_high": each.high}
+                tables.append(pd.DataFrame(about))
+        return pd.concat(tables)
 
     def _rows(self, kind: str) -> pd.DataFrame:
         rows = [row for row in self.results.rows if row["kind"] == kind]
-        frame = pd.DataFrame(rows, columns=None if rows else [*self.results.rows[0]])
-        frame = frame.reindex(columns=list(dict.fromkeys([*frame.columns, *_ALWAYS])))
+        frame = pd.DataFrame(rows)
+        frame = frame.reindex(columns=list(dict.fromkeys([*TASK_COLUMNS, *frame.columns, *_ALWAYS])))
         frame = frame.astype(dict.fromkeys(("data", "folder", "failure", "loop_closed"), object))
         frame = frame.where(frame.notna(), None) if frame.empty else frame
         for column in ("folder", "failure"):
@@ -315,13 +331,6 @@ def duels(flights: pd.DataFrame, baseline: str) -> list[Duel]:
     return found
 
 
-def inside_band(errors: TrajectoryErrors, half_width_m: float) -> dict[str, float]:
-    """Percent of the instants at which |x|, |y|, |z| and all three are within ``half_width_m``."""
-    within = np.abs(errors.position_m) <= half_width_m
-    percent = dict(zip("xyz", (100.0 * within.mean(axis=0)).tolist(), strict=True))
-    return {**percent, "all": 100.0 * float(within.all(axis=1).mean())}
-
-
 def ate_sim3_m(errors: TrajectoryErrors | None) -> float:
     """RMSE of the position after alignment by Sim(3), as many published figures have it; NaN where it is open."""
     if errors is None or errors.scale is None:
@@ -329,24 +338,6 @@ def ate_sim3_m(errors: TrajectoryErrors | None) -> float:
     # Whatever the estimate was aligned by before, the best of all similarities leaves the same.
     scaled = align_sim3(errors.estimate, errors.truth).apply(errors.estimate)
     return float(np.sqrt(np.mean(np.sum(position_error_W(scaled, errors.truth) ** 2, axis=1))))
-
-
-def relative_errors(study: Study, flights: pd.DataFrame) -> pd.DataFrame:
-    """A row a stretch of the path, of all ``flights``: its contender, ``task``, ``length``, and its errors.
-
-    By length in metres where any flight's path is long enough, else by fraction of the path, which ``of_path`` says.
-    """
-    rows = records(flights[flights["evaluated"]])
-    found = [(row, errors) for row in rows if (errors := study.errors(row)) is not None]
-    by_length = any(errors.relative for _, errors in found)
-    tables = [
-        pd.DataFrame({"translation_percent": stretches.translation_percent, "yaw_deg": stretches.yaw_deg}).assign(
-            detector=row["detector"], backend=row["backend"], task=row["task"], length=length, of_path=not by_length
-        )
-        for row, errors in found
-        for length, stretches in (errors.relative if by_length else errors.relative_by_fraction).items()
-    ]
-    return pd.concat(tables, ignore_index=True) if tables else pd.DataFrame()
 
 
 def stage_means(flights: pd.DataFrame) -> pd.DataFrame:

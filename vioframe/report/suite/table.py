@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -65,6 +65,12 @@ class Table:
 
     def shown(self, row: TableRow) -> list[str]:
         return [row.entries[heading].shown if heading in row.entries else UNKNOWN for heading in self.headings]
+
+    def upright(self, names: Sequence[str]) -> pd.DataFrame:
+        """The cells as shown, for :func:`vioframe.report.tables.to_rich`: a column a row, called by its ``names``."""
+        shown = pd.DataFrame([self.shown(row) for row in self.rows], columns=self.headings)
+        cells = shown.drop(columns=[*names]).T.set_axis(shown[[*names]].agg("\n".join, axis="columns"), axis="columns")
+        return cells.set_axis(pd.MultiIndex.from_product([[self.title], cells.index]))
 
     def to_csv(self) -> str:
         """Exact values, empty where there is none, and the folders behind each row."""

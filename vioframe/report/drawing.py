@@ -1,4 +1,4 @@
-"""Draws the report's figures into files: the traces and layouts that the page shows, with matplotlib, for papers.
+"""Draws figures into files: the traces and layouts that a report's page shows, with matplotlib.
 
 A column a back-end, or one for each of several pictures side by side: on paper nothing can be hidden. Only what
 :mod:`.figures` makes use of is drawn: lines, markers, areas, paths in 3-D, boxes and stacked bars.
@@ -9,38 +9,55 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from textwrap import fill
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 
-from vioframe.report.style import RC
-from vioframe.report.suite.figures import DASHES, Case, Figure, Layout, Trace
+from vioframe.errors import RunError
+from vioframe.report.figures import Case, Figure, Layout, Trace
+from vioframe.report.style import DASHES, RC
 
-FORMATS = ("png", "svg")
 _DPI = 200
 """Twice what a figure is laid out for."""
 _COLUMN_INCH, _NARROWEST_INCH, _ROW_INCH = 5.0, 8.0, 2.5
 _LETTERS_AN_INCH = 12.6
+_SPATIAL = 0.45
+"""Factor from the width of a line in space, which is drawn finer on paper."""
 _SPREAD = 4.0
 """Columns whose errors differ by more than this factor each have a scale of their own."""
 _DASHES = dict(zip(DASHES, ("-", (0, (5, 1.6)), (0, (1.5, 1.2)), (0, (6, 1.5, 1.5, 1.5))), strict=True))
 _MARKERS = {"circle": "o", "square": "s", "triangle-up": "^", "diamond": "D", "line-ew": "_"}
+_THICK = 2.5
+"""Points; a line that is broader than this is the ground truth, below all others."""
 _VIEWS = {"top_view": (0, 1), "side_view": (0, 2)}
 """What paths in 3-D are drawn from as well, by the axes that are seen."""
 
 
-def write_figures(figures: Sequence[Figure], folder: Path, names: Mapping[str, str]) -> list[Path]:
-    """``NAME.png`` and ``NAME.svg`` in ``folder`` for each case that has files; ``names`` has other names for some."""
+def write_figures(
+    figures: Sequence[Figure],
+    folder: Path,
+    *,
+    formats: Sequence[str] = ("png",),
+    names: Mapping[str, str] = MappingProxyType({}),
+) -> list[Path]:
+    """``NAME.png`` or other ``formats`` in ``folder`` for each case that has files; ``names`` has other ones for some.
+
+    Raises :class:`RunError` where they cannot be written.
+    """
     import matplotlib as mpl
 
-    folder.mkdir(parents=True, exist_ok=True)
     written = []
-    with mpl.rc_context(dict(RC)):
-        for name, drawn in drawings(figures, names):
-            for ending in FORMATS:
-                written.append(folder / f"{name}.{ending}")
-                # Without its date an SVG is the same file for the same results.
-                drawn.savefig(written[-1], dpi=_DPI, metadata={"Date": None} if ending == "svg" else None)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with mpl.rc_context(dict(RC)):
+            for name, drawn in drawings(figures, names):
+                for ending in formats:
+                    written.append(folder / f"{name}.{ending}")
+                    # Without its date an SVG is the same file for the same results.
+                    drawn.savefig(written[-1], dpi=_DPI, metadata={"Date": None} if ending == "svg" else None)
+    except OSError as error:
+        raise RunError(f"cannot write figures to {folder}: {error.strerror}; choose another --out") from error
     return written
 
 
@@ -58,7 +75,10 @@ def drawings(figures: Sequence[Figure], names: Mapping[str, str]) -> Iterator[tu
 def _seen_along(case: Case, axes: tuple[int, int]) -> Case:
     """Paths in 3-D as they are seen without perspective, along the axis that is not one of ``axes``."""
     across, up = ("xyz"[k] for k in axes)
-    traces = [{**trace, "type": "scatter", "x": trace[across], "y": trace[up]} for trace in case.pictures[0][0]]
+    traces = []
+    for trace in case.pictures[0][0]:
+        line = {"line": {**trace["line"], "width": _SPATIAL * trace["line"]["width"]}} if "line" in trace else {}
+        traces.append({**trace, **line, "type": "scatter", "x": trace[across], "y": trace[up]})
     titles = {"x": "x [m]", "y": "y [m]", "z": "z (up) [m]"}
     layout = {f"{axis}axis": {"title": {"text": titles[of]}} for axis, of in (("x", across), ("y", up))}
     return Case([(traces, {**layout, "equal": True})], case.caption)
@@ -72,7 +92,7 @@ def _draw(case: Case, caption: str) -> Any:
     rows = max(1, sum(key.startswith("yaxis") for key in columns[0][2]))
     spatial = any(trace["type"] == "scatter3d" for trace in columns[0][1])
     width = max(_NARROWEST_INCH, (_COLUMN_INCH if rows > 1 or spatial else 6.0) * len(columns))
-    height = 5.2 if spatial else max(_ROW_INCH * rows, _categories(columns)) + 1.5
+    height = 6.2 if spatial else max(_ROW_INCH * rows, _categories(columns)) + 1.5
     equal = bool(columns[0][2].get("equal"))
     if equal:
         every = (np.concatenate([trace[axis] for trace in columns[0][1]]) for axis in "xy")
@@ -122,11 +142,11 @@ def _panel(ax: Any, traces: Sequence[Trace], layout: Layout, row: int, *, by_bac
         shift = (groups.index(trace["offsetgroup"]) + 0.5) / len(groups) - 0.5 if "offsetgroup" in trace else 0.0
         shift, width = 0.82 * shift, 0.68 / max(1, len(groups))
         line = trace.get("line", {})
-        style = {"color": line.get("color"), "lw": max(1.2, 0.8 * line.get("width", 0) if scene is None else 1.5)}
+        style = {"color": line.get("color"), "lw": max(0.4, (_SPATIAL if scene else 1.0) * 0.8 * line.get("width", 0))}
         style["ls"] = "-" if by_backend else _DASHES[line.get("dash", "solid")]
         if trace["type"] == "scatter3d":
-            truth = "backend" not in trace["meta"]
-            ax.plot(trace["x"], trace["y"], trace["z"], **{**style, "lw": 4.0 if truth else 1.5})
+            dot = {"marker": "o", "ms": 5, "color": trace["marker"]["color"]} if "marker" in trace else {}
+            ax.plot(trace["x"], trace["y"], trace["z"], **style | dot)
         elif trace["type"] == "box":
             _boxes(ax, trace, [places["x"][name] + shift for name in trace["x"]], width)
         elif trace["type"] == "bar":
@@ -161,8 +181,8 @@ def _scatter(ax: Any, trace: Trace, x: Any, y: Any, style: Mapping[str, Any]) ->
         ax.fill(x, y, color=trace["fillcolor"], alpha=trace["opacity"], lw=0)
         return
     if "lines" in trace["mode"]:
-        truth = "backend" not in trace["meta"] and "owners" not in trace["meta"]
-        ax.plot(x, y, **{**style, "lw": 4.0 if truth else style["lw"]}, zorder=1.5 if truth else 2)
+        below = style["lw"] > _THICK or "opacity" in trace
+        ax.plot(x, y, **style, alpha=trace.get("opacity"), zorder=1.5 if below else 2)
     if trace["mode"] == "text":
         for place, top, said in zip(x, y, trace["text"], strict=True):
             ax.annotate(said, (place, top), color=trace["textfont"]["color"], ha="center", va="top", fontsize=9)
@@ -229,7 +249,7 @@ def _numbers(values: Any, places: Mapping[str, int]) -> Any:
 
 def _space(ax: Any, scene: Mapping[str, Any]) -> None:
     for axis in "xyz":
-        getattr(ax, f"set_{axis}label")(scene[f"{axis}axis"]["title"]["text"], labelpad=6 if axis != "z" else -2)
+        getattr(ax, f"set_{axis}label")(scene[f"{axis}axis"]["title"]["text"], labelpad=6 if axis != "z" else 2)
     ax.set_aspect("equal")
     ax.locator_params(nbins=5)
     ax.locator_params(axis="z", nbins=3)
@@ -276,7 +296,8 @@ def _legend(canvas: Any, columns: Sequence[tuple[str, Sequence[Trace], Layout]])
                 handles[label] = Patch(label=label, **look)
             elif "lines" in trace["mode"]:
                 dashes = "-" if title else _DASHES[line.get("dash", "solid")]
-                handles[label] = Line2D([], [], ls=dashes, lw=4 if "backend" not in meta else 2, label=label, **look)
+                broad = 4 if line["width"] > 2 * _THICK else 2
+                handles[label] = Line2D([], [], ls=dashes, lw=broad, label=label, **look)
             elif "markers" in trace["mode"]:
                 symbol = marker["symbol"] if isinstance(marker.get("symbol"), str) else "circle"
                 face = "white" if symbol.endswith("-open") else look["color"]
