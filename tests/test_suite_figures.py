@@ -209,7 +209,11 @@ def test_trials_are_drawn_with_the_bounds_of_an_honest_filter(tmp_path):
         made.trial("msckf", seed, 1.0)
     study = made.study()
     assert files_of(study) == ["nees_of_trials", "trials"]
-    assert [t["meta"]["series"] for t in traces_of(study, "nees_of_trials")] == ["95 % if honest", "msckf"] * 3
+    assert [t["meta"]["series"] for t in traces_of(study, "nees_of_trials")] == [
+        "95 % if honest",
+        "single trials",
+        "msckf",
+    ] * 3
     assert "figure_eight: made up for a test." in drawn(study, "trials").get_supxlabel()
 
 
@@ -322,7 +326,7 @@ def test_a_place_that_cannot_be_written_is_one_line(tmp_path):
     said = CliRunner().invoke(main, ["report", str(tmp_path / "results"), "--out", str(out), "--no-page"])
     assert said.exit_code == 2
     assert said.output.count("\n") == 1
-    assert f"cannot write the report to {out}: " in said.output
+    assert f"cannot write {out}: " in said.output
 
 
 def _with_a_damaged_table(path: Path) -> None:

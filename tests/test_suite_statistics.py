@@ -8,8 +8,6 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from suite_helpers import MadeUp, comparison, key, labels, stress
 from trajectory_helpers import flight
 
@@ -28,7 +26,6 @@ from vioframe.report.suite.statistics import (
     records,
     seeds_text,
     stage_means,
-    wilson,
 )
 from vioframe.report.suite.tables import tables
 from vioframe.runs.evaluated import write_matched_truth
@@ -195,15 +192,6 @@ def test_without_a_second_seed_there_is_no_band(tmp_path):
     made.flight(labels())
     made.flight(labels(condition="fog", level=1.0))
     assert curves(made.study().flights)[["low", "high"]].isna().all(axis=None)
-
-
-@given(n=st.integers(1, 40), share=st.floats(0.0, 1.0))
-def test_wilsons_interval_is_that_of_scipy(n, share):
-    from scipy import stats
-
-    successes = round(share * n)
-    expected = stats.binomtest(successes, n).proportion_ci(0.95, method="wilson")
-    assert wilson(successes, n) == pytest.approx((expected.low, expected.high), abs=1e-12)
 
 
 def test_duels_pair_flights_and_a_failure_loses(stressed):

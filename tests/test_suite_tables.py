@@ -10,8 +10,8 @@ from suite_helpers import MACHINE, MadeUp, comparison, labels, stress
 
 from vioframe.evaluation import evaluate
 from vioframe.report.suite.statistics import Study, groups, records
-from vioframe.report.suite.table import Table, TableRow, number, text
 from vioframe.report.suite.tables import tables, write_tables
+from vioframe.report.table import Table, TableRow, number, text
 from vioframe.runs.folder import RunFolder
 
 AWKWARD = Table(

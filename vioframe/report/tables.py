@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING, Any
 
 from vioframe.evaluation import ALIGNED_BY
 from vioframe.evaluation.map_quality import WITHIN_M
+from vioframe.report.table import UNKNOWN, markdown
 from vioframe.runs.evaluated import Evaluated
 
 if TYPE_CHECKING:
     import pandas as pd
     from rich.table import Table
 
-UNKNOWN = "–"
 _STYLES = {"consistent": "green", "overconfident": "red", "pessimistic": "yellow"}
 
 # Cells by section and label, as formats of what `Evaluated.to_dict` holds.
@@ -117,15 +117,14 @@ def to_rich(cells: pd.DataFrame) -> Table:
 
 def to_markdown(cells: pd.DataFrame) -> str:
     """The same as a GitHub table."""
+    import pandas as pd
 
-    def line(*texts: str) -> str:
-        return "| " + " | ".join(text.replace("|", "\\|") for text in texts) + " |"
-
-    lines = [line("", *cells.columns), line("---", *("---:" for _ in cells.columns))]
+    blocks = []
     for title, rows in cells.groupby(level=0, sort=False):
-        lines.append(line(f"**{title}**", *("" for _ in cells.columns)))
-        lines += [line(str(label), *row) for label, row in rows.droplevel(0).iterrows()]
-    return "\n".join(lines)
+        own = rows.droplevel(0)
+        blocks += [pd.DataFrame("", [f"**{title}**"], own.columns), own]
+    table = pd.concat(blocks).reset_index(names="").map(lambda text: text.replace("|", "\\|"))
+    return "\n".join(markdown(table, ["---", *("---:" for _ in cells.columns)]))
 
 
 def to_json(runs: Sequence[Evaluated]) -> str:

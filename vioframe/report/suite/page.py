@@ -28,7 +28,7 @@ from vioframe.report.suite.statistics import (
     records,
     seeds_text,
 )
-from vioframe.report.suite.table import Table, TableRow
+from vioframe.report.table import Table, TableRow
 from vioframe.runs.results import CLEAR, Data
 
 DARK = {

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import os
-import shutil
 from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
 from vioframe.errors import PluginError, RunError
+from vioframe.io.convert import appearing
 from vioframe.runs.results import Results, task_count
 
 REPORT_FOLDER = "report"
@@ -29,8 +28,8 @@ class Written:
 def write_report(results: Results, out: Path | None = None, *, page: bool = True) -> Written:
     """Write everything to ``out``, by default ``report`` in the results; what was there before is replaced as a whole.
 
-    Without ``page`` it is tables and figures alone. Raises :class:`RunError` where ``out`` is some other folder, or
-    cannot be written, and :class:`PluginError` where the extra that it needs is not installed.
+    Without ``page`` it is tables and figures alone. Raises :class:`RunError` where ``out`` is some other folder,
+    :class:`DatasetError` where it cannot be written, and :class:`PluginError` where the extra that it needs is missing.
     """
     try:
         from vioframe.report.drawing import write_figures
@@ -48,35 +47,18 @@ def write_report(results: Results, out: Path | None = None, *, page: bool = True
     study = Study(results)
     made, drawn = tables(study), figures(study)
     quoted = {name: figure.file for name, figure in results.reference.figures.items()}
-    try:
-        with _appearing(out) as folder:
-            files = write_tables(made, folder / "tables", f"../{to_results}")
-            files += write_figures(drawn, folder / "figures", formats=("png", "svg"), names=quoted)
-            if page:
-                files.append(write_page(study, made, drawn, folder / "index.html", to_results))
-            relative = tuple(file.relative_to(folder) for file in files)
-    except OSError as error:
-        raise RunError(f"cannot write the report to {out}: {error.strerror}; choose another --out") from error
+    # Written beside ``out``, so that links out of it hold as they are.
+    with appearing(out, replace=True) as folder:
+        files = write_tables(made, folder / "tables", f"../{to_results}")
+        files += write_figures(drawn, folder / "figures", formats=("png", "svg"), names=quoted)
+        if page:
+            files.append(write_page(study, made, drawn, folder / "index.html", to_results))
+        relative = tuple(file.relative_to(folder) for file in files)
     return Written(out, relative, tuple(_notes(results)))
 
 
 def _replaceable(out: Path) -> bool:
     return out.is_dir() and (not any(out.iterdir()) or any((out / marker).is_file() for marker in MARKERS))
-
-
-@contextmanager
-def _appearing(out: Path) -> Iterator[Path]:
-    """A folder beside ``out``, so that links out of it hold as they are, which takes its place once it is complete."""
-    unfinished = out.with_name(f".{out.name}.unfinished")
-    shutil.rmtree(unfinished, ignore_errors=True)
-    unfinished.mkdir(parents=True)
-    try:
-        yield unfinished
-        if out.is_dir():
-            shutil.rmtree(out)
-        unfinished.replace(out)
-    finally:
-        shutil.rmtree(unfinished, ignore_errors=True)
 
 
 def _notes(results: Results) -> Iterator[str]:

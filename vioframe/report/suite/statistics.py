@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from math import comb
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -38,7 +37,6 @@ COMPLETE, INCOMPLETE = "complete", "not complete"
 """Incomplete is what was begun late, lost for more than a twentieth of the frames, or cut short."""
 NOT_EVALUATED, NEVER_INITIALISED, FAILED = "not evaluated", "never initialised", "failed"
 
-_Z = 1.959963984540054
 _SAME_M = 1e-9
 """ATEs closer than this are of one and the same estimate."""
 _ALWAYS = (
@@ -253,7 +251,7 @@ def curves(flights: pd.DataFrame) -> pd.DataFrame:
     where no level has two flights to tell a spread from. ``success`` is the part of all flights, failed ones included,
     that succeeded, within ``success_low`` to ``success_high`` (Wilson). ``flights`` are those of the point.
     """
-    from scipy.special import stdtrit
+    from scipy.stats import binomtest, t
 
     line = ["data", "sequence", *CONTENDER]
     clear = dict(groups(flights[flights["condition"] == CLEAR], line))
@@ -263,34 +261,25 @@ def curves(flights: pd.DataFrame) -> pd.DataFrame:
         log_ate = curve["ate_m"].astype(float).map(np.log).groupby(curve["level"])
         freedom = int((log_ate.count() - 1).clip(lower=0).sum())
         squares = float(((log_ate.count() - 1).clip(lower=0) * log_ate.var().fillna(0.0)).sum())
-        scatter = float(stdtrit(freedom, 0.5 + 0.5 * CONFIDENCE)) * np.sqrt(squares / freedom) if freedom else np.nan
+        scatter = t.ppf(0.5 + 0.5 * CONFIDENCE, freedom) * np.sqrt(squares / freedom) if freedom else np.nan
         for level, own in curve.groupby("level"):
             middle, n = log_ate.mean()[level], log_ate.count()[level]
             half = scatter / np.sqrt(n) if n else np.nan
-            success = wilson(int(own["succeeded"].sum()), len(own))
+            success = binomtest(int(own["succeeded"].sum()), len(own)).proportion_ci(CONFIDENCE, "wilson")
             rows.append(
                 {**dict(zip([*line, "condition"], key, strict=True)), "level": level, "ate_m": np.exp(middle)}
                 | {"low": np.exp(middle - half), "high": np.exp(middle + half), "success": own["succeeded"].mean()}
-                | {"success_low": success[0], "success_high": success[1], "flights": own}
+                | {"success_low": success.low, "success_high": success.high, "flights": own}
             )
     return pd.DataFrame(rows)
-
-
-def wilson(successes: int, n: int) -> tuple[float, float]:
-    """The 95 % score interval of a proportion (Wilson, 1927): never beyond 0 and 1."""
-    rate, shrink = successes / n, 1.0 + _Z**2 / n
-    middle = (rate + _Z**2 / (2 * n)) / shrink
-    half = _Z * np.sqrt(rate * (1.0 - rate) / n + _Z**2 / (4 * n**2)) / shrink
-    return max(0.0, float(middle - half)), min(1.0, float(middle + half))
 
 
 class Duel(NamedTuple):
     """A detector against the baseline, flight by flight: same recording, condition, level, back-end and seed.
 
     A complete flight wins against one that is not, an ATE against none, and otherwise the smaller one: whoever is lost
-    early has little time to be wrong in. Equal ones are ``tied``. ``ratio`` is the geometric mean of the ATE over the
-    baseline's, of the ``both`` pairs in which both have one. ``condition`` and ``level`` are None where it is over all
-    degraded flights. ``pairs`` has what is the baseline's in columns with the suffix ``_baseline``.
+    early has little time to be wrong in. Equal ones are ``tied``. ``condition`` and ``level`` are None where it is over
+    all degraded flights. ``pairs`` has what is the baseline's in columns with the suffix ``_baseline``.
     """
 
     data: str
@@ -298,18 +287,36 @@ class Duel(NamedTuple):
     level: float | None
     detector: str
     backend: str
-    won: int
-    lost: int
-    tied: int
-    both: int
-    ratio: float
     pairs: pd.DataFrame
+
+    @property
+    def won(self) -> int:
+        return int(self.pairs["won"].sum())
+
+    @property
+    def lost(self) -> int:
+        return int(self.pairs["lost"].sum())
+
+    @property
+    def tied(self) -> int:
+        return len(self.pairs) - self.won - self.lost
+
+    @property
+    def both(self) -> int:
+        """How many pairs there are in which both have an ATE."""
+        return int(self.pairs["log_ratio"].count())
+
+    @property
+    def ratio(self) -> float:
+        """The geometric mean of the ATE over the baseline's, of those pairs."""
+        return float(np.exp(self.pairs["log_ratio"].mean()))
 
     @property
     def p_value(self) -> float:
         """Of the two-sided sign test."""
-        n, k = self.won + self.lost, min(self.won, self.lost)
-        return min(1.0, sum(comb(n, i) for i in range(k + 1)) / 2.0 ** (n - 1))
+        from scipy.stats import binomtest
+
+        return float(binomtest(self.won, self.won + self.lost).pvalue) if self.won + self.lost else 1.0
 
 
 def duels(flights: pd.DataFrame, baseline: str) -> list[Duel]:
@@ -321,14 +328,11 @@ def duels(flights: pd.DataFrame, baseline: str) -> list[Duel]:
     pairs["won"] = (standing > other) | ((standing == other) & (gap_m > _SAME_M))
     pairs["lost"] = (standing < other) | ((standing == other) & (gap_m < -_SAME_M))
     pairs["log_ratio"] = np.log((pairs["ate_m"] / pairs["ate_m_baseline"]).astype(float))
-    single = list(groups(pairs, ("data", "condition", "level", *CONTENDER)))
     hard = groups(pairs[pairs["condition"] != CLEAR], ("data", *CONTENDER))
-    found = []
-    for key, own in [*single, *(((data, None, None, *who), own) for (data, *who), own in hard)]:
-        won, lost = int(own["won"].sum()), int(own["lost"].sum())
-        ratio = float(np.exp(own["log_ratio"].mean()))
-        found.append(Duel._make((*key, won, lost, len(own) - won - lost, int(own["log_ratio"].count()), ratio, own)))
-    return found
+    return [
+        *(Duel._make((*key, own)) for key, own in groups(pairs, ("data", "condition", "level", *CONTENDER))),
+        *(Duel._make((data, None, None, *contender, own)) for (data, *contender), own in hard),
+    ]
 
 
 def ate_sim3_m(errors: TrajectoryErrors | None) -> float:

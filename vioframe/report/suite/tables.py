@@ -33,7 +33,7 @@ from vioframe.report.suite.statistics import (
     stage_means,
     timed,
 )
-from vioframe.report.suite.table import Entry, Table, TableRow, mean, number, text
+from vioframe.report.table import Entry, Table, TableRow, mean, number, text
 from vioframe.runs.evaluated import MATCHED_TRUTH
 from vioframe.runs.results import CLEAR, Data
 

@@ -63,12 +63,15 @@ class Table:
     def has_links(self) -> bool:
         return any(row.links for row in self.rows)
 
-    def shown(self, row: TableRow) -> list[str]:
-        return [row.entries[heading].shown if heading in row.entries else UNKNOWN for heading in self.headings]
+    @property
+    def cells(self) -> pd.DataFrame:
+        """The entries as they are shown."""
+        shown = [{heading: entry.shown for heading, entry in row.entries.items()} for row in self.rows]
+        return pd.DataFrame(shown, columns=self.headings).fillna(UNKNOWN)
 
     def upright(self, names: Sequence[str]) -> pd.DataFrame:
-        """The cells as shown, for :func:`vioframe.report.tables.to_rich`: a column a row, called by its ``names``."""
-        shown = pd.DataFrame([self.shown(row) for row in self.rows], columns=self.headings)
+        """The cells for :func:`vioframe.report.tables.to_rich`: a column a row, called by its ``names``."""
+        shown = self.cells
         cells = shown.drop(columns=[*names]).T.set_axis(shown[[*names]].agg("\n".join, axis="columns"), axis="columns")
         return cells.set_axis(pd.MultiIndex.from_product([[self.title], cells.index]))
 
@@ -79,41 +82,41 @@ class Table:
 
     def to_markdown(self, to_results: str) -> str:
         """``to_results`` leads from the folder of the Markdown file to the results, for the links."""
-        runs = ["runs"] if self.has_links else []
-        rules = ["---" if self.is_text(heading) else "---:" for heading in self.headings] + ["---"] * len(runs)
-        lines = [_markdown(map(_escape_markdown, [*self.headings, *runs])), _markdown(rules)]
-        for row in self.rows:
-            cells = [
-                f"`{shown}`" if heading == self.code and shown != UNKNOWN else _escape_markdown(shown)
-                for heading, shown in zip(self.headings, self.shown(row), strict=True)
+        cells = self.cells.map(_escape_markdown).rename(columns=_escape_markdown)
+        rules = ["---" if self.is_text(heading) else "---:" for heading in self.headings]
+        if self.code in self.headings:
+            cells[self.code] = [shown if shown == UNKNOWN else f"`{shown}`" for shown in self.cells[self.code]]
+        if self.has_links:
+            rules.append("---")
+            cells["runs"] = [
+                " ".join(f"[{_escape_markdown(label)}]({to_results}/{path})" for label, path in row.links)
+                for row in self.rows
             ]
-            links = " ".join(f"[{_escape_markdown(label)}]({to_results}/{path})" for label, path in row.links)
-            lines.append(_markdown([*cells, links] if runs else cells))
-        return "\n".join([f"**{_escape_markdown(self.title)}**", "", *lines, "", _escape_markdown(self.caption), ""])
+        lines = [f"**{_escape_markdown(self.title)}**", "", *markdown(cells, rules), "", _escape_markdown(self.caption)]
+        return "\n".join([*lines, ""])
 
     def to_latex(self) -> str:
         """A float for the package booktabs; the links stay behind."""
-        rows = []
-        for row in self.rows:
-            cells = (_escape_latex(shown) for shown in self.shown(row))
-            pairs = zip(self.headings, cells, strict=True)
-            rows.append(_latex(f"\\texttt{{{cell}}}" if heading == self.code else cell for heading, cell in pairs))
-        lines = [
-            "% needs \\usepackage{booktabs}",
-            "\\begin{table}",
-            "  \\centering",
-            f"  \\caption{{{_escape_latex(f'{self.title}. {self.caption}')}}}",
-            f"  \\label{{tab:{self.name}}}",
-            f"  \\begin{{tabular}}{{{''.join('l' if self.is_text(heading) else 'r' for heading in self.headings)}}}",
-            "    \\toprule",
-            _latex(map(_escape_latex, self.headings)),
-            "    \\midrule",
-            *rows,
-            "    \\bottomrule",
-            "  \\end{tabular}",
-            "\\end{table}",
-        ]
-        return "\n".join(lines) + "\n"
+        cells = self.cells.map(_escape_latex)
+        if self.code in cells:
+            cells[self.code] = "\\texttt{" + cells[self.code] + "}"
+        latex = (
+            cells.rename(columns=_escape_latex)
+            .style.hide(axis="index")
+            .to_latex(
+                column_format="".join("l" if self.is_text(heading) else "r" for heading in self.headings),
+                position_float="centering",
+                hrules=True,
+                label=f"tab:{self.name}",
+                caption=_escape_latex(f"{self.title}. {self.caption}"),
+            )
+        )
+        return f"% needs \\usepackage{{booktabs}}\n{latex}"
+
+
+def markdown(cells: pd.DataFrame, rules: Iterable[str]) -> list[str]:
+    """The lines of a GitHub table of what is escaped already; ``rules`` say how its columns are aligned."""
+    return ["| " + " | ".join(row) + " |" for row in (cells.columns, rules, *cells.itertuples(index=False))]
 
 
 def text(value: str | None) -> Entry:
@@ -129,10 +132,6 @@ def mean(values: pd.Series, spec: str, suffix: str = "") -> Entry:
     """The mean of those that there are, shown with the sample's standard deviation where there are several."""
     std = values.std()
     return number(values.mean(), spec, suffix if pd.isna(std) else f" ± {std:{spec}}{suffix}")
-
-
-def _markdown(cells: Iterable[str]) -> str:
-    return "| " + " | ".join(cells) + " |"
 
 
 def _escape_markdown(value: str) -> str:
@@ -160,7 +159,3 @@ _LATEX = str.maketrans(
 
 def _escape_latex(value: str) -> str:
     return " ".join(value.split()).translate(_LATEX)
-
-
-def _latex(cells: Iterable[str]) -> str:
-    return "    " + " & ".join(cells) + " \\\\"
