@@ -6,7 +6,7 @@ A column a back-end, or one for each of several pictures side by side: on paper 
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from textwrap import fill
 from types import MappingProxyType
@@ -110,7 +110,7 @@ def _draw(case: Case, caption: str) -> Any:
     for row in () if spatial or equal else panels:
         _same_scale(row)
     canvas.align_ylabels(() if spatial else panels[:, 0])
-    _legend(canvas, columns)
+    _legend(canvas, panels.flat)
     letters = int(_LETTERS_AN_INCH * width)
     canvas.supxlabel(fill(caption, letters), fontsize=10, color="#555555", x=0.01, ha="left")
     return canvas
@@ -144,18 +144,21 @@ def _panel(ax: Any, traces: Sequence[Trace], layout: Layout, row: int, *, by_bac
         line = trace.get("line", {})
         style = {"color": line.get("color"), "lw": max(0.4, (_SPATIAL if scene else 1.0) * 0.8 * line.get("width", 0))}
         style["ls"] = "-" if by_backend else _DASHES[line.get("dash", "solid")]
+        meta = trace["meta"]
+        label = meta["detector"] if by_backend and "detector" in meta else meta.get("series", "")
         if trace["type"] == "scatter3d":
             dot = {"marker": "o", "ms": 5, "color": trace["marker"]["color"]} if "marker" in trace else {}
-            ax.plot(trace["x"], trace["y"], trace["z"], **style | dot)
+            ax.plot(trace["x"], trace["y"], trace["z"], **style | dot, label="" if dot else label)
         elif trace["type"] == "box":
-            _boxes(ax, trace, [places["x"][name] + shift for name in trace["x"]], width)
+            _boxes(ax, trace, [places["x"][name] + shift for name in trace["x"]], width, label)
         elif trace["type"] == "bar":
-            for name, value in zip(trace["y"], trace["x"], strict=True):
-                ax.barh(places["y"][name], value, left=left.get(name, 0.0), height=0.64, color=trace["marker"]["color"])
-                left[name] = left.get(name, 0.0) + value
+            begins = [left.get(name, 0.0) for name in trace["y"]]
+            where = [places["y"][name] for name in trace["y"]]
+            ax.barh(where, trace["x"], left=begins, height=0.64, color=trace["marker"]["color"], label=label)
+            left |= {name: begin + x for name, begin, x in zip(trace["y"], begins, trace["x"], strict=True)}
         else:
             x, y = (_numbers(trace[axis], places[axis]) for axis in "xy")
-            _scatter(ax, trace, x + shift, y, style)
+            _scatter(ax, trace, x + shift, y, {**style, "label": label})
     for name, total in left.items():
         ax.annotate(
             f"{total:.1f} ms", (total, places["y"][name]), xytext=(6, 0), textcoords="offset points", va="center"
@@ -178,7 +181,7 @@ def _scatter(ax: Any, trace: Trace, x: Any, y: Any, style: Mapping[str, Any]) ->
     marker = trace.get("marker", {})
     colour = marker.get("color") or style["color"]
     if trace.get("fill") == "toself":
-        ax.fill(x, y, color=trace["fillcolor"], alpha=trace["opacity"], lw=0)
+        ax.fill(x, y, color=trace["fillcolor"], alpha=trace["opacity"], lw=0, label=style["label"])
         return
     if "lines" in trace["mode"]:
         below = style["lw"] > _THICK or "opacity" in trace
@@ -196,17 +199,18 @@ def _scatter(ax: Any, trace: Trace, x: Any, y: Any, style: Mapping[str, Any]) ->
         for across, up, symbol in zip(x, y, symbols, strict=True):
             face = "white" if symbol.endswith("-open") else colour
             shape = _MARKERS[symbol.removesuffix("-open")]
-            ax.plot(across, up, shape, ms=0.75 * marker["size"], mfc=face, mec=colour, mew=1.5, zorder=4)
+            look = {"ls": "none", "marker": shape, "ms": 0.75 * marker["size"], "mfc": face, "mec": colour, "mew": 1.5}
+            ax.plot(across, up, **look, zorder=4, label="" if "lines" in trace["mode"] else style["label"])
 
 
-def _boxes(ax: Any, trace: Trace, places: Sequence[float], width: float) -> None:
+def _boxes(ax: Any, trace: Trace, places: Sequence[float], width: float, label: str) -> None:
     keys = {"lowerfence": "whislo", "q1": "q1", "median": "med", "q3": "q3", "upperfence": "whishi"}
     boxes = [dict(zip(keys.values(), five, strict=True)) for five in zip(*(trace[key] for key in keys), strict=True)]
     edge = {"color": trace["line"]["color"], "lw": 1.2}
     look = {"medianprops": {"color": "black", "lw": 1.6}, "whiskerprops": edge, "capprops": edge}
     face = {"facecolor": trace["fillcolor"], "edgecolor": edge["color"], "lw": 0.8}
     how: dict[str, Any] = {"showfliers": False, "patch_artist": True, "manage_ticks": False, "boxprops": face}
-    ax.bxp(boxes, positions=places, widths=width, **how, **look)
+    ax.bxp(boxes, positions=places, widths=width, **how, **look)["boxes"][0].set_label(label)
 
 
 def _set_axis(ax: Any, name: str, axis: Mapping[str, Any], traces: Sequence[Trace]) -> dict[str, int]:
@@ -273,37 +277,15 @@ def _categories(columns: Sequence[tuple[str, Sequence[Trace], Layout]]) -> float
     return sum(0.49 + 0.24 * name.count("<br>") for name in names)
 
 
-def _legend(canvas: Any, columns: Sequence[tuple[str, Sequence[Trace], Layout]]) -> None:
-    """One legend for all panels, above them, in as few lines as fit; columns say which back-end it is."""
-    from matplotlib.lines import Line2D
-    from matplotlib.patches import Patch
-
+def _legend(canvas: Any, panels: Iterable[Any]) -> None:
+    """One legend for all panels, above them, in as few lines as fit."""
     handles: dict[str, Any] = {}
-    for title, traces, _ in columns:
-        for trace in traces:
-            meta, line, marker = trace["meta"], trace.get("line", {}), trace.get("marker", {})
-            label = meta["detector"] if title and "detector" in meta else meta.get("series", "")
-            if not label or (label in handles and trace.get("fill")):
-                continue
-            look: dict[str, Any] = {"color": marker.get("color") or line.get("color")}
-            if trace["type"] in ("bar", "box") or trace.get("fill"):
-                faint = trace.get("opacity", 1.0)
-                look = {
-                    "facecolor": trace.get("fillcolor") or look["color"],
-                    "edgecolor": look["color"],
-                    "alpha": faint,
-                }
-                handles[label] = Patch(label=label, **look)
-            elif "lines" in trace["mode"]:
-                dashes = "-" if title else _DASHES[line.get("dash", "solid")]
-                broad = 4 if line["width"] > 2 * _THICK else 2
-                handles[label] = Line2D([], [], ls=dashes, lw=broad, label=label, **look)
-            elif "markers" in trace["mode"]:
-                symbol = marker["symbol"] if isinstance(marker.get("symbol"), str) else "circle"
-                face = "white" if symbol.endswith("-open") else look["color"]
-                shape = _MARKERS[symbol.removesuffix("-open")]
-                handles.setdefault(label, Line2D([], [], ls="none", marker=shape, mfc=face, label=label, **look))
+    for ax in panels:
+        for handle, label in zip(*ax.get_legend_handles_labels(), strict=True):
+            handles.setdefault(label, handle)
     if handles:
         columns_that_fit = int(canvas.get_figwidth() / (0.75 + max(map(len, handles)) / 11.0))
         how: dict[str, Any] = {"loc": "outside upper left", "borderaxespad": 0.2}
-        canvas.legend(handles=list(handles.values()), ncols=max(1, min(columns_that_fit, len(handles))), **how)
+        how["ncols"] = max(1, min(columns_that_fit, len(handles)))
+        for shown in canvas.legend(list(handles.values()), list(handles), **how).get_lines():
+            shown.set(lw=max(2.0, shown.get_linewidth()), alpha=1.0)

@@ -190,11 +190,9 @@ def _over_time(
         for line, errors in course.with_errors:
             for k, (t_ns, values, note) in enumerate(series(errors)):
                 said = f"%{{y:.3f}} at %{{x:.1f}} s{f', {note}' if note else ''}<extra>{line.series}</extra>"
-                shown = {"x": None if k else line.seconds(t_ns), "y": line.shown(t_ns, values), "line": line.style()}
-                meta = {**line.meta, "note": note, "x_back": k}
-                traces.append(
-                    {"type": "scatter", "mode": "lines", **shown, "hovertemplate": said, "meta": meta, **axes(k)}
-                )
+                time_s, meta = None if k else line.seconds(t_ns), {**line.meta, "note": note, "x_back": k}
+                shown = line.shown(t_ns, values)
+                traces.append(scatter(time_s, shown, meta, k, line=line.style(), hovertemplate=said))
         layout = panels(panel_titles, "time since the ground truth begins [s]", **y)
         if bands:
             layout["shapes"] = [_shaded(k, *ends) for k, ends in enumerate(bands)]
@@ -390,9 +388,8 @@ def _tracks(lines: Sequence[Line]) -> Figure:
         if found := line.run.folder.tracks() if line.run.folder else None:
             time_s = (found.frames_ns - found.frames_ns[0]) / NS_PER_S
             # In the first frame every feature is new, which would hide all that follows.
-            for k, counts in enumerate((found.tracked, found.new[1:])):
-                shown = {"x": time_s[k:], "y": counts, "line": line.style(), "meta": line.meta}
-                traces.append({"type": "scatter", "mode": "lines", **shown, **axes(k)})
+            counts = (found.tracked, found.new[1:])
+            traces += [scatter(time_s[k:], each, line.meta, k, line=line.style()) for k, each in enumerate(counts)]
     return Figure("tracks", "Features over time", {"all": Case([(traces, layout)])} if traces else {})
 
 
@@ -427,10 +424,16 @@ def category(names: Sequence[str]) -> dict[str, Any]:
     return {"type": "category", "categoryorder": "array", "categoryarray": list(names)}
 
 
-def area(x: Any, low: Any, high: Any, colour: str, opacity: float = 0.18) -> Trace:
-    outline = {"x": [*x, *x[::-1]], "y": [*high, *low[::-1]], "mode": "lines", "line": {"width": 0, "color": colour}}
-    outline = {key: np.asarray(value, np.float32) if key in "xy" else value for key, value in outline.items()}
-    return {**outline, "fill": "toself", "fillcolor": colour, "opacity": opacity, "hoverinfo": "skip"}
+def scatter(x: Any, y: Any, meta: Mapping[str, Any], k: int = 0, mode: str = "lines", **more: Any) -> Trace:
+    """Lines or markers in the k-th of :func:`panels`."""
+    return {"type": "scatter", "mode": mode, "x": x, "y": y, "meta": meta, **axes(k), **more}
+
+
+def area(x: Any, low: Any, high: Any, meta: Mapping[str, Any], k: int, colour: str, opacity: float = 0.18) -> Trace:
+    """What is between ``low`` and ``high`` (N,), which may be pandas' or NumPy's."""
+    around = np.asarray([*x, *x[::-1]], np.float32), np.asarray([*high, *low[::-1]], np.float32)
+    look = {"line": {"width": 0, "color": colour}, "fill": "toself", "fillcolor": colour, "opacity": opacity}
+    return scatter(*around, meta, k, **look, hoverinfo="skip")
 
 
 def _shaded(k: int, low: float, high: float) -> dict[str, Any]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -24,11 +24,11 @@ from vioframe.report.figures import (
     Line,
     Trace,
     area,
-    axes,
     axis_name,
     category,
     figures_of_courses,
     panels,
+    scatter,
     stage_bars,
     timing,
 )
@@ -157,20 +157,21 @@ def _ate_by_sequence(study: Study, look: Look) -> Figure | None:
     traces: list[Trace] = []
     for (detector, backend), own in groups(found, CONTENDER):
         where = own["sequence"] + "<br>" + own["data"].astype(str)
-        series, colour = look.name(detector, backend), look.colour(detector, backend)
-        shared = {"type": "scatter", "meta": look.meta(detector, backend), "offsetgroup": series, "name": series}
+        series, colour, meta = (
+            look.name(detector, backend),
+            look.colour(detector, backend),
+            look.meta(detector, backend),
+        )
+        shared = {"offsetgroup": series, "name": series, "hovertemplate": f"%{{y:.3f}} m<extra>{series}</extra>"}
         means = own.groupby(where, sort=False)["ate_m"].mean().dropna()
         missing = (~own["evaluated"]).groupby(where, sort=False).sum().loc[lambda n: n > 0]
         dots = {"size": 8, "symbol": f"{look.symbol(backend)}-open", "color": colour, "line": {"width": 1.6}}
         bars = {"size": 16, "symbol": "line-ew", "color": colour, "line": {"width": 3, "color": colour}}
-        hover = {"hovertemplate": f"%{{y:.3f}} m<extra>{series}</extra>"}
-        traces += [
-            {**shared, "x": where.tolist(), "y": own["ate_m"].tolist(), "mode": "markers", "marker": dots, **hover},
-            {**shared, "x": list(means.index), "y": means.tolist(), "mode": "markers", "marker": bars, **hover},
-        ]
+        traces.append(scatter(where.tolist(), own["ate_m"].tolist(), meta, 0, "markers", marker=dots, **shared))
+        traces.append(scatter(list(means.index), means.tolist(), meta, 0, "markers", marker=bars, **shared))
         if len(missing):
             said = {"text": [f"✗{n}" for n in missing], "textfont": {"color": colour}, "hoverinfo": "skip"}
-            traces.append({**shared, "x": list(missing.index), "y": [top] * len(missing), "mode": "text", **said})
+            traces.append(scatter(list(missing.index), [top] * len(missing), meta, 0, "text", **{**shared, **said}))
     layout = {
         "xaxis": category(recordings),
         "yaxis": {"title": {"text": "ATE, position + yaw [m]"}, **_LOG},
@@ -218,29 +219,26 @@ def _curve(curve: pd.DataFrame, contender: tuple[str, str], look: Look) -> list[
         ("ate_m", "low", "high", "ATE {:.3f} m"),
         ("success", "success_low", "success_high", "{:.0f} % succeeded"),
     )
-    traces = []
+    colour, meta, traces = look.colour(detector, backend), look.meta(detector, backend), []
     for k, (value, low, high, says) in enumerate(columns):
         known = percent[percent[value].notna()]
-        shared = {"type": "scatter", "meta": look.meta(detector, backend), **axes(k)}
-        colour = look.colour(detector, backend)
         banded = known[known[low].notna()]
         if len(banded) > 1:
             faint = min(0.14, 0.4 / (len(look.detectors) * len(look.backends)))
-            traces.append({**shared, **area(banded["level"], banded[low], banded[high], colour, faint)})
-        whole = [bool(own["complete"].all()) for own in known["flights"]]
-        said = [
-            f"{says.format(v)}, seeds: {seeds_text(own)}" for v, own in zip(known[value], known["flights"], strict=True)
-        ]
-        line = {"mode": "lines+markers", "line": look.line(detector, backend, width=2.2), "customdata": said}
-        hollow = ["circle" if k or each else "circle-open" for each in whole]
-        line |= {"x": known["level"].tolist(), "y": known[value].tolist()}
-        line |= {"marker": {"size": 7, "color": colour, "symbol": hollow}}
-        hover = f"level %{{x:g}}: %{{customdata}}<extra>{look.name(detector, backend)}</extra>"
-        traces.append({**shared, **line, "hovertemplate": hover})
+            traces.append(area(banded["level"], banded[low], banded[high], meta, k, colour, faint))
+        hollow = ["circle" if k or own["complete"].all() else "circle-open" for own in known["flights"]]
+        points = zip(known[value], known["flights"], strict=True)
+        more = {
+            "line": look.line(detector, backend, width=2.2),
+            "marker": {"size": 7, "color": colour, "symbol": hollow},
+            "customdata": [f"{says.format(v)}, seeds: {seeds_text(own)}" for v, own in points],
+            "hovertemplate": f"level %{{x:g}}: %{{customdata}}<extra>{look.name(detector, backend)}</extra>",
+        }
+        traces.append(scatter(known["level"].tolist(), known[value].tolist(), meta, k, "lines+markers", **more))
         if not k:
             single = pd.concat(list(known["flights"])).dropna(subset="ate_m")
-            dots = {"x": single["level"].tolist(), "y": single["ate_m"].tolist(), "hoverinfo": "skip", "opacity": 0.6}
-            traces.append({**shared, **dots, "mode": "markers", "marker": {"size": 4, "color": colour}})
+            dots = {"marker": {"size": 4, "color": colour}, "opacity": 0.6, "hoverinfo": "skip"}
+            traces.append(scatter(single["level"].tolist(), single["ate_m"].tolist(), meta, k, "markers", **dots))
     return traces
 
 
@@ -257,40 +255,23 @@ def _detector_fps(study: Study) -> Figure | None:
     quoted = {name: speeds[base] for name in measured["detector"] if (base := name.partition(":")[0]) in speeds}
     blue = style.colour(0)
     ends = {"array": measured["fps_high"] - measured["fps"], "arrayminus": measured["fps"] - measured["fps_low"]}
-    traces: list[Trace] = [
-        {
-            "type": "scatter",
-            "mode": "markers",
-            "x": measured["fps"].tolist(),
-            "y": [_wrapped(name) for name in measured["detector"]],
-            "error_x": {
-                "type": "data",
-                **{key: values.tolist() for key, values in ends.items()},
-                "color": blue,
-                "thickness": 2,
-                "width": 0,
-            },
-            "marker": {"size": 12, "color": blue},
-            "customdata": [f"{row.ms:.2f} ms on {row.on}" for row in measured.itertuples()],
-            "hovertemplate": "%{x:.1f} FPS, %{customdata}<extra>measured here</extra>",
-            "meta": {"series": "measured here", "owners": [{"detector": name} for name in measured["detector"]]},
-        }
-    ]
+    spans = {"type": "data", "color": blue, "thickness": 2, "width": 0, **{k: v.tolist() for k, v in ends.items()}}
+
+    def points(series: str, fps: Iterable[float], names: Iterable[str], said: list[str], **more: Any) -> Trace:
+        names = list(names)
+        meta = {"series": series, "owners": [{"detector": name} for name in names]}
+        hover = f"%{{x:.4g}} FPS, %{{customdata}}<extra>{series}</extra>"
+        shown = list(fps), [_wrapped(name) for name in names]
+        return scatter(*shown, meta, mode="markers", customdata=said, hovertemplate=hover, **more)
+
+    traces = []
     if quoted:
         hollow = {"symbol": "diamond-open", "size": 12, "color": TRUTH_COLOUR, "line": {"width": 2.5}}
-        traces.insert(
-            0,
-            {
-                "type": "scatter",
-                "mode": "markers",
-                "marker": hollow,
-                "x": [q.fps for q in quoted.values()],
-                "y": [_wrapped(name) for name in quoted],
-                "customdata": [q.source for q in quoted.values()],
-                "hovertemplate": "%{x:.0f} FPS<br>%{customdata}<extra>quoted</extra>",
-                "meta": {"series": "quoted", "owners": [{"detector": name} for name in quoted]},
-            },
-        )
+        sources = [quote.source for quote in quoted.values()]
+        traces.append(points("quoted", [quote.fps for quote in quoted.values()], quoted, sources, marker=hollow))
+    times = [f"{row.ms:.2f} ms on {row.on}" for row in measured.itertuples()]
+    dots = {"error_x": spans, "marker": {"size": 12, "color": blue}}
+    traces.append(points("measured here", measured["fps"], measured["detector"], times, **dots))
     names = [_wrapped(name) for name in measured["detector"][::-1]]
     layout = {
         "xaxis": {"title": {"text": "frames a second, logarithmic"}, **_LOG},
@@ -350,24 +331,21 @@ def _nees_picture(
     layout, traces = panels(titles, "time since the first frame [s]"), []
     for k, part in enumerate(PARTS):
         widest = max((each[part] for each in found.values()), key=lambda nees: int(nees.trials.max()))
-        bounds = area(widest.t_ns / NS_PER_S, widest.low, widest.high, BAND_COLOUR)
-        traces.append({"type": "scatter", **bounds, "meta": {"series": "95 % if honest"}, **axes(k)})
+        t_s, honest = widest.t_ns / NS_PER_S, {"series": "95 % if honest"}
+        traces.append(area(t_s, widest.low, widest.high, honest, k, BAND_COLOUR))
         if single:
             gap = pd.DataFrame({"t_ns": [np.nan], part: [np.nan]})
             joined = pd.concat([each for trial in single for each in (trial[:: 1 + len(trial) // _POINTS_LEAST], gap)])
-            shown: Trace = {"x": joined["t_ns"].to_numpy(np.float32) / NS_PER_S, "y": joined[part].to_numpy(np.float32)}
-            thin = {"line": {"color": TRUTH_COLOUR, "width": 0.6}, "opacity": 0.5, "hoverinfo": "skip", "mode": "lines"}
-            traces.append({"type": "scatter", **shown, **thin, "meta": {"series": "single trials"}, **axes(k)})
+            t_s, values = (joined[column].to_numpy(np.float32) for column in ("t_ns", part))
+            thin = {"line": {"color": TRUTH_COLOUR, "width": 0.6}, "opacity": 0.5, "hoverinfo": "skip"}
+            traces.append(scatter(t_s / NS_PER_S, values, {"series": "single trials"}, k, **thin))
         for (detector, backend), parts in found.items():
-            time_s, values = (
-                np.asarray(each, np.float32) for each in (parts[part].t_ns / NS_PER_S, parts[part].values)
-            )
-            shown = {"x": time_s, "y": values, "mode": "lines"}
-            note = f"mean {parts[part].mean:.2f}"
+            nees = parts[part]
+            t_s, values = (np.asarray(each, np.float32) for each in (nees.t_ns / NS_PER_S, nees.values))
+            note = f"mean {nees.mean:.2f}"
             hover = f"%{{y:.2f}} at %{{x:.1f}} s, {note}<extra>{backend}</extra>"
-            own = {"line": look.line(detector, backend), "hovertemplate": hover}
             meta = {"series": backend, "backend": backend, "note": note}
-            traces.append({"type": "scatter", **shown, **own, "meta": meta, **axes(k)})
+            traces.append(scatter(t_s, values, meta, k, line=look.line(detector, backend), hovertemplate=hover))
         highest = max(float(each[part].values.max()) for each in found.values())
         if highest > _LOGARITHMIC_FROM * widest.mean_band[1]:
             # The first pose is the gauge, where the error is nothing.
@@ -389,11 +367,12 @@ def _trials(study: Study, look: Look) -> Figure:
             layout[axis_name("x", k)] |= category(list(here["backend"].unique()))
             for (detector, backend), own in groups(here, CONTENDER):
                 dots = {"size": 8, "symbol": "circle-open", "color": look.colour(detector, backend)}
-                values = {"x": own["backend"].tolist(), "y": own[column].astype(float).tolist(), "mode": "markers"}
-                hover = "%{y:.3f}, seed %{customdata}<extra></extra>"
-                told = {"customdata": own["seed"].tolist(), "hovertemplate": hover, "marker": dots}
-                meta = {"series": backend, "backend": backend}
-                traces.append({"type": "scatter", **values, **told, "meta": meta, **axes(k)})
+                told = {
+                    "customdata": own["seed"].tolist(),
+                    "hovertemplate": "%{y:.3f}, seed %{customdata}<extra></extra>",
+                }
+                meta, values = {"series": backend, "backend": backend}, own[column].astype(float).tolist()
+                traces.append(scatter(own["backend"].tolist(), values, meta, k, "markers", marker=dots, **told))
         return (traces, layout) if here["ate_m"].notna().any() else None
 
     missing = int(study.trials["ate_m"].isna().sum())
