@@ -117,6 +117,7 @@ def test_the_band_is_shaded_and_each_line_says_how_much_of_it_is_inside(compared
     worst = compared.flights[compared.flights["evaluated"]].groupby("seed").get_group(1).iloc[0]
     share = inside_band(compared.errors(worst), 0.2)
     assert axes[1, 0].get_legend().get_texts()[0].get_text() == f"{share['y']:.1f} % inside"
+    assert [text.get_text() for text in canvas.legends[0].get_texts()] == ["shi_tomasi", "keypointnet"]
     assert "±20 cm" in canvas.get_supxlabel()
 
 

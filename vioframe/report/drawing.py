@@ -132,6 +132,8 @@ def _columns(case: Case) -> Iterator[tuple[str, Sequence[Trace], Layout]]:
 
 
 def _panel(ax: Any, traces: Sequence[Trace], layout: Layout, row: int, *, by_backend: bool) -> None:
+    from matplotlib.lines import Line2D
+
     scene = layout.get("scene")
     places: dict[str, dict[str, int]] = {}
     for name in () if scene else ("x", "y"):
@@ -169,7 +171,7 @@ def _panel(ax: Any, traces: Sequence[Trace], layout: Layout, row: int, *, by_bac
             ax.axhspan(shape["y0"], shape["y1"], color=shape["fillcolor"], alpha=shape["opacity"], lw=0)
     notes = [(trace, note) for trace in traces if (note := trace["meta"].get("note"))]
     if notes:
-        handles = [ax.plot([], [], color=trace["line"]["color"], label=note)[0] for trace, note in notes]
+        handles = [Line2D([], [], color=trace["line"]["color"], label=note) for trace, note in notes]
         ax.legend(handles=handles, loc="lower right", bbox_to_anchor=(1.0, 0.97), ncols=len(notes), fontsize=9.5)
     if scene:
         _space(ax, scene)
@@ -279,10 +281,14 @@ def _categories(columns: Sequence[tuple[str, Sequence[Trace], Layout]]) -> float
 
 def _legend(canvas: Any, panels: Iterable[Any]) -> None:
     """One legend for all panels, above them, in as few lines as fit."""
+    from matplotlib.patches import Polygon
+
     handles: dict[str, Any] = {}
     for ax in panels:
         for handle, label in zip(*ax.get_legend_handles_labels(), strict=True):
-            handles.setdefault(label, handle)
+            # A line says more of its series than the area about it.
+            if label not in handles or isinstance(handles[label], Polygon):
+                handles[label] = handle
     if handles:
         columns_that_fit = int(canvas.get_figwidth() / (0.75 + max(map(len, handles)) / 11.0))
         how: dict[str, Any] = {"loc": "outside upper left", "borderaxespad": 0.2}

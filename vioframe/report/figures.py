@@ -432,7 +432,7 @@ def scatter(x: Any, y: Any, meta: Mapping[str, Any], k: int = 0, mode: str = "li
 def area(x: Any, low: Any, high: Any, meta: Mapping[str, Any], k: int, colour: str, opacity: float = 0.18) -> Trace:
     """What is between ``low`` and ``high`` (N,), which may be pandas' or NumPy's."""
     around = np.asarray([*x, *x[::-1]], np.float32), np.asarray([*high, *low[::-1]], np.float32)
-    look = {"line": {"width": 0, "color": colour}, "fill": "toself", "fillcolor": colour, "opacity": opacity}
+    look: Trace = {"line": {"width": 0, "color": colour}, "fill": "toself", "fillcolor": colour, "opacity": opacity}
     return scatter(*around, meta, k, **look, hoverinfo="skip")
 
 

@@ -157,11 +157,8 @@ def _ate_by_sequence(study: Study, look: Look) -> Figure | None:
     traces: list[Trace] = []
     for (detector, backend), own in groups(found, CONTENDER):
         where = own["sequence"] + "<br>" + own["data"].astype(str)
-        series, colour, meta = (
-            look.name(detector, backend),
-            look.colour(detector, backend),
-            look.meta(detector, backend),
-        )
+        colour, meta = look.colour(detector, backend), look.meta(detector, backend)
+        series = meta["series"]
         shared = {"offsetgroup": series, "name": series, "hovertemplate": f"%{{y:.3f}} m<extra>{series}</extra>"}
         means = own.groupby(where, sort=False)["ate_m"].mean().dropna()
         missing = (~own["evaluated"]).groupby(where, sort=False).sum().loc[lambda n: n > 0]
@@ -336,16 +333,16 @@ def _nees_picture(
         if single:
             gap = pd.DataFrame({"t_ns": [np.nan], part: [np.nan]})
             joined = pd.concat([each for trial in single for each in (trial[:: 1 + len(trial) // _POINTS_LEAST], gap)])
-            t_s, values = (joined[column].to_numpy(np.float32) for column in ("t_ns", part))
-            thin = {"line": {"color": TRUTH_COLOUR, "width": 0.6}, "opacity": 0.5, "hoverinfo": "skip"}
-            traces.append(scatter(t_s / NS_PER_S, values, {"series": "single trials"}, k, **thin))
+            at_s, values = (joined[column].to_numpy(np.float32) for column in ("t_ns", part))
+            thin: Trace = {"line": {"color": TRUTH_COLOUR, "width": 0.6}, "opacity": 0.5, "hoverinfo": "skip"}
+            traces.append(scatter(at_s / NS_PER_S, values, {"series": "single trials"}, k, **thin))
         for (detector, backend), parts in found.items():
             nees = parts[part]
-            t_s, values = (np.asarray(each, np.float32) for each in (nees.t_ns / NS_PER_S, nees.values))
+            seconds, shown = (np.asarray(each, np.float32) for each in (nees.t_ns / NS_PER_S, nees.values))
             note = f"mean {nees.mean:.2f}"
             hover = f"%{{y:.2f}} at %{{x:.1f}} s, {note}<extra>{backend}</extra>"
             meta = {"series": backend, "backend": backend, "note": note}
-            traces.append(scatter(t_s, values, meta, k, line=look.line(detector, backend), hovertemplate=hover))
+            traces.append(scatter(seconds, shown, meta, k, line=look.line(detector, backend), hovertemplate=hover))
         highest = max(float(each[part].values.max()) for each in found.values())
         if highest > _LOGARITHMIC_FROM * widest.mean_band[1]:
             # The first pose is the gauge, where the error is nothing.
@@ -367,10 +364,8 @@ def _trials(study: Study, look: Look) -> Figure:
             layout[axis_name("x", k)] |= category(list(here["backend"].unique()))
             for (detector, backend), own in groups(here, CONTENDER):
                 dots = {"size": 8, "symbol": "circle-open", "color": look.colour(detector, backend)}
-                told = {
-                    "customdata": own["seed"].tolist(),
-                    "hovertemplate": "%{y:.3f}, seed %{customdata}<extra></extra>",
-                }
+                hover = "%{y:.3f}, seed %{customdata}<extra></extra>"
+                told = {"customdata": own["seed"].tolist(), "hovertemplate": hover}
                 meta, values = {"series": backend, "backend": backend}, own[column].astype(float).tolist()
                 traces.append(scatter(own["backend"].tolist(), values, meta, k, "markers", marker=dots, **told))
         return (traces, layout) if here["ate_m"].notna().any() else None
