@@ -10,7 +10,7 @@ torch = pytest.importorskip("torch")
 
 from keypointnet_helpers import ARCHITECTURES, COMPACT, NARROW, QUICK, network, texture, weights  # noqa: E402
 
-from vioframe.errors import ConfigError  # noqa: E402
+from vioframe.errors import ConfigError, PluginError  # noqa: E402
 from vioframe_keypointnet import runtimes  # noqa: E402
 from vioframe_keypointnet.graph import onnx_model  # noqa: E402
 from vioframe_keypointnet.network import describe as describe_in_torch  # noqa: E402
@@ -182,5 +182,5 @@ def test_a_library_that_is_absent_is_named_with_its_extra(runtime, monkeypatch):
     made = weights(network(COMPACT))
     monkeypatch.setitem(sys.modules, runtime, None)
     extra = "keypointnet" if runtime == "torch" else runtime
-    with pytest.raises(ConfigError, match=rf"{runtime}.*pip install 'vioframe\[{extra}\]'"):
+    with pytest.raises(PluginError, match=rf"{runtime}.*pip install 'vioframe\[{extra}\]'"):
         runtimes.start(runtime, "float32", made, descriptors=False, threads=1)

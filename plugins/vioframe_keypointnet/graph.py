@@ -8,19 +8,22 @@ it lets through below zero is less than a step.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from vioframe_keypointnet.architecture import HEADS, OUT, RESPONSE, Architecture, Tensors
-from vioframe_keypointnet.optional import needs
+from vioframe.errors import needs
+from vioframe_keypointnet.architecture import HEADS, Architecture, Tensors
 from vioframe_keypointnet.seeing import CONTRAST_STEP, ZERO
 from vioframe_keypointnet.weights import Weights
 
 _OPSET, _IR = 17, 9
+_OUT = "out"
+_LAST = (_OUT, "R")
+"""The layers whose outputs are the detector's: in int8 what they see has 8 bits, what they give has not."""
 _LEAK = 0.01
 """Slope of LeakyReLU below zero."""
 _NEUTRAL_GREY = 127.5
@@ -35,7 +38,7 @@ def onnx_model(weights: Weights, shape: tuple[int, int], *, descriptors: bool = 
     It takes as ``seen`` (1, C, h, w) what an :class:`~vioframe_keypointnet.seeing.Eye` sees, and gives what
     :meth:`vioframe_keypointnet.network.KeypointNet.found` does, which it equals on R = G = B but for rounding.
     """
-    with needs("onnx", "openvino"):
+    with needs("onnx", "openvino", user="KeypointNet by OpenVINO"):
         from onnx import TensorProto, helper
 
     architecture, f = weights.architecture, weights.architecture.fold
@@ -52,26 +55,29 @@ def onnx_model(weights: Weights, shape: tuple[int, int], *, descriptors: bool = 
 def _build(graph: _Graph, weights: Weights, descriptors: bool) -> tuple[str, ...]:
     """Adds all layers; the names of the outputs."""
     architecture, tensors = weights.architecture, weights.tensors
-    x = graph.seen("seen", architecture.peaks)
-    after = {}
-    for layer in _encoder(architecture, tensors, descriptors, whole_grey_levels=graph.int8 and not architecture.peaks):
-        x = after[layer.name[0]] = graph.convolve(layer, x)
-        if layer.name in architecture.pooled:
+    x, after = graph.seen("seen", architecture.peaks), dict[int, str]()
+    for number, layers in architecture.encoder.items():
+        if number > 2 and architecture.peaks and not descriptors:
+            break
+        if after:
             x = graph.node("MaxPool", [x], kernel_shape=[2, 2], strides=[2, 2])
+        for k, layer in enumerate(layers):
+            convolution = _convolution(tensors, layer.name)
+            if not after and k == 0:
+                convolution = _of_what_is_seen(convolution, architecture, graph.int8)
+            x = graph.convolve(convolution, x)
+        after[number] = x
     if architecture.peaks:
-        response = _Convolution(RESPONSE, tensors["convR.weight"], tensors["convR.bias"], activated=False)
-        found = graph.node("Transpose", [graph.convolve(response, after["2"])], perm=[0, 2, 3, 1])
+        found = graph.node("Transpose", [graph.convolve(_convolution(tensors, "R"), after[2])], perm=[0, 2, 3, 1])
     else:
-        hidden = _stacked(HEADS, [_normalised(tensors, name) for name in ("Da", "Pa")])
-        found = graph.convolve(_joint_output(tensors), graph.convolve(hidden, x))
+        hidden, output = _score_and_place(tensors)
+        found = graph.convolve(output, graph.convolve(hidden, x))
     if not descriptors:
         return (found,)
-    first, second, third = (_normalised(tensors, name, activated=name != "Fb") for name in ("Fa", "Fb", "Faa"))
-    last = _Convolution("Fbb", tensors["convFbb.weight"], tensors["convFbb.bias"], activated=False)
-    x = graph.convolve(second, graph.convolve(first, x))
+    x = graph.convolve(_convolution(tensors, "Fb", activated=False), graph.convolve(_convolution(tensors, "Fa"), x))
     x = graph.node("DepthToSpace", [x], blocksize=2, mode="CRD")
-    x = graph.node("Concat", [x, after["3"]], axis=1)
-    return found, graph.convolve(last, graph.convolve(third, x))
+    x = graph.convolve(_convolution(tensors, "Faa"), graph.node("Concat", [x, after[3]], axis=1))
+    return found, graph.convolve(_convolution(tensors, "Fbb"), x)
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,29 +92,10 @@ class _Convolution:
     activated: bool = True
 
 
-def _encoder(
-    architecture: Architecture, tensors: Tensors, descriptors: bool, whole_grey_levels: bool
-) -> list[_Convolution]:
-    """The encoder's layers that are needed: of a network of peaks that does not describe, the first two blocks.
-
-    The first layer sees one channel in place of all, of local contrast or of (grey level - 127.5), in place of
-    (x / 255 - 0.5) * 0.225. Only the factor may go into the weights: the shift has to stay before the padding, whose
-    zeros mean neutral grey. For ``whole_grey_levels``, shifted by 128, only what is seen beyond the border differs.
-    """
-    needed = [name for name, *_ in architecture.encoder if descriptors or not architecture.peaks or name < "3"]
-    first, *rest = (_normalised(tensors, name) for name in needed)
-    weight = first.weight.reshape(len(first.weight), architecture.image_channels, -1, 3, 3).sum(axis=1)
-    if not architecture.peaks:
-        weight *= np.float32(_SCALE)
-    first = replace(first, weight=weight)
-    if whole_grey_levels:
-        shift = weight.sum(axis=(1, 2, 3)) * np.float32(ZERO - _NEUTRAL_GREY)
-        first = replace(first, bias=first.bias + shift)
-    return [first, *rest]
-
-
-def _normalised(tensors: Tensors, name: str, activated: bool = True) -> _Convolution:
-    """Convolution ``name`` and the batch norm behind it, in one."""
+def _convolution(tensors: Tensors, name: str, *, activated: bool = True) -> _Convolution:
+    """Layer ``name`` and the batch norm behind it in one; those without a batch norm are not activated."""
+    if f"conv{name}.weight" in tensors:
+        return _Convolution(name, tensors[f"conv{name}.weight"], tensors[f"conv{name}.bias"], activated=False)
     gamma, beta, mean, variance = (
         tensors[f"conv{name}.1.{s}"].astype(np.float64) for s in ("weight", "bias", "running_mean", "running_var")
     )
@@ -117,17 +104,34 @@ def _normalised(tensors: Tensors, name: str, activated: bool = True) -> _Convolu
     return _Convolution(name, weight.astype(np.float32), (beta - mean * gain).astype(np.float32), activated)
 
 
-def _stacked(name: str, layers: Sequence[_Convolution]) -> _Convolution:
-    """Layers that see the same, as one."""
-    return _Convolution(name, np.concatenate([la.weight for la in layers]), np.concatenate([la.bias for la in layers]))
+def _of_what_is_seen(first: _Convolution, architecture: Architecture, int8: bool) -> _Convolution:
+    """The first layer on one channel in place of all, of local contrast or of grey levels.
+
+    That is (grey level - 127.5) in place of (x / 255 - 0.5) * 0.225. Only the factor may go into the weights: the shift
+    has to stay before the padding, whose zeros mean neutral grey. In int8 levels are whole, shifted by 128, and only
+    what is seen beyond the border differs.
+    """
+    weight, bias = (
+        first.weight.reshape(len(first.weight), architecture.image_channels, -1, 3, 3).sum(axis=1),
+        first.bias,
+    )
+    if not architecture.peaks:
+        weight *= np.float32(_SCALE)
+        if int8:
+            bias = bias + weight.sum(axis=(1, 2, 3)) * np.float32(ZERO - _NEUTRAL_GREY)
+    return replace(first, weight=weight, bias=bias)
 
 
-def _joint_output(tensors: Tensors) -> _Convolution:
-    """Score and place as one convolution of the stacked hidden layers, each blind to the other's half."""
-    score, place = tensors["convDb.weight"], tensors["convPb.weight"]
-    weight = np.zeros((3, 2 * score.shape[1], 3, 3), np.float32)
-    weight[:1, : score.shape[1]], weight[1:, score.shape[1] :] = score, place
-    return _Convolution(OUT, weight, np.concatenate([tensors["convDb.bias"], tensors["convPb.bias"]]), activated=False)
+def _score_and_place(tensors: Tensors) -> tuple[_Convolution, _Convolution]:
+    """Both heads as one: the hidden layers stacked, and the last, each part of it blind to the other's half."""
+    score, place = _convolution(tensors, "Da"), _convolution(tensors, "Pa")
+    hidden = np.concatenate([score.weight, place.weight]), np.concatenate([score.bias, place.bias])
+    score, place = _convolution(tensors, "Db"), _convolution(tensors, "Pb")
+    half = score.weight.shape[1]
+    weight = np.zeros((3, 2 * half, 3, 3), np.float32)
+    weight[:1, :half], weight[1:, half:] = score.weight, place.weight
+    last = _Convolution(_OUT, weight, np.concatenate([score.bias, place.bias]), activated=False)
+    return _Convolution(HEADS, *hidden), last
 
 
 class _Graph:
@@ -155,7 +159,7 @@ class _Graph:
         return self.node("Sub", [levels, self._constant(np.float32(_NEUTRAL_GREY))])
 
     def convolve(self, layer: _Convolution, x: str) -> str:
-        integer = x in self._steps and (layer.name in self._ranges or layer.name in (OUT, RESPONSE))
+        integer = x in self._steps and (layer.name in self._ranges or layer.name in _LAST)
         if integer:
             weight, bias = self._integers(layer, self._steps[x])
         else:
