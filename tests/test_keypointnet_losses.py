@@ -102,11 +102,6 @@ def test_nearest_candidates_are_off_the_border():
     np.testing.assert_allclose(distance[0], [5.0, 3.0])
 
 
-def test_location_loss_is_the_mean_distance():
-    assert losses.location_loss(exact(1.0, 2.0, 3.0)) == 2.0
-    assert losses.location_loss(exact()) == 0.0
-
-
 def test_score_loss_by_hand():
     # (0.8 + 0.6) / 2 (1 - 2) + (0.2 + 0.4) / 2 (3 - 2), over two; and (0.2^2 + 0.2^2) / 2.
     value = losses.score_loss(exact(0.8, 0.2), exact(0.6, 0.4), exact(1.0, 3.0))

@@ -116,12 +116,16 @@ class KeypointNet(nn.Module):
         return self._conv("Fbb", x)
 
 
+def fill(network: KeypointNet, weights: Weights) -> None:
+    """Give ``network`` the ``weights``, which are of its architecture; counters of batches stay as they are."""
+    state = {name: torch.from_numpy(np.array(values)) for name, values in weights.tensors.items()}
+    network.load_state_dict(state, strict=False)
+
+
 def of_weights(weights: Weights) -> KeypointNet:
     """The network with ``weights``, ready to run, each batch norm made part of the convolution before it."""
     network = KeypointNet(weights.architecture)
-    # Counters of batches are all that may be missing: a weights file has been checked for the rest.
-    state = {name: torch.from_numpy(np.array(values)) for name, values in weights.tensors.items()}
-    network.load_state_dict(state, strict=False)
+    fill(network, weights)
     network.eval()
     for name, layer in list(network.named_children()):
         if isinstance(layer, nn.Sequential):
