@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from functools import lru_cache, partial
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -26,7 +24,7 @@ Floats = NDArray[np.float32]
 
 
 class Eye:
-    """Sees images whose sides are multiples of 8.
+    """Sees images whose sides are multiples of 8; what it gives stays as it is until the next image.
 
     The grey levels themselves, (1, H, W); for a network of peaks the local contrast of
     :func:`vioframe_keypointnet.network.locally_normalised`, 2 x 2 pixels folded, (4, H/2, W/2), or, in ``eight_bits``,
@@ -35,42 +33,42 @@ class Eye:
 
     def __init__(self, architecture: Architecture, *, eight_bits: bool) -> None:
         self._peaks, self._eight_bits = architecture.peaks, eight_bits
-        # A new array each time would take longer than what fills it.
-        self._contrast = lru_cache(maxsize=4)(partial(np.empty, dtype=np.float32))
+        self._make_room(0, 0)
+
+    def _make_room(self, rows: int, columns: int) -> None:
+        """Arrays for images of one size: as new ones each time they would take longer than what fills them."""
+        self._contrast, self._steps = np.empty((rows, columns), np.float32), np.empty((rows, columns), np.uint8)
+        self._seen = np.empty((4, rows // 2, columns // 2), np.uint8 if self._eight_bits else np.float32)
+        self._coarse, self._means = (np.empty((rows // COARSE_PX, columns // COARSE_PX), np.float32) for _ in range(2))
+        self._around = np.empty((rows // COARSE_PX, columns), np.float32)
 
     def __call__(self, image: Image) -> Floats | Image:
         if not self._peaks:
             return image[None]
-        contrast = self._contrast(image.shape)
-        _fill_contrast(image, contrast)
-        rows, columns = image.shape[0] // 2, image.shape[1] // 2
-        if not self._eight_bits:
-            by_place = contrast.reshape(rows, 2, columns, 2).transpose(1, 3, 0, 2)
-            return np.ascontiguousarray(by_place).reshape(4, rows, columns)
-        steps = np.empty(image.shape, np.uint8)
-        _round(contrast, np.float32(1.0) / CONTRAST_STEP, steps)
-        # The two pixels of a row that one place holds are one whole number, of which a cast takes the lower half.
-        pairs = steps.view("<u2").reshape(rows, 2, columns).swapaxes(0, 1)
-        seen = np.empty((4, rows, columns), np.uint8)
-        seen[0::2], seen[1::2] = pairs, pairs >> 8
-        return seen
+        rows, columns = image.shape
+        if image.shape != self._contrast.shape:
+            self._make_room(rows, columns)
+        _means(image, self._coarse)
+        _take_away(image, self._smoothed(), self._contrast, self._coarse)
+        _divide(self._contrast, self._smoothed(), _FAINT)
+        if self._eight_bits:
+            _round(self._contrast, np.float32(1.0) / CONTRAST_STEP, self._steps)
+            # The two pixels of a row that one place holds are one whole number, of which a cast takes the lower half.
+            pairs = self._steps.view("<u2").reshape(rows // 2, 2, columns // 2).swapaxes(0, 1)
+            self._seen[0::2] = pairs
+            np.right_shift(pairs, 8, out=self._seen[1::2], casting="unsafe")
+        else:
+            by_place = self._contrast.reshape(rows // 2, 2, columns // 2, 2).transpose(1, 3, 0, 2)
+            self._seen.reshape(2, 2, rows // 2, columns // 2)[:] = by_place
+        return self._seen
 
+    def _smoothed(self) -> Floats:
+        """(H/4, W): the mean of the coarse values around each, interpolated within the rows; kernels do it between."""
+        import cv2
 
-def _fill_contrast(image: Image, contrast: Floats) -> None:
-    """``contrast`` (H, W) becomes ``image`` less its mean, over its deviation, of about 20 px around."""
-    coarse = np.empty((image.shape[0] // COARSE_PX, image.shape[1] // COARSE_PX), np.float32)
-    _means(image, coarse)
-    _take_away(image, _smoothed(coarse), contrast, coarse)
-    _divide(contrast, _smoothed(coarse), _FAINT)
-
-
-def _smoothed(coarse: Floats) -> Floats:
-    """(H/4, W): the mean of the ``coarse`` values around each, interpolated within the rows; kernels do it between."""
-    import cv2
-
-    means = cv2.blur(coarse, (_AROUND, _AROUND), borderType=cv2.BORDER_REPLICATE)
-    size = COARSE_PX * coarse.shape[1], coarse.shape[0]
-    return np.asarray(cv2.resize(means, size, interpolation=cv2.INTER_LINEAR), np.float32)
+        cv2.blur(self._coarse, (_AROUND, _AROUND), self._means, borderType=cv2.BORDER_REPLICATE)
+        cv2.resize(self._means, self._around.shape[::-1], self._around, interpolation=cv2.INTER_LINEAR)
+        return self._around
 
 
 @kernel
