@@ -70,7 +70,7 @@ class KeypointNet(nn.Module):
         return Detection(score, keypoint_places(place), self._describe(after), response)
 
     def found(self, grey: Tensor, *, descriptors: bool) -> tuple[Tensor, ...]:
-        """What is needed to choose keypoints of ``grey`` (B, 1, H, W) in [0, 1]; the exported graph gives the same.
+        """What is needed to choose keypoints of ``grey`` (B, 1, H, W) in [0, 1]; OpenVINO's graph gives the same.
 
         (B, 3, H/8, W/8), before sigmoid and tanh, the score, x and y of each cell; of a network of peaks
         (B, H/2, W/2, 4), the response of 2 x 2 pixels, row by row. Then, if asked for, (B, D, H/4, W/4) descriptors,

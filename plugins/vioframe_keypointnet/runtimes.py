@@ -1,4 +1,4 @@
-"""What runs the network: OpenVINO the exported graph, the fastest on a CPU; torch the network as it was trained.
+"""What runs the network: OpenVINO a graph of its own, the fastest on a CPU; torch the network as it was trained.
 
 A runtime takes a grey image whose sides are multiples of 8 to what
 :meth:`vioframe_keypointnet.network.KeypointNet.found` gives, without the batch's axis, in float32; it stays as it is
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from vioframe.errors import ConfigError, needs
 from vioframe.types import Image
-from vioframe_keypointnet.graph import onnx_model
+from vioframe_keypointnet.graph import model
 from vioframe_keypointnet.options import Precision, Runtime
 from vioframe_keypointnet.seeing import Eye
 from vioframe_keypointnet.weights import Weights
@@ -60,7 +60,7 @@ def start(runtime: str, precision: str, weights: Weights, *, descriptors: bool, 
 
 
 def _by_openvino(weights: Weights, descriptors: bool, int8: bool, threads: int) -> Run:
-    """The exported graph on a CPU, compiled for each size of image when the first comes."""
+    """OpenVINO's graph on a CPU, compiled for each size of image when the first comes."""
     with needs("openvino", "openvino", user="KeypointNet by OpenVINO"):
         import openvino
 
@@ -71,7 +71,7 @@ def _by_openvino(weights: Weights, descriptors: bool, int8: bool, threads: int) 
 
     @lru_cache(maxsize=4)
     def compiled(shape: tuple[int, int]) -> Any:
-        graph = core.read_model(onnx_model(weights, shape, descriptors=descriptors, int8=int8))
+        graph = model(weights, shape, descriptors=descriptors, int8=int8)
         return core.compile_model(graph, "CPU", settings).create_infer_request()
 
     def run(image: Image) -> tuple[NDArray[np.float32], ...]:
@@ -110,7 +110,7 @@ def _by_torch(weights: Weights, descriptors: bool, device: str, half: bool, thre
 def _is_here(runtime: str) -> bool:
     """Whether its libraries are installed; torch is loaded to ask it for a GPU only where there is a driver."""
     if runtime == "openvino":
-        return find_spec("openvino") is not None and find_spec("onnx") is not None
+        return find_spec("openvino") is not None
     if find_spec("torch") is None or (runtime == "cuda" and shutil.which("nvidia-smi") is None):
         return False
     if runtime == "torch":
