@@ -5,13 +5,12 @@ from typing import Annotated
 
 from pydantic import NonNegativeFloat
 
-from vioframe.frontend.opencv_keypoints import detect
+from vioframe.frontend.opencv_keypoints import OpenCvDetector
 from vioframe.interfaces import DetectorFactory
 from vioframe.parts.hooks import hookimpl
-from vioframe.types import Image, Keypoints
 
 
-class Akaze:
+class Akaze(OpenCvDetector):
     """Sub-pixel maxima of the determinant of the Hessian over a non-linear scale space."""
 
     def __init__(
@@ -22,12 +21,7 @@ class Akaze:
     ) -> None:
         import cv2
 
-        self._akaze = cv2.AKAZE.create(threshold=threshold)
-        self._descriptors = descriptors
-
-    def detect(self, image: Image, max_points: int) -> Keypoints:
-        """At most ``max_points`` blobs of ``image``, strongest first."""
-        return detect(self._akaze, image, max_points, descriptors=self._descriptors)
+        super().__init__(cv2.AKAZE.create(threshold=threshold), descriptors)
 
 
 @hookimpl

@@ -5,13 +5,12 @@ from typing import Annotated
 
 from pydantic import NonNegativeInt, PositiveInt
 
-from vioframe.frontend.opencv_keypoints import detect
+from vioframe.frontend.opencv_keypoints import OpenCvDetector
 from vioframe.interfaces import DetectorFactory
 from vioframe.parts.hooks import hookimpl
-from vioframe.types import Image, Keypoints
 
 
-class Brisk:
+class Brisk(OpenCvDetector):
     """Sub-pixel corners of several scales.
 
     OpenCV places those of the coarser scales about 0.2 px too far left; those of ``octaves=0`` are without bias.
@@ -26,12 +25,7 @@ class Brisk:
     ) -> None:
         import cv2
 
-        self._brisk = cv2.BRISK.create(threshold, octaves)
-        self._descriptors = descriptors
-
-    def detect(self, image: Image, max_points: int) -> Keypoints:
-        """At most ``max_points`` corners of ``image``, strongest first."""
-        return detect(self._brisk, image, max_points, descriptors=self._descriptors)
+        super().__init__(cv2.BRISK.create(threshold, octaves), descriptors)
 
 
 @hookimpl

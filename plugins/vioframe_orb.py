@@ -3,13 +3,13 @@
 from collections.abc import Mapping
 from typing import Annotated
 
-from vioframe.frontend.opencv_keypoints import detect
+from vioframe.frontend.opencv_keypoints import OpenCvDetector
 from vioframe.interfaces import DetectorFactory
 from vioframe.parts.hooks import hookimpl
 from vioframe.types import Image, Keypoints
 
 
-class Orb:
+class Orb(OpenCvDetector):
     """Corners of all levels at full resolution: whole pixels of their own level."""
 
     def __init__(
@@ -22,12 +22,12 @@ class Orb:
         import cv2
 
         self._orb = cv2.ORB.create(nlevels=levels, fastThreshold=fast_threshold)
-        self._descriptors = descriptors
+        super().__init__(self._orb, descriptors)
 
     def detect(self, image: Image, max_points: int) -> Keypoints:
         """At most ``max_points`` corners of ``image``, strongest first."""
         self._orb.setMaxFeatures(max_points)
-        return detect(self._orb, image, max_points, descriptors=self._descriptors)
+        return super().detect(image, max_points)
 
 
 @hookimpl

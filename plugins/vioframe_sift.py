@@ -3,13 +3,12 @@
 from collections.abc import Mapping
 from typing import Annotated
 
-from vioframe.frontend.opencv_keypoints import detect
+from vioframe.frontend.opencv_keypoints import OpenCvDetector
 from vioframe.interfaces import DetectorFactory
 from vioframe.parts.hooks import hookimpl
-from vioframe.types import Image, Keypoints
 
 
-class Sift:
+class Sift(OpenCvDetector):
     """Sub-pixel blobs of all scales, each place once."""
 
     def __init__(
@@ -21,12 +20,9 @@ class Sift:
         import cv2
 
         # Without the precise upscale every point is 0.23 px off on both axes.
-        self._sift = cv2.SIFT.create(contrastThreshold=contrast_threshold, enable_precise_upscale=True)
-        self._descriptors = descriptors
-
-    def detect(self, image: Image, max_points: int) -> Keypoints:
-        """At most ``max_points`` blobs of ``image``, strongest first."""
-        return detect(self._sift, image, max_points, descriptors=self._descriptors)
+        super().__init__(
+            cv2.SIFT.create(contrastThreshold=contrast_threshold, enable_precise_upscale=True), descriptors
+        )
 
 
 @hookimpl

@@ -10,7 +10,7 @@ from vioframe_keypointnet.weights import Weights
 
 TINY = Architecture("tiny", 1, ((4,), (8,), (8,), (12, 8)), 16, 8)
 COLOUR = Architecture("colour", 3, ((6,), (8,), (8,), (8,)), 8, 8)
-PEAKS = Architecture("peaks", 3, ((), (8, 12), (16,), (8,)), 16, 8, peaks=True)
+PEAKS = Architecture("peaks", 3, ((), (8, 12), (16,), (8,)), 16, 8)
 NARROW = FULL.widened(0.125)
 ARCHITECTURES = {architecture.name: architecture for architecture in (TINY, COLOUR, PEAKS, NARROW, COMPACT, QUICK)}
 

@@ -10,9 +10,9 @@ torch = pytest.importorskip("torch")
 
 from keypointnet_helpers import ARCHITECTURES, COMPACT, NARROW, QUICK, network, texture, weights  # noqa: E402
 
-from vioframe.errors import ConfigError  # noqa: E402
+from vioframe.errors import ConfigError, PluginError  # noqa: E402
 from vioframe_keypointnet import runtimes  # noqa: E402
-from vioframe_keypointnet.graph import onnx_model  # noqa: E402
+from vioframe_keypointnet.graph import model  # noqa: E402
 from vioframe_keypointnet.network import describe as describe_in_torch  # noqa: E402
 from vioframe_keypointnet.quantisation import measure_ranges  # noqa: E402
 from vioframe_keypointnet.selection import by_pixels, candidate_places, describe  # noqa: E402
@@ -114,11 +114,11 @@ def test_the_response_of_each_pixel_is_that_of_the_trained_network(architecture)
 
 @pytest.mark.parametrize("descriptors", [False, True])
 def test_only_what_is_needed_is_in_the_graph(descriptors):
-    onnx = pytest.importorskip("onnx")
-    model = onnx.load_from_string(onnx_model(weights(network(COMPACT)), (48, 64), descriptors=descriptors))
-    convolutions = [node for node in model.graph.node if node.op_type == "Conv"]
+    pytest.importorskip("openvino")
+    graph = model(weights(network(COMPACT)), (48, 64), descriptors=descriptors)
+    convolutions = [node for node in graph.get_ops() if node.get_type_name() == "Convolution"]
     assert len(convolutions) == (2 + 1 + 1 + 4 + 2 if descriptors else 3 + 1)
-    assert len(model.graph.output) == (2 if descriptors else 1)
+    assert len(graph.outputs) == (2 if descriptors else 1)
 
 
 def test_descriptors_are_sampled_as_in_training():
@@ -182,5 +182,5 @@ def test_a_library_that_is_absent_is_named_with_its_extra(runtime, monkeypatch):
     made = weights(network(COMPACT))
     monkeypatch.setitem(sys.modules, runtime, None)
     extra = "keypointnet" if runtime == "torch" else runtime
-    with pytest.raises(ConfigError, match=rf"{runtime}.*pip install 'vioframe\[{extra}\]'"):
+    with pytest.raises(PluginError, match=rf"{runtime}.*pip install 'vioframe\[{extra}\]'"):
         runtimes.start(runtime, "float32", made, descriptors=False, threads=1)

@@ -4,6 +4,7 @@ import json
 import logging
 import os
 import sys
+from dataclasses import replace
 from types import ModuleType
 
 import numpy as np
@@ -19,8 +20,9 @@ from keypointnet_helpers import ARCHITECTURES, TINY, network, texture, weights  
 from vioframe.errors import ConfigError  # noqa: E402
 from vioframe_keypointnet import weights as weights_file  # noqa: E402
 from vioframe_keypointnet.__main__ import convert  # noqa: E402
-from vioframe_keypointnet.architecture import COMPACT, FULL, ranged_layers, shapes  # noqa: E402
+from vioframe_keypointnet.architecture import COMPACT, FULL  # noqa: E402
 from vioframe_keypointnet.network import KeypointNet  # noqa: E402
+from vioframe_keypointnet.weights import Weights  # noqa: E402
 
 REMEDY = "vioframe train keypointnet --images DIR"
 
@@ -30,7 +32,7 @@ def saved(tmp_path):
     """(file, weights) of a tiny network."""
     made = weights(network(TINY))
     path = tmp_path / "tiny.safetensors"
-    weights_file.save(path, made.tensors, TINY, {"epochs": 3}, {"2a": 1.5})
+    weights_file.save(path, replace(made, card={"epochs": 3}, activation_ranges={"2a": 1.5}))
     return path, made
 
 
@@ -59,7 +61,7 @@ def official(tmp_path, monkeypatch):
 def test_the_table_of_shapes_is_that_of_the_network(architecture):
     state = KeypointNet(architecture).state_dict()
     expected = {name: tuple(t.shape) for name, t in state.items() if not name.endswith("num_batches_tracked")}
-    assert shapes(architecture) == expected
+    assert architecture.shapes == expected
 
 
 def test_what_is_saved_is_loaded(saved):
@@ -72,7 +74,7 @@ def test_what_is_saved_is_loaded(saved):
 
 def test_half_precision_and_counters_of_batches_are_no_obstacle(tmp_path):
     state = {name: t.half() if t.dtype.is_floating_point else t for name, t in network(TINY).state_dict().items()}
-    weights_file.save(tmp_path / "half.safetensors", {n: t.numpy() for n, t in state.items()}, TINY, {})
+    weights_file.save(tmp_path / "half.safetensors", Weights(TINY, {n: t.numpy() for n, t in state.items()}))
     found = weights_file.load(tmp_path / "half.safetensors")
     assert {t.dtype for t in found.tensors.values()} == {np.dtype(np.float32)}
     assert found.activation_ranges is None
@@ -111,8 +113,8 @@ def test_tensors_of_another_network_are_refused(saved):
 @pytest.mark.parametrize(
     ("change", "complaint"),
     [
-        (lambda t: t.pop("convDb.bias"), "convDb.bias is missing"),
-        (lambda t: t.update(extra=np.zeros(3, np.float32)), "extra is not of it"),
+        (lambda t: t.pop("convDb.bias"), r"convDb.bias has the shape nothing and not \(1,\)"),
+        (lambda t: t.update(extra=np.zeros(3, np.float32)), r"extra has the shape \(3,\) and not nothing"),
         (
             lambda t: t.update({"convDb.bias": np.zeros(2, np.float32)}),
             r"convDb.bias has the shape \(2,\) and not \(1,\)",
@@ -126,7 +128,7 @@ def test_tensors_that_do_not_fit_are_neither_saved_nor_loaded(saved, change, com
     tensors = dict(made.tensors)
     change(tensors)
     with pytest.raises(ConfigError, match=complaint):
-        weights_file.save(path, tensors, TINY, {})
+        weights_file.save(path, Weights(TINY, tensors))
     safetensors.save_file(tensors, path, {"architecture": TINY.to_json()})
     with pytest.raises(ConfigError, match=complaint):
         weights_file.load(path)
@@ -136,8 +138,8 @@ def test_random_weights_come_by_explicit_wish_only_and_with_a_warning(caplog):
     with caplog.at_level(logging.WARNING):
         first, second = (weights_file.load("untrained:compact") for _ in range(2))
     assert "random weights" in caplog.text
-    assert all(np.array_equal(first.tensors[name], second.tensors[name]) for name in shapes(COMPACT))
-    assert set(first.activation_ranges) == set(ranged_layers(COMPACT))
+    assert all(np.array_equal(first.tensors[name], second.tensors[name]) for name in COMPACT.shapes)
+    assert set(first.activation_ranges) == set(COMPACT.ranged)
     with pytest.raises(ConfigError, match=r"no network 'big'.*compact, full"):
         weights_file.load("untrained:big")
 
@@ -148,7 +150,7 @@ def test_an_official_checkpoint_loads_without_yacs(official, legacy):
     assert len(state) == 84  # as many as published
     found = weights_file.load(official(state, legacy=legacy))
     assert found.architecture == FULL
-    assert all(np.array_equal(found.tensors[name], state[name].numpy()) for name in shapes(FULL))
+    assert all(np.array_equal(found.tensors[name], state[name].numpy()) for name in FULL.shapes)
 
 
 def test_a_checkpoint_of_another_network_is_refused(official):
@@ -197,7 +199,7 @@ def test_the_converter_measures_ranges_where_images_are_given(saved, tmp_path):
     assert done.exit_code == 0, done.output
     found = weights_file.load(tmp_path / "o.safetensors")
     assert found.card == {"epochs": 3}
-    assert set(found.activation_ranges) == set(ranged_layers(TINY))
+    assert set(found.activation_ranges) == set(TINY.ranged)
     assert all(np.array_equal(found.tensors[name], made.tensors[name]) for name in made.tensors)
 
 

@@ -12,7 +12,7 @@ from vioframe.errors import ConfigError, PluginError  # noqa: E402
 from vioframe.parts import registry  # noqa: E402
 from vioframe.testing import check_detector  # noqa: E402
 from vioframe_superpoint import superpoint  # noqa: E402
-from vioframe_superpoint.suppression import local_maxima  # noqa: E402
+from vioframe_superpoint.detector import local_maxima  # noqa: E402
 
 # Name, channels in, channels out and kernel of every layer of the published file.
 LAYERS = [
@@ -195,12 +195,12 @@ def test_without_weights_it_says_where_they_are():
 @pytest.mark.parametrize(
     ("table", "why"),
     [
-        ({"conv1a.weight": torch.zeros(64, 1, 3, 3)}, r"another network \(without conv1a.bias\)"),
-        (random_weights() | {"convPb.bias": torch.zeros(64)}, r"\(convPb.bias is \(64,\), not \(65,\)\)"),
-        (random_weights() | {"bn1a.weight": torch.zeros(64)}, r"\(with bn1a.weight\)"),
-        (random_weights() | {"convDb.bias": torch.full((256,), torch.nan)}, r"\(convDb.bias is not finite\)"),
-        ({"state_dict": random_weights()}, r"\(not a table of tensors\)"),
-        ([1, 2], r"\(not a table of tensors\)"),
+        ({"conv1a.weight": torch.zeros(64, 1, 3, 3)}, 'of another network.*Missing key.*"conv1a.bias"'),
+        (random_weights() | {"convPb.bias": torch.zeros(64)}, r"of another network.*size mismatch for convPb.bias"),
+        (random_weights() | {"bn1a.weight": torch.zeros(64)}, 'of another network.*Unexpected key.*"bn1a.weight"'),
+        (random_weights() | {"convDb.bias": torch.full((256,), torch.nan)}, "not finite"),
+        ({"state_dict": random_weights()}, "of another network"),
+        ([1, 2], "of another network"),
         ({"code": np.random.default_rng}, r"is no file of PyTorch weights; superpoint needs superpoint_v1\.pth"),
     ],
 )

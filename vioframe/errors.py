@@ -1,5 +1,8 @@
 """The errors vioframe raises on purpose. Each message is one line that says what is wrong and what to do about it."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 
 class VioframeError(Exception):
     """Root of all errors raised by vioframe; the command line turns it into one line and exit code 2."""
@@ -31,3 +34,18 @@ class DivergedError(VioframeError):
 
 class RunError(VioframeError):
     """A run folder exists already, is incomplete, or cannot be written."""
+
+
+@contextmanager
+def needs(library: str, extra: str, *, user: str) -> Iterator[None]:
+    """Around the import of a ``library`` that is optional: without it :class:`PluginError` says which extra has it.
+
+    ``user`` is what the message begins with, such as ``"detector 'surf'"``.
+    """
+    try:
+        yield
+    except ImportError as error:
+        raise PluginError(
+            f"{user} needs {library}, which is not installed or does not load ({error}): "
+            f"pip install 'vioframe[{extra}]'"
+        ) from error

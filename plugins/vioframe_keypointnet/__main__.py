@@ -5,6 +5,7 @@ python -m vioframe_keypointnet v4.ckpt v4.safetensors --calibrate FOLDER_OF_IMAG
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import click
@@ -27,12 +28,12 @@ def convert(checkpoint: Path, out: Path, calibrate: Path | None) -> None:
     """
     try:
         found = weights_file.load(checkpoint)
-        ranges = found.activation_ranges
         if calibrate is not None:
             from vioframe_keypointnet.quantisation import measure_ranges
 
             ranges = measure_ranges(found, map(read_grey, evenly(find_images(calibrate), _MOST_IMAGES)))
-        weights_file.save(out, found.tensors, found.architecture, found.card, ranges)
+            found = replace(found, activation_ranges=ranges)
+        weights_file.save(out, found)
     except VioframeError as error:
         raise click.ClickException(str(error)) from error
 

@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
-from dataclasses import dataclass
-from functools import partial
 from typing import cast
 
 import numpy as np
@@ -13,50 +10,39 @@ import numpy as np
 from vioframe.errors import ConfigError
 from vioframe.types import Image, Keypoints
 from vioframe_keypointnet import runtimes
-from vioframe_keypointnet.architecture import Architecture
 from vioframe_keypointnet.options import KeypointNetOptions
-from vioframe_keypointnet.selection import Array, Rules, describe, padded_to_cells, peaks, select
-from vioframe_keypointnet.weights import load
-
-Choose = Callable[[Array, Image, tuple[int, int], int], tuple[Array, Array]]
-"""From what the network found to the places and scores of keypoints; the arguments of :func:`select` but its rules."""
+from vioframe_keypointnet.selection import describe, padded_to_cells, peaks, select
+from vioframe_keypointnet.weights import Weights
 
 _LOG = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True, slots=True)
 class KeypointNet:
-    """The strongest keypoints of grey images, by a network that any runtime runs."""
+    """The strongest keypoints of grey images, by the network of ``weights`` as ``options`` say.
 
-    run: runtimes.Run
-    choose: Choose
-    runtime: str
-    precision: str
+    Raises :class:`ConfigError` where they ask for what does not go together, and :class:`PluginError` where a library
+    is missing.
+    """
+
+    def __init__(self, weights: Weights, options: KeypointNetOptions) -> None:
+        calibrated = weights.activation_ranges is not None
+        self._runtime, self.precision = runtimes.choose(options.runtime, options.precision, calibrated)
+        _LOG.info("KeypointNet %s runs by %s in %s", weights.architecture.name, self._runtime, self.precision)
+        self._run = runtimes.start(
+            self._runtime, self.precision, weights, descriptors=options.descriptors, threads=options.threads
+        )
+        self._choose = peaks if weights.architecture.peaks else select
+        self._options = options
 
     @property
     def device(self) -> str:
-        return "cuda" if self.runtime == "cuda" else "cpu"
+        return "cuda" if self._runtime == "cuda" else "cpu"
 
     def detect(self, image: Image, max_points: int) -> Keypoints:
         """At most ``max_points`` keypoints of ``image`` (H, W), at sub-pixel places."""
         if image.ndim != 2 or image.dtype != np.uint8:
             raise ConfigError(f"KeypointNet wants images (H, W) of uint8, not {image.shape} of {image.dtype}")
         padded = padded_to_cells(image)
-        found, *described = self.run(padded)
-        xy, score = self.choose(found, padded, cast(tuple[int, int], image.shape), max_points)
+        found, *described = self._run(padded)
+        xy, score = self._choose(found, padded, cast(tuple[int, int], image.shape), max_points, self._options)
         return Keypoints(xy, score, describe(described[0], xy) if described else None)
-
-
-def keypointnet(options: KeypointNetOptions) -> KeypointNet:
-    """What ``options`` describe; raises :class:`ConfigError` where weights or libraries are missing."""
-    weights = load(options.weights)
-    architecture = weights.architecture
-    runtime, precision = runtimes.choose(options.runtime, options.precision, weights.activation_ranges is not None)
-    _LOG.info("KeypointNet %s runs by %s in %s", architecture.name, runtime, precision)
-    run = runtimes.start(runtime, precision, weights, descriptors=options.descriptors, threads=options.threads)
-    return KeypointNet(run, chooser(architecture, Rules(options.nms_px, options.min_contrast)), runtime, precision)
-
-
-def chooser(architecture: Architecture, rules: Rules) -> Choose:
-    """How keypoints are chosen among what a network of ``architecture`` finds."""
-    return partial(peaks if architecture.peaks else select, rules=rules)

@@ -1,26 +1,31 @@
-"""The network as one ONNX graph to be run: batch norm folded into the convolutions, nothing in it that is not needed.
+"""The network as OpenVINO's graph: batch norm folded into the convolutions, nothing in it that is not needed.
 
-Made by hand, so that it needs no torch. In int8 it stays a graph of floats with pairs of QuantizeLinear and
-DequantizeLinear where values have 8 bits, which a runtime recognises and turns into integer convolutions: outputs of
-the layers by one range each, unsigned, weights by one each channel, signed. LeakyReLU becomes ReLU there: most of what
-it lets through below zero is less than a step.
+Made by hand, so that it needs no torch. In int8 it stays a graph of floats, quantised and dequantised where values have
+8 bits, which OpenVINO recognises and turns into integer convolutions: outputs of the layers by one range each,
+unsigned, weights by one each channel, signed. LeakyReLU becomes ReLU there: most of what it lets through below zero is
+less than a step.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from vioframe_keypointnet.architecture import HEADS, OUT, RESPONSE, Architecture, Tensors
-from vioframe_keypointnet.optional import needs
+from vioframe.errors import needs
+from vioframe_keypointnet.architecture import HEADS, Architecture, Tensors
 from vioframe_keypointnet.seeing import CONTRAST_STEP, ZERO
 from vioframe_keypointnet.weights import Weights
 
-_OPSET, _IR = 17, 9
+if TYPE_CHECKING:
+    from openvino import Model
+
+_OUT = "out"
+_LAST = (_OUT, "R")
+"""The layers whose outputs are the detector's: in int8 what they see has 8 bits, what they give has not."""
 _LEAK = 0.01
 """Slope of LeakyReLU below zero."""
 _NEUTRAL_GREY = 127.5
@@ -29,49 +34,58 @@ _SCALE = 0.225 / 255.0
 _BATCH_NORM_EPSILON = 1e-5
 
 
-def onnx_model(weights: Weights, shape: tuple[int, int], *, descriptors: bool = False, int8: bool = False) -> bytes:
-    """A serialised ONNX model for grey images of ``shape`` (H, W), multiples of 8.
+class _Values(NamedTuple):
+    """What a node of the graph gives, in float32, and the step of those that have 8 bits."""
 
-    It takes as ``seen`` (1, C, h, w) what an :class:`~vioframe_keypointnet.seeing.Eye` sees, and gives what
+    node: Any
+    step: np.float32 | None = None
+
+
+def model(weights: Weights, shape: tuple[int, int], *, descriptors: bool = False, int8: bool = False) -> Model:
+    """The graph for grey images of ``shape`` (H, W), multiples of 8.
+
+    It takes (1, C, h, w), what an :class:`~vioframe_keypointnet.seeing.Eye` sees, and gives what
     :meth:`vioframe_keypointnet.network.KeypointNet.found` does, which it equals on R = G = B but for rounding.
     """
-    with needs("onnx", "openvino"):
-        from onnx import TensorProto, helper
+    with needs("OpenVINO", "openvino", user="KeypointNet by OpenVINO"):
+        from openvino import Model
+        from openvino import opset13 as ops
 
-    architecture, f = weights.architecture, weights.architecture.fold
-    graph = _Graph(weights.activation_ranges or {} if int8 else {})
-    outputs = _build(graph, weights, descriptors)
-    kind = TensorProto.FLOAT if architecture.peaks and not int8 else TensorProto.UINT8
-    seen = helper.make_tensor_value_info("seen", kind, [1, f * f, shape[0] // f, shape[1] // f])
-    found = [helper.make_tensor_value_info(name, TensorProto.FLOAT, None) for name in outputs]
-    made = helper.make_graph(graph.nodes, "keypointnet", [seen], found, graph.constants)
-    model = helper.make_model(made, opset_imports=[helper.make_opsetid("", _OPSET)], ir_version=_IR)
-    return bytes(model.SerializeToString())
-
-
-def _build(graph: _Graph, weights: Weights, descriptors: bool) -> tuple[str, ...]:
-    """Adds all layers; the names of the outputs."""
-    architecture, tensors = weights.architecture, weights.tensors
-    x = graph.seen("seen", architecture.peaks)
-    after = {}
-    for layer in _encoder(architecture, tensors, descriptors, whole_grey_levels=graph.int8 and not architecture.peaks):
-        x = after[layer.name[0]] = graph.convolve(layer, x)
-        if layer.name in architecture.pooled:
-            x = graph.node("MaxPool", [x], kernel_shape=[2, 2], strides=[2, 2])
-    if architecture.peaks:
-        response = _Convolution(RESPONSE, tensors["convR.weight"], tensors["convR.bias"], activated=False)
-        found = graph.node("Transpose", [graph.convolve(response, after["2"])], perm=[0, 2, 3, 1])
+    architecture, tensors, f = weights.architecture, weights.tensors, weights.architecture.fold
+    ranges: Mapping[str, float] = weights.activation_ranges or {} if int8 else {}
+    kind = np.float32 if architecture.peaks and not int8 else np.uint8
+    image = ops.parameter([1, f * f, shape[0] // f, shape[1] // f], kind)
+    if int8:
+        x = _dequantised(image, CONTRAST_STEP if architecture.peaks else np.float32(1.0), ZERO)
+    elif architecture.peaks:
+        x = _Values(image)
     else:
-        hidden = _stacked(HEADS, [_normalised(tensors, name) for name in ("Da", "Pa")])
-        found = graph.convolve(_joint_output(tensors), graph.convolve(hidden, x))
+        x = _Values(ops.subtract(ops.convert(image, np.float32), np.float32(_NEUTRAL_GREY)))
+    after = dict[int, _Values]()
+    for number, layers in architecture.encoder.items():
+        if number > 2 and architecture.peaks and not descriptors:
+            break
+        if after:
+            x = x._replace(node=ops.max_pool(x.node, [2, 2], [1, 1], [0, 0], [0, 0], [2, 2]).output(0))
+        for k, layer in enumerate(layers):
+            convolution = _convolution(tensors, layer.name)
+            if not after and k == 0:
+                convolution = _of_what_is_seen(convolution, architecture, int8)
+            x = _convolve(convolution, x, ranges)
+        after[number] = x
+    if architecture.peaks:
+        found = ops.transpose(_convolve(_convolution(tensors, "R"), after[2], ranges).node, np.array([0, 2, 3, 1]))
+    else:
+        hidden, output = _score_and_place(tensors)
+        found = _convolve(output, _convolve(hidden, x, ranges), ranges).node
     if not descriptors:
-        return (found,)
-    first, second, third = (_normalised(tensors, name, activated=name != "Fb") for name in ("Fa", "Fb", "Faa"))
-    last = _Convolution("Fbb", tensors["convFbb.weight"], tensors["convFbb.bias"], activated=False)
-    x = graph.convolve(second, graph.convolve(first, x))
-    x = graph.node("DepthToSpace", [x], blocksize=2, mode="CRD")
-    x = graph.node("Concat", [x, after["3"]], axis=1)
-    return found, graph.convolve(last, graph.convolve(third, x))
+        return Model([found], [image], "keypointnet")
+    for layer in (_convolution(tensors, "Fa"), _convolution(tensors, "Fb", activated=False)):
+        x = _convolve(layer, x, ranges)
+    x = _Values(ops.concat([ops.depth_to_space(x.node, "depth_first", 2), after[3].node], axis=1))
+    for layer in (_convolution(tensors, "Faa"), _convolution(tensors, "Fbb")):
+        x = _convolve(layer, x, ranges)
+    return Model([found, x.node], [image], "keypointnet")
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,29 +100,10 @@ class _Convolution:
     activated: bool = True
 
 
-def _encoder(
-    architecture: Architecture, tensors: Tensors, descriptors: bool, whole_grey_levels: bool
-) -> list[_Convolution]:
-    """The encoder's layers that are needed: of a network of peaks that does not describe, the first two blocks.
-
-    The first layer sees one channel in place of all, of local contrast or of (grey level - 127.5), in place of
-    (x / 255 - 0.5) * 0.225. Only the factor may go into the weights: the shift has to stay before the padding, whose
-    zeros mean neutral grey. For ``whole_grey_levels``, shifted by 128, only what is seen beyond the border differs.
-    """
-    needed = [name for name, *_ in architecture.encoder if descriptors or not architecture.peaks or name < "3"]
-    first, *rest = (_normalised(tensors, name) for name in needed)
-    weight = first.weight.reshape(len(first.weight), architecture.image_channels, -1, 3, 3).sum(axis=1)
-    if not architecture.peaks:
-        weight *= np.float32(_SCALE)
-    first = replace(first, weight=weight)
-    if whole_grey_levels:
-        shift = weight.sum(axis=(1, 2, 3)) * np.float32(ZERO - _NEUTRAL_GREY)
-        first = replace(first, bias=first.bias + shift)
-    return [first, *rest]
-
-
-def _normalised(tensors: Tensors, name: str, activated: bool = True) -> _Convolution:
-    """Convolution ``name`` and the batch norm behind it, in one."""
+def _convolution(tensors: Tensors, name: str, *, activated: bool = True) -> _Convolution:
+    """Layer ``name`` and the batch norm behind it in one; those without a batch norm are not activated."""
+    if f"conv{name}.weight" in tensors:
+        return _Convolution(name, tensors[f"conv{name}.weight"], tensors[f"conv{name}.bias"], activated=False)
     gamma, beta, mean, variance = (
         tensors[f"conv{name}.1.{s}"].astype(np.float64) for s in ("weight", "bias", "running_mean", "running_var")
     )
@@ -117,87 +112,62 @@ def _normalised(tensors: Tensors, name: str, activated: bool = True) -> _Convolu
     return _Convolution(name, weight.astype(np.float32), (beta - mean * gain).astype(np.float32), activated)
 
 
-def _stacked(name: str, layers: Sequence[_Convolution]) -> _Convolution:
-    """Layers that see the same, as one."""
-    return _Convolution(name, np.concatenate([la.weight for la in layers]), np.concatenate([la.bias for la in layers]))
+def _of_what_is_seen(first: _Convolution, architecture: Architecture, int8: bool) -> _Convolution:
+    """The first layer on one channel in place of all, of local contrast or of grey levels.
+
+    That is (grey level - 127.5) in place of (x / 255 - 0.5) * 0.225. Only the factor may go into the weights: the shift
+    has to stay before the padding, whose zeros mean neutral grey. In int8 levels are whole, shifted by 128, and only
+    what is seen beyond the border differs.
+    """
+    weight, bias = (
+        first.weight.reshape(len(first.weight), architecture.image_channels, -1, 3, 3).sum(axis=1),
+        first.bias,
+    )
+    if not architecture.peaks:
+        weight *= np.float32(_SCALE)
+        if int8:
+            bias = bias + weight.sum(axis=(1, 2, 3)) * np.float32(ZERO - _NEUTRAL_GREY)
+    return replace(first, weight=weight, bias=bias)
 
 
-def _joint_output(tensors: Tensors) -> _Convolution:
-    """Score and place as one convolution of the stacked hidden layers, each blind to the other's half."""
-    score, place = tensors["convDb.weight"], tensors["convPb.weight"]
-    weight = np.zeros((3, 2 * score.shape[1], 3, 3), np.float32)
-    weight[:1, : score.shape[1]], weight[1:, score.shape[1] :] = score, place
-    return _Convolution(OUT, weight, np.concatenate([tensors["convDb.bias"], tensors["convPb.bias"]]), activated=False)
+def _score_and_place(tensors: Tensors) -> tuple[_Convolution, _Convolution]:
+    """Both heads as one: the hidden layers stacked, and the last, each part of it blind to the other's half."""
+    score, place = _convolution(tensors, "Da"), _convolution(tensors, "Pa")
+    hidden = np.concatenate([score.weight, place.weight]), np.concatenate([score.bias, place.bias])
+    score, place = _convolution(tensors, "Db"), _convolution(tensors, "Pb")
+    half = score.weight.shape[1]
+    weight = np.zeros((3, 2 * half, 3, 3), np.float32)
+    weight[:1, :half], weight[1:, half:] = score.weight, place.weight
+    last = _Convolution(_OUT, weight, np.concatenate([score.bias, place.bias]), activated=False)
+    return _Convolution(HEADS, *hidden), last
 
 
-class _Graph:
-    """Operations of ONNX; a node is the name of its output."""
+def _convolve(layer: _Convolution, x: _Values, ranges: Mapping[str, float]) -> _Values:
+    """``layer`` on ``x``: in whole numbers where that has 8 bits and the layer's output has a range, or is the last."""
+    from openvino import opset13 as ops
 
-    def __init__(self, activation_ranges: Mapping[str, float]) -> None:
-        from onnx import NodeProto, TensorProto
+    weight, bias = layer.weight, layer.bias[None, :, None, None]
+    if x.step is not None and (layer.name in ranges or layer.name in _LAST):
+        # Weights have a step for each channel, the bias that of the products.
+        steps = np.maximum(np.abs(weight).max(axis=(1, 2, 3)), np.finfo(np.float32).tiny) / np.float32(127.0)
+        steps = steps[:, None, None, None]
+        weight = ops.multiply(ops.convert(ops.constant(np.round(weight / steps).astype(np.int8)), np.float32), steps)
+        products = (steps * x.step).reshape(bias.shape)
+        whole = np.clip(np.round(bias / products.astype(np.float64)), -(2**31), 2**31 - 1).astype(np.int32)
+        bias = whole.astype(np.float32) * products
+    around = [layer.weight.shape[2] // 2] * 2
+    y = ops.add(ops.convolution(x.node, weight, [1, 1], around, around, [1, 1]), bias)
+    if layer.name in ranges:
+        step = np.float32(ranges[layer.name] / 255.0)
+        top = np.float32(255.0)
+        levels = ops.fake_quantize(ops.relu(y), np.float32(0.0), step * top, np.float32(0.0), top, 256)
+        return _dequantised(ops.convert(levels, np.uint8), step, 0)
+    return _Values(ops.prelu(y, np.array([_LEAK], np.float32)) if layer.activated else y)
 
-        self.nodes: list[NodeProto] = []
-        self.constants: list[TensorProto] = []
-        self.int8 = bool(activation_ranges)
-        self._ranges = activation_ranges
-        self._steps: dict[str, np.float32] = {}
-        """Values that have 8 bits, and the step of these."""
 
-    def seen(self, x: str, peaks: bool) -> str:
-        """What comes in, as the first layer wants it."""
-        from onnx import TensorProto
+def _dequantised(x: Any, step: np.float32, zero: int) -> _Values:
+    """The values of ``x`` uint8, of which convolutions may make use as they are."""
+    from openvino import opset13 as ops
 
-        if self.int8:
-            return self._dequantised(x, CONTRAST_STEP if peaks else np.float32(1.0), ZERO)
-        if peaks:
-            return x
-        levels = self.node("Cast", [x], to=TensorProto.FLOAT)
-        return self.node("Sub", [levels, self._constant(np.float32(_NEUTRAL_GREY))])
-
-    def convolve(self, layer: _Convolution, x: str) -> str:
-        integer = x in self._steps and (layer.name in self._ranges or layer.name in (OUT, RESPONSE))
-        if integer:
-            weight, bias = self._integers(layer, self._steps[x])
-        else:
-            weight, bias = self._constant(layer.weight), self._constant(layer.bias)
-        y = self.node("Conv", [x, weight, bias], pads=[layer.weight.shape[2] // 2] * 4)
-        if layer.name in self._ranges:
-            step = np.float32(self._ranges[layer.name] / 255.0)
-            y = self.node("Relu", [y])
-            y = self.node("QuantizeLinear", [y, self._constant(step), self._constant(np.uint8(0))])
-            return self._dequantised(y, step, 0)
-        return self.node("LeakyRelu", [y], alpha=_LEAK) if layer.activated else y
-
-    def node(self, kind: str, inputs: list[str], **attributes: Any) -> str:
-        from onnx import helper
-
-        name = f"{kind}_{len(self.nodes)}"
-        self.nodes.append(helper.make_node(kind, inputs, [name], name, **attributes))
-        if kind == "MaxPool" and inputs[0] in self._steps:
-            self._steps[name] = self._steps[inputs[0]]
-        return name
-
-    def _dequantised(self, x: str, step: np.float32, zero: int) -> str:
-        """The values of ``x`` uint8, of which convolutions may make use as they are."""
-        y = self.node("DequantizeLinear", [x, self._constant(step), self._constant(np.uint8(zero))])
-        self._steps[y] = step
-        return y
-
-    def _integers(self, layer: _Convolution, input_step: np.float32) -> tuple[str, str]:
-        """The weights in 8 bits with a step for each channel, the bias in 32 with that of the products."""
-        steps = np.maximum(np.abs(layer.weight).max(axis=(1, 2, 3)), np.finfo(np.float32).tiny) / np.float32(127.0)
-        weight = np.round(layer.weight / steps[:, None, None, None]).astype(np.int8)
-        products = steps * input_step
-        bias = np.clip(np.round(layer.bias / products.astype(np.float64)), -(2**31), 2**31 - 1).astype(np.int32)
-        return self._of_channels(weight, steps), self._of_channels(bias, products)
-
-    def _of_channels(self, integers: NDArray[np.generic], steps: NDArray[np.float32]) -> str:
-        zeros = self._constant(np.zeros(len(steps), integers.dtype))
-        return self.node("DequantizeLinear", [self._constant(integers), self._constant(steps), zeros], axis=0)
-
-    def _constant(self, value: NDArray[np.generic] | np.generic) -> str:
-        from onnx import numpy_helper
-
-        name = f"constant_{len(self.constants)}"
-        self.constants.append(numpy_helper.from_array(np.asarray(value), name))
-        return name
+    levels = ops.subtract(ops.convert(x, np.float32), np.float32(zero)) if zero else ops.convert(x, np.float32)
+    return _Values(ops.multiply(levels, step), step)

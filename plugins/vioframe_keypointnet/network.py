@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from torch.nn.functional import avg_pool2d, grid_sample, interpolate, normalize, pad, pixel_shuffle, pixel_unshuffle
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
-from vioframe_keypointnet.architecture import CELL_PX, FAINT, FULL, Architecture
+from vioframe_keypointnet.architecture import CELL_PX, FAINT, Architecture
 from vioframe_keypointnet.weights import Weights
 
 _CROSS_RATIO = 2.0
@@ -43,41 +43,34 @@ class KeypointNet(nn.Module):
     ``dropout`` is that of whole channels after the second convolution of each block and in each head.
     """
 
-    def __init__(self, architecture: Architecture = FULL, dropout: float = 0.2) -> None:
+    def __init__(self, architecture: Architecture, dropout: float = 0.2) -> None:
         super().__init__()
         self.architecture = architecture
-        for name, before, after in architecture.encoder:
-            self.add_module(f"conv{name}", _conv_bn(before, after))
-        deepest, skip = architecture.blocks[3][-1], architecture.blocks[2][-1]
-        head, quarter = architecture.head, architecture.blocks[2][-1]
-        self.convDa, self.convDb = _conv_bn(deepest, head), nn.Conv2d(head, 1, 3, padding=1)
-        if architecture.peaks:
-            side = architecture.response_kernel
-            self.convR = nn.Conv2d(architecture.blocks[1][-1], architecture.fold**2, side, padding=side // 2)
-        else:
-            self.convPa, self.convPb = _conv_bn(deepest, head), nn.Conv2d(head, 2, 3, padding=1)
-        self.convFa, self.convFb = _conv_bn(deepest, head), _conv_bn(head, 4 * quarter)
-        self.convFaa = _conv_bn(quarter + skip, head)
-        self.convFbb = nn.Conv2d(head, architecture.descriptor, 3, padding=1)
+        for layer in architecture.layers:
+            conv = nn.Conv2d(layer.before, layer.after, layer.side, padding=layer.side // 2, bias=not layer.normalised)
+            self.add_module(
+                f"conv{layer.name}", nn.Sequential(conv, nn.BatchNorm2d(layer.after)) if layer.normalised else conv
+            )
         self.fold, self.unfold = nn.PixelUnshuffle(architecture.fold), nn.PixelShuffle(2)
         self.act, self.pool = nn.LeakyReLU(inplace=True), nn.MaxPool2d(2)
         self.dropout = nn.Dropout2d(dropout)
 
     def forward(self, images: Tensor) -> Detection:
         """Of ``images`` (B, C, H, W) in [0, 1], H and W multiples of 8; for training."""
-        after = self._encode(images, "1234")
-        score, response = self._score(after["4"])[:, 0], None
+        after = self._encode(images)
+        score, response = self._regress("D", after[4])[:, 0], None
         if self.architecture.peaks:
-            response = cells_of(self.convR(after["2"]).float())
+            response = cells_of(self._conv("R", after[2]).float())
             score = score + torch.logsumexp(response, dim=1)
             place = peak_places(response)
         else:
-            place = _CROSS_RATIO * (CELL_PX - 1) / 2 * torch.tanh(self._place(after["4"]))
-        descriptors = self._describe(after)
-        return Detection(_without_ring(torch.sigmoid(score)), keypoint_places(place), descriptors, response)
+            place = _CROSS_RATIO * (CELL_PX - 1) / 2 * torch.tanh(self._regress("P", after[4]))
+        # The outermost ring of cells scores 0.
+        score = pad(torch.sigmoid(score)[:, 1:-1, 1:-1], (1, 1, 1, 1))
+        return Detection(score, keypoint_places(place), self._describe(after), response)
 
     def found(self, grey: Tensor, *, descriptors: bool) -> tuple[Tensor, ...]:
-        """What is needed to choose keypoints of ``grey`` (B, 1, H, W) in [0, 1]; the exported graph gives the same.
+        """What is needed to choose keypoints of ``grey`` (B, 1, H, W) in [0, 1]; OpenVINO's graph gives the same.
 
         (B, 3, H/8, W/8), before sigmoid and tanh, the score, x and y of each cell; of a network of peaks
         (B, H/2, W/2, 4), the response of 2 x 2 pixels, row by row. Then, if asked for, (B, D, H/4, W/4) descriptors,
@@ -85,50 +78,54 @@ class KeypointNet(nn.Module):
         """
         peaks = self.architecture.peaks
         images = grey.expand(-1, self.architecture.image_channels, -1, -1)
-        after = self._encode(images, "1234" if descriptors or not peaks else "12")
+        after = self._encode(images, blocks=4 if descriptors or not peaks else 2)
         if peaks:
-            first = self.convR(after["2"]).permute(0, 2, 3, 1)
+            first = self._conv("R", after[2]).permute(0, 2, 3, 1)
         else:
-            first = torch.cat([self._score(after["4"]), self._place(after["4"])], dim=1)
+            first = torch.cat([self._regress("D", after[4]), self._regress("P", after[4])], dim=1)
         return (first, self._describe(after)) if descriptors else (first,)
 
-    def _encode(self, images: Tensor, blocks: str) -> dict[str, Tensor]:
-        """What each of ``blocks`` gives, before the resolution is halved."""
+    def _conv(self, name: str, x: Tensor) -> Tensor:
+        out: Tensor = self.get_submodule(f"conv{name}")(x)
+        return out
+
+    def _encode(self, images: Tensor, blocks: int = 4) -> dict[int, Tensor]:
+        """What each of the first ``blocks`` gives, before the resolution is halved."""
         x = self.fold(locally_normalised(images) if self.architecture.peaks else (images - 0.5) * 0.225)
-        after: dict[str, Tensor] = {}
-        for name, *_ in self.architecture.encoder:
-            if name[0] not in blocks:
+        after: dict[int, Tensor] = {}
+        for number, layers in self.architecture.encoder.items():
+            if number > blocks:
                 break
-            x = self.act(self.get_submodule(f"conv{name}")(x))
-            if name.endswith("b"):
-                x = self.dropout(x)
-            after[name[0]] = x
-            if name in self.architecture.pooled:
+            if after:
                 x = self.pool(x)
+            for layer in layers:
+                x = self.act(self._conv(layer.name, x))
+                if layer.name.endswith("b"):
+                    x = self.dropout(x)
+            after[number] = x
         return after
 
-    # Pixels of a large image do not fit into half precision.
-    def _score(self, deepest: Tensor) -> Tensor:
-        out: Tensor = self.convDb(self.dropout(self.act(self.convDa(deepest)))).float()
-        return out
+    def _regress(self, head: str, deepest: Tensor) -> Tensor:
+        """What the head of the score (D) or of the place (P) gives."""
+        hidden = self.dropout(self.act(self._conv(f"{head}a", deepest)))
+        return self._conv(f"{head}b", hidden).float()  # pixels of a large image do not fit into half precision
 
-    def _place(self, deepest: Tensor) -> Tensor:
-        out: Tensor = self.convPb(self.dropout(self.act(self.convPa(deepest)))).float()
-        return out
+    def _describe(self, after: dict[int, Tensor]) -> Tensor:
+        x = self._conv("Fb", self.dropout(self.act(self._conv("Fa", after[4]))))
+        x = self.act(self._conv("Faa", torch.cat([self.unfold(x), after[3]], dim=1)))
+        return self._conv("Fbb", x)
 
-    def _describe(self, after: dict[str, Tensor]) -> Tensor:
-        x = self.convFb(self.dropout(self.act(self.convFa(after["4"]))))
-        x = self.act(self.convFaa(torch.cat([self.unfold(x), after["3"]], dim=1)))
-        out: Tensor = self.convFbb(x)
-        return out
+
+def fill(network: KeypointNet, weights: Weights) -> None:
+    """Give ``network`` the ``weights``, which are of its architecture; counters of batches stay as they are."""
+    state = {name: torch.from_numpy(np.array(values)) for name, values in weights.tensors.items()}
+    network.load_state_dict(state, strict=False)
 
 
 def of_weights(weights: Weights) -> KeypointNet:
     """The network with ``weights``, ready to run, each batch norm made part of the convolution before it."""
     network = KeypointNet(weights.architecture)
-    # Counters of batches are all that may be missing: a weights file has been checked for the rest.
-    state = {name: torch.from_numpy(np.array(values)) for name, values in weights.tensors.items()}
-    network.load_state_dict(state, strict=False)
+    fill(network, weights)
     network.eval()
     for name, layer in list(network.named_children()):
         if isinstance(layer, nn.Sequential):
@@ -180,14 +177,3 @@ def describe(descriptors: Tensor, xy: Tensor) -> Tensor:
     size = xy.new_tensor([4.0 * w - 1.0, 4.0 * h - 1.0])
     sampled = grid_sample(descriptors, (2.0 * xy / size - 1.0)[:, :, None], align_corners=True)[..., 0]
     return normalize(sampled, dim=1).transpose(1, 2)
-
-
-def _conv_bn(before: int, after: int) -> nn.Sequential:
-    return nn.Sequential(nn.Conv2d(before, after, 3, padding=1, bias=False), nn.BatchNorm2d(after))
-
-
-def _without_ring(score: Tensor) -> Tensor:
-    """``score`` (B, h, w) with 0 in its outermost ring."""
-    inner = torch.zeros_like(score)
-    inner[:, 1:-1, 1:-1] = 1.0
-    return score * inner

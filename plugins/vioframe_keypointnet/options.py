@@ -1,11 +1,14 @@
-"""The options of the detector ``keypointnet``; nothing heavy is imported to know them."""
+"""The options of the detector and of the trainer ``keypointnet``; nothing heavy is imported to know them."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
-from pydantic import NonNegativeFloat, NonNegativeInt
+from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
+
+from vioframe.errors import ConfigError
+from vioframe_keypointnet.architecture import ARCHITECTURES, Architecture
 
 Runtime = Literal["auto", "cuda", "openvino", "torch"]
 Precision = Literal["auto", "float32", "float16", "int8"]
@@ -29,3 +32,57 @@ class KeypointNetOptions:
     """Grey levels by which the image must vary within 8 px of a keypoint; 0 admits those on blank surfaces."""
     descriptors: bool = False
     """Also compute descriptors, which tracking does not use and which take longer than detection."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TrainingOptions:
+    """How KeypointNet is trained, by default on the published schedule (Tang et al., ICLR 2020).
+
+    Raises :class:`ConfigError` where they do not fit together.
+    """
+
+    network: Literal["full", "compact", "quick"] = "compact"
+    """full (as published), compact or quick."""
+    width: PositiveFloat = 1.0
+    """Factor on the channels of every layer."""
+    dropout: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.2
+    """Of whole channels, as published; the weights that ship were trained with 0: small networks have none to spare."""
+    seed: NonNegativeInt = 0
+    """Of the initial weights, the views and their order."""
+    size: tuple[int, int] = (320, 240)
+    """Width and height of the views, px, multiples of 8."""
+    batch: PositiveInt = 8
+    """Pairs of views a step."""
+    epochs: PositiveInt = 50
+    """Epochs to train."""
+    lesson_epochs: NonNegativeInt = 0
+    """First epochs in which corners are taught instead; what makes hours of training out of days."""
+    descriptors_only: bool = False
+    """Leave the detector as it is and train what only descriptors need; with --finetune."""
+    halve_at: tuple[int, ...] = (40,)
+    """Epochs after which the learning rate is halved."""
+    epoch_samples: int | None = None
+    """Pairs an epoch; null: each image once."""
+    learning_rate: PositiveFloat = 1e-3
+    """Of Adam; 1e-4 is usual for fine-tuning."""
+    photometric_probability: Annotated[float, Field(ge=0.0, le=1.0)] = 0.5
+    """Of each effect of light, lens and sensor on a view; the weights that ship were trained with 0.25."""
+    frames_per_recording: PositiveInt = 200
+    """Images taken, evenly, from each recording."""
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    """Where to train; auto takes CUDA where there is any."""
+    precision: Literal["float32", "bfloat16"] = "float32"
+    """Of the convolutions; bfloat16 is faster where the processor has it."""
+    threads: NonNegativeInt = 0
+    """Threads on a CPU; 0 leaves torch's choice."""
+
+    def __post_init__(self) -> None:
+        if any(n < 32 or n % 8 for n in self.size):
+            raise ConfigError(f"size must be two multiples of 8, each at least 32, not {self.size}")
+        if self.epoch_samples is not None and self.epoch_samples < self.batch:
+            raise ConfigError(f"epoch_samples must be at least the batch, {self.batch}, not {self.epoch_samples}")
+
+    @property
+    def architecture(self) -> Architecture:
+        base = ARCHITECTURES[self.network]
+        return base if self.width == 1.0 else base.widened(self.width)

@@ -7,10 +7,9 @@ from collections.abc import Iterable
 import numpy as np
 from numpy.typing import NDArray
 
-from vioframe.errors import ConfigError
+from vioframe.errors import ConfigError, needs
 from vioframe.types import Image
-from vioframe_keypointnet.architecture import HEADS, ranged_layers
-from vioframe_keypointnet.optional import needs
+from vioframe_keypointnet.architecture import HEADS
 from vioframe_keypointnet.selection import padded_to_cells
 from vioframe_keypointnet.weights import Weights
 
@@ -25,13 +24,13 @@ def measure_ranges(weights: Weights, images: Iterable[Image]) -> dict[str, float
     It is the one that loses least in the mean square, of what it cuts off and of what falls between 255 steps, over
     values drawn evenly from each image.
     """
-    with needs("torch", "keypointnet"):
+    with needs("torch", "keypointnet", user="measuring ranges for int8"):
         import torch
 
         from vioframe_keypointnet.network import of_weights
 
     network = of_weights(weights)
-    values: dict[str, list[NDArray[np.float32]]] = {name: [] for name in ranged_layers(weights.architecture)}
+    values: dict[str, list[NDArray[np.float32]]] = {name: [] for name in weights.architecture.ranged}
     for name, found in values.items():
 
         def keep(_: object, __: object, y: torch.Tensor, found: list[NDArray[np.float32]] = found) -> None:

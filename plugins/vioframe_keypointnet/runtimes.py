@@ -1,4 +1,4 @@
-"""What runs the network: OpenVINO the exported graph, the fastest on a CPU; torch the network as it was trained.
+"""What runs the network: OpenVINO a graph of its own, the fastest on a CPU; torch the network as it was trained.
 
 A runtime takes a grey image whose sides are multiples of 8 to what
 :meth:`vioframe_keypointnet.network.KeypointNet.found` gives, without the batch's axis, in float32; it stays as it is
@@ -16,10 +16,9 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from vioframe.errors import ConfigError
+from vioframe.errors import ConfigError, needs
 from vioframe.types import Image
-from vioframe_keypointnet.graph import onnx_model
-from vioframe_keypointnet.optional import needs
+from vioframe_keypointnet.graph import model
 from vioframe_keypointnet.options import Precision, Runtime
 from vioframe_keypointnet.seeing import Eye
 from vioframe_keypointnet.weights import Weights
@@ -56,73 +55,62 @@ def choose(runtime: Runtime, precision: Precision, calibrated: bool) -> tuple[st
 def start(runtime: str, precision: str, weights: Weights, *, descriptors: bool, threads: int) -> Run:
     """The network of ``weights`` in ``runtime``, with so many ``threads``, or as many as the library likes if 0."""
     if runtime == "openvino":
-        return OpenVino(weights, descriptors=descriptors, int8=precision == "int8", threads=threads)
-    return Torch(
-        weights,
-        descriptors=descriptors,
-        device="cuda" if runtime == "cuda" else "cpu",
-        precision=precision,
-        threads=threads,
-    )
+        return _by_openvino(weights, descriptors, precision == "int8", threads)
+    return _by_torch(weights, descriptors, "cuda" if runtime == "cuda" else "cpu", precision == "float16", threads)
 
 
-class OpenVino:
-    """The exported graph on a CPU, compiled for each size of image when the first comes."""
+def _by_openvino(weights: Weights, descriptors: bool, int8: bool, threads: int) -> Run:
+    """OpenVINO's graph on a CPU, compiled for each size of image when the first comes."""
+    with needs("openvino", "openvino", user="KeypointNet by OpenVINO"):
+        import openvino
 
-    def __init__(self, weights: Weights, *, descriptors: bool, int8: bool, threads: int) -> None:
-        with needs("openvino", "openvino"):
-            import openvino
+    core, see = openvino.Core(), Eye(weights.architecture, eight_bits=int8)
+    settings: dict[str, Any] = {"INFERENCE_PRECISION_HINT": "f32", "PERFORMANCE_HINT": "LATENCY"}
+    if threads:
+        settings["INFERENCE_NUM_THREADS"] = threads
 
-        self._core = openvino.Core()
-        self._weights, self._descriptors, self._int8 = weights, descriptors, int8
-        self._see = Eye(weights.architecture, eight_bits=int8)
-        self._settings: dict[str, Any] = {"INFERENCE_PRECISION_HINT": "f32", "PERFORMANCE_HINT": "LATENCY"}
-        if threads:
-            self._settings["INFERENCE_NUM_THREADS"] = threads
-        self._request = lru_cache(maxsize=4)(self._compile)
+    @lru_cache(maxsize=4)
+    def compiled(shape: tuple[int, int]) -> Any:
+        graph = model(weights, shape, descriptors=descriptors, int8=int8)
+        return core.compile_model(graph, "CPU", settings).create_infer_request()
 
-    def __call__(self, image: Image) -> tuple[NDArray[np.float32], ...]:
-        request = self._request(cast(tuple[int, int], image.shape))
-        found = request.infer({0: self._see(image)[None]}, share_inputs=True, share_outputs=True)
+    def run(image: Image) -> tuple[NDArray[np.float32], ...]:
+        request = compiled(cast(tuple[int, int], image.shape))
+        found = request.infer({0: see(image)[None]}, share_inputs=True, share_outputs=True)
         return tuple(array[0] for array in found.to_tuple())
 
-    def _compile(self, shape: tuple[int, int]) -> Any:
-        graph = onnx_model(self._weights, shape, descriptors=self._descriptors, int8=self._int8)
-        return self._core.compile_model(self._core.read_model(graph), "CPU", self._settings).create_infer_request()
+    return run
 
 
-class Torch:
-    """The network as it was trained, on a CPU or by CUDA; the number of threads, if given, is set for torch as a whole.
+def _by_torch(weights: Weights, descriptors: bool, device: str, half: bool, threads: int) -> Run:
+    """The network as it was trained; the number of threads, if given, is set for torch as a whole.
 
-    In float16 the convolutions have half precision, and nothing else.
+    With ``half`` the convolutions have half precision, and nothing else.
     """
-
-    def __init__(self, weights: Weights, *, descriptors: bool, device: str, precision: str, threads: int) -> None:
-        with needs("torch", "keypointnet"):
-            import torch
-
-            from vioframe_keypointnet.network import of_weights
-        if device == "cuda" and not torch.cuda.is_available():
-            raise ConfigError("torch finds no CUDA device; leave the option runtime out, or install torch with CUDA")
-        if threads:
-            torch.set_num_threads(threads)
-        self._network = of_weights(weights).to(device)
-        self._descriptors, self._device, self._half = descriptors, device, precision == "float16"
-
-    def __call__(self, image: Image) -> tuple[NDArray[np.float32], ...]:
+    with needs("torch", "keypointnet", user="KeypointNet by PyTorch"):
         import torch
 
+        from vioframe_keypointnet.network import of_weights
+    if device == "cuda" and not torch.cuda.is_available():
+        raise ConfigError("torch finds no CUDA device; leave the option runtime out, or install torch with CUDA")
+    if threads:
+        torch.set_num_threads(threads)
+    network = of_weights(weights).to(device)
+
+    def run(image: Image) -> tuple[NDArray[np.float32], ...]:
         # A copy: torch wants no memory that it may not write to.
-        grey = torch.from_numpy(image.copy()).to(self._device)[None, None] / 255.0
-        with torch.inference_mode(), torch.autocast(self._device, torch.float16, enabled=self._half):
-            outputs = self._network.found(grey, descriptors=self._descriptors)
+        grey = torch.from_numpy(image.copy()).to(device)[None, None] / 255.0
+        with torch.inference_mode(), torch.autocast(device, torch.float16, enabled=half):
+            outputs = network.found(grey, descriptors=descriptors)
         return tuple(output[0].float().cpu().contiguous().numpy() for output in outputs)
+
+    return run
 
 
 def _is_here(runtime: str) -> bool:
     """Whether its libraries are installed; torch is loaded to ask it for a GPU only where there is a driver."""
     if runtime == "openvino":
-        return find_spec("openvino") is not None and find_spec("onnx") is not None
+        return find_spec("openvino") is not None
     if find_spec("torch") is None or (runtime == "cuda" and shutil.which("nvidia-smi") is None):
         return False
     if runtime == "torch":

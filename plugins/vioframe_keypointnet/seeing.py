@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from functools import lru_cache
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -28,53 +26,41 @@ Floats = NDArray[np.float32]
 class Eye:
     """Sees images whose sides are multiples of 8; what it gives stays as it is until the next image.
 
-    The grey levels themselves, (1, H, W); for a network of peaks that folds f x f pixels (f^2, H/f, W/f) the local
-    contrast of :func:`vioframe_keypointnet.network.locally_normalised`, or, in ``eight_bits``, steps of
-    :data:`CONTRAST_STEP` from :data:`ZERO`.
+    The grey levels themselves, (1, H, W); for a network of peaks the local contrast of
+    :func:`vioframe_keypointnet.network.locally_normalised`, 2 x 2 pixels folded, (4, H/2, W/2), or, in ``eight_bits``,
+    steps of :data:`CONTRAST_STEP` from :data:`ZERO`.
     """
 
     def __init__(self, architecture: Architecture, *, eight_bits: bool) -> None:
-        self._architecture, self._eight_bits = architecture, eight_bits
-        self._sight = lru_cache(maxsize=4)(_Sight)
+        self._peaks, self._eight_bits = architecture.peaks, eight_bits
+        self._make_room(0, 0)
 
-    def __call__(self, image: Image) -> Floats | Image:
-        if not self._architecture.peaks:
-            return image[None]
-        rows, columns = image.shape
-        sight = self._sight((rows, columns), self._architecture.fold)
-        return sight.contrast_in_steps(image) if self._eight_bits else sight.contrast(image)
-
-
-class _Sight:
-    """Arrays for images of one ``shape`` (H, W): as new ones each time they would take longer than what fills them."""
-
-    def __init__(self, shape: tuple[int, int], fold: int) -> None:
-        rows, columns = shape
-        self._fold, self._folded = fold, (fold * fold, rows // fold, columns // fold)
-        self._contrast, self._steps = np.empty(shape, np.float32), np.empty(shape, np.uint8)
-        self._seen = np.empty(self._folded, np.uint8)
+    def _make_room(self, rows: int, columns: int) -> None:
+        """Arrays for images of one size: as new ones each time they would take longer than what fills them."""
+        self._contrast, self._steps = np.empty((rows, columns), np.float32), np.empty((rows, columns), np.uint8)
+        self._seen = np.empty((4, rows // 2, columns // 2), np.uint8 if self._eight_bits else np.float32)
         self._coarse, self._means = (np.empty((rows // COARSE_PX, columns // COARSE_PX), np.float32) for _ in range(2))
         self._around = np.empty((rows // COARSE_PX, columns), np.float32)
 
-    def contrast(self, image: Image) -> Floats:
-        """Local contrast, folded."""
-        f, (_, rows, columns) = self._fold, self._folded
-        by_place = self._local_contrast(image).reshape(rows, f, columns, f).transpose(1, 3, 0, 2)
-        return np.ascontiguousarray(by_place).reshape(self._folded)
-
-    def contrast_in_steps(self, image: Image) -> Image:
-        """The same in 8 bits."""
-        _round(self._local_contrast(image), np.float32(1.0) / CONTRAST_STEP, self._steps)
-        # The pixels of a row that one place holds, as one whole number, of which shifts take them apart.
-        _fold(self._steps.view(f"<u{self._fold}"), self._seen)
-        return self._seen
-
-    def _local_contrast(self, image: Image) -> Floats:
-        """``image`` less its mean, over its deviation, of about 20 px around; flat parts stay small."""
+    def __call__(self, image: Image) -> Floats | Image:
+        if not self._peaks:
+            return image[None]
+        rows, columns = image.shape
+        if image.shape != self._contrast.shape:
+            self._make_room(rows, columns)
         _means(image, self._coarse)
         _take_away(image, self._smoothed(), self._contrast, self._coarse)
         _divide(self._contrast, self._smoothed(), _FAINT)
-        return self._contrast
+        if self._eight_bits:
+            _round(self._contrast, np.float32(1.0) / CONTRAST_STEP, self._steps)
+            # The two pixels of a row that one place holds are one whole number, of which a cast takes the lower half.
+            pairs = self._steps.view("<u2").reshape(rows // 2, 2, columns // 2).swapaxes(0, 1)
+            self._seen[0::2] = pairs
+            np.right_shift(pairs, 8, out=self._seen[1::2], casting="unsafe")
+        else:
+            by_place = self._contrast.reshape(rows // 2, 2, columns // 2, 2).transpose(1, 3, 0, 2)
+            self._seen.reshape(2, 2, rows // 2, columns // 2)[:] = by_place
+        return self._seen
 
     def _smoothed(self) -> Floats:
         """(H/4, W): the mean of the coarse values around each, interpolated within the rows; kernels do it between."""
@@ -144,14 +130,3 @@ def _round(contrast: Floats, per_step: np.float32, steps: Image) -> None:
             rounded = contrast[y, x] * per_step + np.float32(ZERO + 0.5)
             # By way of int32, as processors convert no vector of floats to bytes.
             steps[y, x] = np.uint8(np.int32(min(max(rounded, np.float32(0.0)), np.float32(255.0))))
-
-
-@kernel
-def _fold(packed: NDArray[np.unsignedinteger], seen: Image) -> None:
-    """Fill ``seen`` (f^2, H/f, W/f) from (H, W/f) whole numbers of f bytes, the first pixel's the lowest."""
-    f = packed.shape[0] // seen.shape[1]
-    for y in range(packed.shape[0]):
-        for k in range(f):
-            channel = (y % f) * f + k
-            for x in range(seen.shape[2]):
-                seen[channel, y // f, x] = np.uint8((packed[y, x] >> np.uint32(8 * k)) & np.uint32(255))

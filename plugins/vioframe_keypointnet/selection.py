@@ -6,7 +6,6 @@ keypoints (:func:`peaks`).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from math import ceil
 
 import numpy as np
@@ -15,6 +14,7 @@ from numpy.typing import NDArray
 from vioframe.jit import kernel
 from vioframe.types import Image, Int
 from vioframe_keypointnet.architecture import CELL_PX
+from vioframe_keypointnet.options import KeypointNetOptions
 
 OFFSET_PX = 2.0 * (CELL_PX - 1) / 2
 """How far a keypoint may lie from its cell's centre: the network's cross ratio of 2 times half a cell."""
@@ -29,16 +29,6 @@ _EVERY = 7
 Array = NDArray[np.float32]
 
 
-@dataclass(frozen=True, slots=True)
-class Rules:
-    """Which candidates are keypoints."""
-
-    nms_px: float
-    """A candidate goes where a stronger one is nearer than this; the cells reach into each other."""
-    min_contrast: int
-    """Grey levels by which the image must vary within 8 px of a keypoint."""
-
-
 def padded_to_cells(image: Image) -> Image:
     """``image`` with its last row and column repeated until the sides are multiples of 8; contiguous."""
     rows, columns = (-side % CELL_PX for side in image.shape)
@@ -48,7 +38,9 @@ def padded_to_cells(image: Image) -> Image:
     return np.ascontiguousarray(image)
 
 
-def select(heads: Array, image: Image, shape: tuple[int, int], max_points: int, rules: Rules) -> tuple[Array, Array]:
+def select(
+    heads: Array, image: Image, shape: tuple[int, int], max_points: int, rules: KeypointNetOptions
+) -> tuple[Array, Array]:
     """``xy`` (N, 2) px and ``score`` (N,) in (0, 1), strongest first, of the candidates ``heads`` (3, h, w).
 
     ``heads`` are the score, x and y of each cell as the network gives them before sigmoid and tanh; ``image``
@@ -81,7 +73,9 @@ def candidate_places(heads: Array) -> tuple[Array, Array]:
     return np.clip(offset[0], 0.0, w * CELL_PX - 1.0), np.clip(offset[1], 0.0, h * CELL_PX - 1.0)
 
 
-def peaks(found: Array, image: Image, shape: tuple[int, int], max_points: int, rules: Rules) -> tuple[Array, Array]:
+def peaks(
+    found: Array, image: Image, shape: tuple[int, int], max_points: int, rules: KeypointNetOptions
+) -> tuple[Array, Array]:
     """``xy`` (N, 2) px and ``score`` (N,) in (0, 1), strongest first, of the peaks of ``found`` (H/2, W/2, 4).
 
     A peak is the highest of all pixels nearer than ``nms_px`` along both axes, of equals the first row by row; its
@@ -106,11 +100,9 @@ def peaks(found: Array, image: Image, shape: tuple[int, int], max_points: int, r
 def by_pixels(found: Array) -> Array:
     """(H, W) of (H/2, W/2, 4), the values of 2 x 2 pixels, row by row."""
     h, w, _ = found.shape
-    out = np.empty((2 * h, 2 * w), np.float32)
     # Two of a row are moved as one: twice as fast.
-    pairs = np.ascontiguousarray(found).view(np.float64)
-    out.view(np.float64)[0::2], out.view(np.float64)[1::2] = pairs[..., 0], pairs[..., 1]
-    return out
+    pairs = np.ascontiguousarray(found).view(np.float64).swapaxes(1, 2)
+    return np.ascontiguousarray(pairs).reshape(2 * h, w).view(np.float32)
 
 
 def describe(descriptors: Array, xy: Array) -> Array:

@@ -22,18 +22,9 @@ from typing import Any
 
 import numpy as np
 
-from vioframe.errors import ConfigError
+from vioframe.errors import ConfigError, needs
 from vioframe.parts.options import did_you_mean
-from vioframe_keypointnet.architecture import (
-    ARCHITECTURES,
-    FULL,
-    Architecture,
-    Tensors,
-    ranged_layers,
-    shapes,
-    untrained,
-)
-from vioframe_keypointnet.optional import needs
+from vioframe_keypointnet.architecture import ARCHITECTURES, FULL, Architecture, Tensors
 
 _LOG = logging.getLogger(__name__)
 
@@ -57,27 +48,20 @@ class Weights:
     tensors: Tensors
     card: Mapping[str, Any] = field(default_factory=dict)
     activation_ranges: Mapping[str, float] | None = None
-    source: str = "memory"
 
 
-def save(
-    path: str | Path,
-    tensors: Mapping[str, Any],
-    architecture: Architecture,
-    card: Mapping[str, Any],
-    activation_ranges: Mapping[str, float] | None = None,
-) -> None:
-    """Write ``tensors`` (arrays by name; counters of batches are left out) as a file that :func:`load` reads.
+def save(path: Path, weights: Weights) -> None:
+    """Write ``weights`` as a file that :func:`load` reads, but for counters of batches.
 
-    Raises :class:`ConfigError` where they are not those of ``architecture``.
+    Raises :class:`ConfigError` where the tensors are not those of the architecture.
     """
-    with needs("safetensors", "keypointnet"):
+    with needs("safetensors", "openvino", user="KeypointNet"):
         from safetensors.numpy import save_file
 
-    checked = _checked(tensors, architecture, "the tensors to save")
-    metadata = {"architecture": architecture.to_json(), "card": json.dumps(dict(card))}
-    if activation_ranges is not None:
-        metadata["activation_ranges"] = json.dumps(dict(activation_ranges))
+    checked = _checked(weights.tensors, weights.architecture, "the tensors to save")
+    metadata = {"architecture": weights.architecture.to_json(), "card": json.dumps(dict(weights.card))}
+    if weights.activation_ranges is not None:
+        metadata["activation_ranges"] = json.dumps(dict(weights.activation_ranges))
     save_file(dict(checked), path, metadata)
 
 
@@ -108,7 +92,7 @@ def shipped() -> list[str]:
 
 
 def _read(path: Path) -> Weights:
-    with needs("safetensors", "keypointnet"):
+    with needs("safetensors", "openvino", user="KeypointNet"):
         from safetensors import SafetensorError, safe_open
     try:
         with safe_open(path, framework="np") as file:
@@ -126,7 +110,7 @@ def _read(path: Path) -> Weights:
             f"{path} does not say which KeypointNet it is of; convert official checkpoints with "
             f"`python -m vioframe_keypointnet IN.ckpt OUT.safetensors`, or {_REMEDY}"
         ) from error
-    return Weights(architecture, _checked(tensors, architecture, str(path)), card, ranges, str(path))
+    return Weights(architecture, _checked(tensors, architecture, str(path)), card, ranges)
 
 
 def _read_checkpoint(path: Path) -> Weights:
@@ -134,7 +118,7 @@ def _read_checkpoint(path: Path) -> Weights:
 
     Raises :class:`ConfigError` where the file is none, wants anything but tensors built, or is of another network.
     """
-    with needs("torch", "keypointnet"):
+    with needs("torch", "keypointnet", user="an official checkpoint"):
         import torch
     try:
         with torch.serialization.safe_globals([(OrderedDict, "yacs.config.CfgNode")]):
@@ -149,7 +133,7 @@ def _read_checkpoint(path: Path) -> Weights:
     if not isinstance(tensors, Mapping) or not all(isinstance(t, torch.Tensor) for t in tensors.values()):
         raise ConfigError(f"{path} is no checkpoint of KP2D: it has no tensors under 'state_dict'")
     arrays = _checked({name: t.numpy() for name, t in tensors.items()}, FULL, str(path))
-    return Weights(FULL, arrays, {"converted_from": path.name}, source=str(path))
+    return Weights(FULL, arrays, {"converted_from": path.name})
 
 
 def _random(name: str) -> Weights:
@@ -157,28 +141,30 @@ def _random(name: str) -> Weights:
     if kind not in ARCHITECTURES:
         raise ConfigError(f"there is no network {kind!r} to leave untrained; known: {', '.join(sorted(ARCHITECTURES))}")
     _LOG.warning("KeypointNet runs with random weights, as asked: it is good for measuring speed and nothing else")
-    architecture = ARCHITECTURES[kind]
-    ranges = dict.fromkeys(ranged_layers(architecture), 1.0)  # signals stay about as small as the normalised image
-    return Weights(architecture, untrained(architecture), {"trained": False}, ranges, name)
+    architecture, rng, tensors = ARCHITECTURES[kind], np.random.default_rng(0), {}
+    for tensor, shape in architecture.shapes.items():
+        if len(shape) == 4:
+            # Under which signals neither grow nor fade (He et al., ICCV 2015).
+            tensors[tensor] = rng.normal(0.0, np.sqrt(2.0 / np.prod(shape[1:])), shape).astype(np.float32)
+        else:
+            tensors[tensor] = np.full(shape, tensor.endswith((".1.weight", "running_var")), np.float32)
+    ranges = dict.fromkeys(architecture.ranged, 1.0)  # signals stay about as small as the normalised image
+    return Weights(architecture, tensors, {"trained": False}, ranges)
 
 
 def _checked(tensors: Mapping[str, Any], architecture: Architecture, what: str) -> Tensors:
     """``tensors`` as float32, exactly those that ``architecture`` has."""
-    found = {name: tensor for name, tensor in tensors.items() if not name.endswith("num_batches_tracked")}
-    expected = shapes(architecture)
-    wrong = [f"{name} is missing" for name in expected.keys() - found.keys()]
-    wrong += [f"{name} is not of it" for name in found.keys() - expected.keys()]
-    wrong += [
-        f"{name} has the shape {tuple(found[name].shape)} and not {shape}"
-        for name, shape in expected.items()
-        if name in found and tuple(found[name].shape) != shape
-    ]
+    expected = architecture.shapes
+    found = {name: tuple(t.shape) for name, t in tensors.items() if not name.endswith("num_batches_tracked")}
+    wrong = sorted(name for name in expected.keys() | found.keys() if expected.get(name) != found.get(name))
     if wrong:
+        have, want = (f"{shape}" if shape else "nothing" for shape in (found.get(wrong[0]), expected.get(wrong[0])))
+        more = f" and {len(wrong) - 1} more such" if len(wrong) > 1 else ""
         raise ConfigError(
-            f"{what}: not the weights of a {architecture.name} KeypointNet: {min(wrong)}"
-            f"{f' and {len(wrong) - 1} more such' if len(wrong) > 1 else ''}; {_REMEDY}"
+            f"{what}: not the weights of a {architecture.name} KeypointNet: "
+            f"{wrong[0]} has the shape {have} and not {want}{more}; {_REMEDY}"
         )
-    arrays = {name: np.ascontiguousarray(found[name], np.float32) for name in expected}
+    arrays = {name: np.ascontiguousarray(tensors[name], np.float32) for name in expected}
     broken = [name for name, array in arrays.items() if not np.isfinite(array).all()]
     if broken:
         raise ConfigError(f"{what}: {broken[0]} holds numbers that are not finite; {_REMEDY}")

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import NonNegativeInt
 
-from vioframe.errors import PluginError
+from vioframe.errors import needs
 from vioframe.interfaces import Detector, DetectorFactory
 from vioframe.parts.hooks import hookimpl
 
@@ -22,21 +22,9 @@ def superpoint(
     descriptors: Annotated[bool, "also compute the 256-vectors, which tracking does not use"] = False,
 ) -> Detector:
     """Whole-pixel keypoints by the SuperPoint network, whose weights its authors' licence forbids to pass on."""
-    try:
+    with needs("PyTorch", "superpoint", user="detector 'superpoint'"):
         from vioframe_superpoint.detector import SuperPoint
-    except ModuleNotFoundError as error:
-        if error.name != "torch":
-            raise
-        raise PluginError(
-            "detector 'superpoint' needs PyTorch, which is not installed: pip install 'vioframe[superpoint]'"
-        ) from error
-    return SuperPoint(
-        weights,
-        threshold=threshold,
-        border_px=border_px,
-        device=device,
-        descriptors=descriptors,
-    )
+    return SuperPoint(weights, threshold=threshold, border_px=border_px, device=device, descriptors=descriptors)
 
 
 @hookimpl

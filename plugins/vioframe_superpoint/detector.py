@@ -6,13 +6,13 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.functional import pad
 
 from vioframe.errors import ConfigError
 from vioframe.types import Image, Keypoints
 from vioframe_superpoint.network import CELL_PX, load
-from vioframe_superpoint.suppression import local_maxima
 
 _NMS_RADIUS_PX = 4
 """No two keypoints are this near or nearer, in both x and y: as in the authors' demo."""
@@ -51,3 +51,30 @@ class SuperPoint:
         height, width = image.shape
         pixels = torch.from_numpy(np.array(image))[None, None].to(self._device).float() / 255.0
         return pad(pixels, (0, -width % CELL_PX, 0, -height % CELL_PX), mode="replicate")
+
+
+def local_maxima(
+    score: NDArray[np.float32], threshold: float, radius_px: int, border_px: int, max_points: int
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """The ``max_points`` strongest pixels of ``score`` (H, W) and their scores: (N, 2) px and (N,), strongest first.
+
+    A pixel above ``threshold`` is kept unless a stronger one that is kept lies within ``radius_px`` in both x and y.
+    Those less than ``border_px`` from the border are never kept. Of equals the first in reading order is the stronger.
+    """
+    height, width = score.shape
+    free = score > threshold
+    free[:border_px] = free[height - border_px :] = False
+    free[:, :border_px] = free[:, width - border_px :] = False
+    rows, columns = np.nonzero(free)
+    order = np.argsort(-score[rows, columns], kind="stable")
+    kept: list[tuple[int, int]] = []
+    for row, column in zip(rows[order].tolist(), columns[order].tolist(), strict=True):
+        if len(kept) == max_points:
+            break
+        if free[row, column]:
+            kept.append((column, row))
+            free[max(row - radius_px, 0) : row + radius_px + 1, max(column - radius_px, 0) : column + radius_px + 1] = (
+                False
+            )
+    xy = np.array(kept, np.int64).reshape(-1, 2)
+    return xy.astype(np.float32), score[xy[:, 1], xy[:, 0]]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pickle
 from pathlib import Path
+from textwrap import shorten
 
 import torch
 from torch import Tensor, nn
@@ -14,10 +15,8 @@ from vioframe.errors import ConfigError
 CELL_PX = 8
 """Side of the cells that the encoder sees an image in."""
 
-_ENCODER = {"1a": (1, 64), "1b": (64, 64), "2a": (64, 64), "2b": (64, 64), "3a": (64, 128), "3b": (128, 128)} | {
-    "4a": (128, 128),
-    "4b": (128, 128),
-}
+_ENCODER = {"1a": 64, "1b": 64, "2a": 64, "2b": 64, "3a": 128, "3b": 128, "4a": 128, "4b": 128}
+"""Channels that the encoder's convolutions give."""
 _POOLED = ("1b", "2b", "3b")
 
 
@@ -26,8 +25,10 @@ class SuperPointNet(nn.Module):
 
     def __init__(self) -> None:
         super().__init__()
-        for name, (before, after) in _ENCODER.items():
+        before = 1
+        for name, after in _ENCODER.items():
             self.add_module(f"conv{name}", nn.Conv2d(before, after, 3, padding=1))
+            before = after
         self.convPa, self.convPb = nn.Conv2d(128, 256, 3, padding=1), nn.Conv2d(256, CELL_PX**2 + 1, 1)
         self.convDa, self.convDb = nn.Conv2d(128, 256, 3, padding=1), nn.Conv2d(256, 256, 1)
 
@@ -66,22 +67,11 @@ def load(path: Path) -> SuperPointNet:
     except (pickle.UnpicklingError, RuntimeError, EOFError, ValueError, KeyError) as error:
         raise ConfigError(f"{path} is no file of PyTorch weights; superpoint needs superpoint_v1.pth") from error
     network = SuperPointNet()
-    wrong = _differences(weights, network.state_dict())
-    if wrong:
-        raise ConfigError(f"{path} holds the weights of another network ({wrong}); superpoint needs superpoint_v1.pth")
-    network.load_state_dict(weights)
+    try:
+        network.load_state_dict(weights)
+    except (RuntimeError, TypeError) as error:
+        reason = shorten(str(error), 200)
+        raise ConfigError(f"{path} is of another network than superpoint_v1.pth, which is needed: {reason}") from error
+    if not all(bool(tensor.isfinite().all()) for tensor in network.parameters()):
+        raise ConfigError(f"{path} holds numbers that are not finite; get superpoint_v1.pth anew")
     return network.eval()
-
-
-def _differences(weights: object, wanted: dict[str, Tensor]) -> str:
-    """What is wrong with ``weights``, or nothing."""
-    if not isinstance(weights, dict) or not all(isinstance(value, Tensor) for value in weights.values()):
-        return "not a table of tensors"
-    for name, tensor in wanted.items():
-        if name not in weights:
-            return f"without {name}"
-        if weights[name].shape != tensor.shape:
-            return f"{name} is {tuple(weights[name].shape)}, not {tuple(tensor.shape)}"
-        if not bool(torch.isfinite(weights[name]).all()):
-            return f"{name} is not finite"
-    return "".join(f"with {name}" for name in sorted(map(str, weights.keys() - wanted.keys()))[:1])

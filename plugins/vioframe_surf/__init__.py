@@ -14,7 +14,7 @@ from typing import Annotated
 import numpy as np
 from pydantic import NonNegativeFloat, PositiveInt
 
-from vioframe.errors import PluginError
+from vioframe.errors import needs
 from vioframe.interfaces import DetectorFactory
 from vioframe.parts.hooks import hookimpl
 from vioframe.types import Float, Image, Keypoints
@@ -42,12 +42,8 @@ class Surf:
         octaves: Annotated[PositiveInt, "how often the resolution is halved, plus one; more finds larger blobs"] = 2,
         descriptors: Annotated[bool, "also compute the 64-vectors, which tracking does not use"] = False,
     ) -> None:
-        try:
+        with needs("mahotas", "surf", user="detector 'surf'"):
             from mahotas.features import surf
-        except ModuleNotFoundError as error:
-            raise PluginError(
-                "detector 'surf' needs mahotas, which is not installed: pip install 'vioframe[surf]'"
-            ) from error
         self._surf = surf
         self._threshold = threshold
         self._octaves = octaves

@@ -103,11 +103,7 @@ def losses(source: Detection, target: Detection, homography: Tensor, judge: Inli
     ``homography`` (B, 3, 3) takes pixels of the source to pixels of the target; both are of the same size.
     """
     a, b = Candidates.of(source), Candidates.of(target)
-    h, w = target.score.shape[1:]
-    size = a.xy.new_tensor([8.0 * w, 8.0 * h])
-    warped = warp(homography, a.xy)
-    seen = ((warped >= 0.0) & (warped <= size - 1.0)).all(dim=-1) & a.off_border
-
+    warped, seen, size = _shown(a, target, homography)
     distance, nearest = nearest_candidates(warped, b)
     near = seen & (distance < NEAR_PX)
     scores = a.score[near], b.score.gather(1, nearest)[near]
@@ -116,11 +112,22 @@ def losses(source: Detection, target: Detection, homography: Tensor, judge: Inli
     descriptors_b = describe(target.descriptors, b.xy.detach())
     positives = describe(target.descriptors, warped.detach())
     return {
-        "location": location_loss(distance[near]),
+        "location": _mean(distance[near]),  # Eq. 2
         "descriptor": descriptor_loss(descriptors_a, positives, descriptors_b, warped.detach(), b.xy.detach(), seen),
         "score": score_loss(*scores, distance[near]),
         "inlier": inlier_loss(judge, a, b, warped, descriptors_a, descriptors_b, size),
     }
+
+
+def _shown(source: Candidates, target: Detection, homography: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Where the source's candidates come in the target (B, N, 2) px, whether it shows them (B, N), and its size, px.
+
+    Those at the border of the source count as not shown.
+    """
+    h, w = target.score.shape[1:]
+    size = source.xy.new_tensor([CELL_PX * w, CELL_PX * h])
+    warped = warp(homography, source.xy)
+    return warped, ((warped >= 0.0) & (warped <= size - 1.0)).all(dim=-1) & source.off_border, size
 
 
 def nearest_candidates(warped: Tensor, target: Candidates) -> tuple[Tensor, Tensor]:
@@ -132,11 +139,6 @@ def nearest_candidates(warped: Tensor, target: Candidates) -> tuple[Tensor, Tens
     at = target.xy.gather(1, nearest[..., None].expand(-1, -1, 2))
     # A gradient at distance zero would be nan.
     return ((warped - at).square().sum(dim=-1) + 1e-12).sqrt(), nearest
-
-
-def location_loss(distance: Tensor) -> Tensor:
-    """Eq. 2: mean distance (K,), px, of points found in both images."""
-    return _mean(distance)
 
 
 def score_loss(score_a: Tensor, score_b: Tensor, distance: Tensor) -> Tensor:
@@ -253,15 +255,13 @@ def matching_loss(a: Detection, b: Detection, homography: Tensor) -> Tensor:
     point, where the published loss leaves them.
     """
     source = Candidates.of(a)
-    h, w = a.score.shape[1:]
-    warped = warp(homography, source.xy.detach())
-    limit = warped.new_tensor([CELL_PX * w - 1.0, CELL_PX * h - 1.0])
-    seen = ((warped >= 0.0) & (warped <= limit)).all(dim=-1) & source.off_border
+    warped, seen, _ = _shown(source, b, homography)
+    warped = warped.detach()
     likeness = describe(a.descriptors, source.xy.detach()) @ describe(b.descriptors, warped).transpose(1, 2)
-    itself = torch.eye(h * w, dtype=torch.bool, device=warped.device)
+    itself = torch.eye(seen.shape[1], dtype=torch.bool, device=warped.device)
     beside = (torch.cdist(warped, warped) < NEAR_PX) & ~itself
     logits = (likeness / _TEMPERATURE).masked_fill(beside | ~seen[:, None, :], -torch.inf)[seen]
-    own = torch.arange(h * w, device=warped.device).expand_as(seen)[seen]
+    own = torch.arange(seen.shape[1], device=warped.device).expand_as(seen)[seen]
     return cross_entropy(logits, own) if len(own) else likeness.sum() * 0.0
 
 

@@ -7,24 +7,24 @@ section 4), but for light and blur, which are those of a camera in flight.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from fnmatch import fnmatch
 from pathlib import Path
-from typing import Self
+from typing import Generic, NamedTuple, TypeVar
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from torch import Tensor
+from torch.utils.data import default_collate
 
 from vioframe.bench.detectors.degradations import line_kernel
-from vioframe.bench.detectors.images import find_images, frames_of
+from vioframe.bench.detectors.images import find_images, frames_of, read_image
 from vioframe.errors import ConfigError, DatasetError
-from vioframe.io.images import decode_image, to_gray8
+from vioframe.io.images import to_gray8
 from vioframe.parts import registry
 from vioframe.types import Float
+from vioframe_keypointnet.options import TrainingOptions
 from vioframe_keypointnet.training.losses import corners, lesson
-from vioframe_keypointnet.training.options import TrainingOptions
 
 _SMALLEST_PX = 64
 _LARGEST_SCALE = 1.2
@@ -51,8 +51,11 @@ _MOTION_BLUR_PX = 9.0
 _NOISE_SIGMA = 0.05
 """Largest standard deviation, of a range of one."""
 
-View = NDArray[np.float32]
+Array = NDArray[np.float32]
+View = Array
 """(H, W) or (H, W, 3) in [0, 1]."""
+
+ArrayT = TypeVar("ArrayT", Array, Tensor)
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,53 +66,40 @@ class Picture:
     pixels: NDArray[np.uint8]
 
 
-@dataclass(frozen=True, slots=True)
-class Pair:
-    """Two views, the homography (3, 3) from pixels of the source to those of the target, and the lessons (3, h, w)."""
+class Pair(NamedTuple, Generic[ArrayT]):
+    """Two views of one image; of a batch, tensors with a row a pair."""
 
-    source: View
-    target: View
-    homography: Float
-    source_lesson: NDArray[np.float32]
-    target_lesson: NDArray[np.float32]
-
-
-@dataclass(frozen=True, slots=True)
-class Batch:
-    """Pairs of views; each field has a row a pair, and views are (B, C, H, W)."""
-
-    source: Tensor
-    target: Tensor
-    homography: Tensor
-    source_lesson: Tensor
-    target_lesson: Tensor
-
-    def to(self, device: torch.device) -> Self:
-        return type(self)(*(getattr(self, field.name).to(device) for field in fields(self)))
+    source: ArrayT
+    """(C, H, W) in [0, 1]."""
+    target: ArrayT
+    homography: ArrayT
+    """(3, 3) from pixels of the source to those of the target."""
+    source_lesson: ArrayT
+    """(3, h, w): see :func:`vioframe_keypointnet.training.losses.lesson`."""
+    target_lesson: ArrayT
 
 
 def gather(sources: Sequence[Path], channels: int, frames_per_recording: int) -> list[Picture]:
     """All images of ``sources`` in a settled order, with ``channels`` 1 (grey) or 3 (RGB).
 
     A source is a folder of photographs (searched to its depths) or a recording that a reader opens. Raises
-    :class:`ConfigError` for one that holds no image of use.
+    :class:`ConfigError` for one that is neither, and :class:`DatasetError` for a damaged image.
     """
     pictures: list[Picture] = []
     for source in sources:
-        if not source.exists():
-            raise ConfigError(f"{source} does not exist; --images takes folders of photographs and recordings")
         try:
             dataset = registry.load().open_dataset(source)
         except DatasetError as error:
-            found = _photographs(source, channels) if source.is_dir() else []
-            if not found:
+            try:
+                files = find_images(source)
+            except DatasetError:
                 raise ConfigError(f"{source} holds neither photographs nor a recording: {error}") from error
-            pictures += found
+            pictures += (Picture(str(path), _with_channels(read_image(path), channels, str(path))) for path in files)
         else:
             for number, frames in frames_of(dataset, frames_per_recording):
                 image = next(image for image in frames.images if image is not None)
                 pictures.append(Picture(f"{source}#{number}", _with_channels(image, channels, str(source))))
-    return pictures
+    return [picture for picture in pictures if min(picture.pixels.shape[:2]) >= _SMALLEST_PX]
 
 
 def split(pictures: Iterable[Picture], hold_out: Sequence[str]) -> tuple[list[Picture], list[Picture]]:
@@ -120,25 +110,10 @@ def split(pictures: Iterable[Picture], hold_out: Sequence[str]) -> tuple[list[Pi
         out = any(pattern in picture.name or fnmatch(picture.name, pattern) for pattern in hold_out)
         (held if out else train).append(picture)
     if not train:
-        raise ConfigError("every image is held out; narrow --hold-out or name more --images")
+        raise ConfigError("no image is left to train on; narrow --hold-out or name more --images, of 64 px or larger")
     if hold_out and not held:
         raise ConfigError(f"no image is named like --hold-out {' '.join(hold_out)}; nothing would be held out")
     return train, held
-
-
-def _photographs(folder: Path, channels: int) -> list[Picture]:
-    try:
-        files = find_images(folder)
-    except DatasetError:
-        return []
-    out = []
-    for path in files:
-        pixels = decode_image(path.read_bytes())
-        if pixels is None:
-            raise ConfigError(f"{path} is damaged or no image; repair or remove it")
-        if min(pixels.shape[:2]) >= _SMALLEST_PX:
-            out.append(Picture(str(path), _with_channels(pixels, channels, str(path))))
-    return out
 
 
 def _with_channels(pixels: NDArray[np.generic], channels: int, where: str) -> NDArray[np.uint8]:
@@ -156,7 +131,9 @@ def grey_of(pixels: NDArray[np.uint8]) -> NDArray[np.uint8]:
     return pixels if pixels.ndim == 2 else np.asarray(cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY), np.uint8)
 
 
-def batch(pictures: Sequence[Picture], options: TrainingOptions, step: int, *, corners_taught: bool = True) -> Batch:
+def batch(
+    pictures: Sequence[Picture], options: TrainingOptions, step: int, *, corners_taught: bool = True
+) -> Pair[Tensor]:
     """The pairs of a step, made of nothing but the arguments, so that a training resumed is one not interrupted.
 
     Unless ``corners_taught``, none are looked for, and the lessons name none.
@@ -166,16 +143,11 @@ def batch(pictures: Sequence[Picture], options: TrainingOptions, step: int, *, c
         pair(pictures[_order(k, len(pictures), options.seed)], options, k, corners_taught=corners_taught)
         for k in range(first, first + options.batch)
     ]
-    return Batch(
-        _images([p.source for p in pairs]),
-        _images([p.target for p in pairs]),
-        torch.from_numpy(np.stack([p.homography for p in pairs]).astype(np.float32)),
-        torch.from_numpy(np.stack([p.source_lesson for p in pairs])),
-        torch.from_numpy(np.stack([p.target_lesson for p in pairs])),
-    )
+    collated: Pair[Tensor] = default_collate(pairs)
+    return collated
 
 
-def pair(picture: Picture, options: TrainingOptions, number: int, *, corners_taught: bool = True) -> Pair:
+def pair(picture: Picture, options: TrainingOptions, number: int, *, corners_taught: bool = True) -> Pair[Array]:
     """The ``number``-th pair, of ``picture``."""
     import cv2
 
@@ -193,10 +165,13 @@ def pair(picture: Picture, options: TrainingOptions, number: int, *, corners_tau
         first, second = second, first
     between = second @ np.linalg.inv(first)
     points = corners(grey_of(shrunk)) if corners_taught else np.empty((0, 3))
+    source, target = (
+        disturbed(_view(shrunk, H, options.size), rng, options.photometric_probability) for H in (first, second)
+    )
     return Pair(
-        disturbed(_view(shrunk, first, options.size), rng, options.photometric_probability),
-        disturbed(_view(shrunk, second, options.size), rng, options.photometric_probability),
-        between / between[2, 2],
+        np.atleast_3d(source).transpose(2, 0, 1),
+        np.atleast_3d(target).transpose(2, 0, 1),
+        (between / between[2, 2]).astype(np.float32),
         lesson(points, first, options.size),
         lesson(points, second, options.size),
     )
@@ -274,8 +249,3 @@ def _order(k: int, count: int, seed: int) -> int:
     """Which image comes ``k``-th: every epoch all of them, each time in another order."""
     epoch, place = divmod(k, count)
     return int(np.random.default_rng([seed, 0, epoch]).permutation(count)[place])
-
-
-def _images(views: Sequence[View]) -> Tensor:
-    stacked = np.stack(views)
-    return torch.from_numpy(stacked[:, None] if stacked.ndim == 3 else stacked.transpose(0, 3, 1, 2)).contiguous()

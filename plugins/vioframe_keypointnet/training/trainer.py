@@ -5,16 +5,14 @@ A step depends on nothing but its number, and the checkpoint holds all that the 
 
 from __future__ import annotations
 
-import csv
 import os
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
+import pandas as pd
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import Module
 from torch.optim import Adam
@@ -25,14 +23,11 @@ from vioframe.errors import ConfigError
 from vioframe.types import TrainingJob, TrainingStep
 from vioframe_keypointnet import weights
 from vioframe_keypointnet.detector import KeypointNet as Detector
-from vioframe_keypointnet.detector import chooser
-from vioframe_keypointnet.network import KeypointNet
+from vioframe_keypointnet.network import KeypointNet, fill
+from vioframe_keypointnet.options import KeypointNetOptions, TrainingOptions
 from vioframe_keypointnet.quantisation import measure_ranges
-from vioframe_keypointnet.runtimes import Torch
-from vioframe_keypointnet.selection import Rules
 from vioframe_keypointnet.training.losses import InlierOutlierNet, losses, matching_loss, teach
-from vioframe_keypointnet.training.options import TrainingOptions
-from vioframe_keypointnet.training.samples import Batch, Picture, batch, gather, grey_of, split
+from vioframe_keypointnet.training.samples import Pair, Picture, batch, gather, grey_of, split
 
 CHECKPOINT, LOG, WEIGHTS = "checkpoint.pt", "log.csv", "keypointnet.safetensors"
 
@@ -46,7 +41,6 @@ _DESCRIPTOR_WEIGHT = 2.0
 
 _FREE = frozenset({"epochs", "device", "threads"})
 """What may be chosen anew when a training goes on."""
-_OTHER_NETWORK = "the weights to start from are of another network than {!r}; choose it with -o network="
 
 
 class KeypointNetTrainer:
@@ -71,7 +65,7 @@ class KeypointNetTrainer:
         if job.resume:
             self._history = self._training.resume(checkpoint)
         elif job.start_from is not None:
-            self._training.start_from(weights.load(job.start_from).tensors)
+            self._training.start_from(weights.load(job.start_from))
 
     def train(self) -> Iterator[TrainingStep]:
         """Train to the end; however it ends, what is done stays in the checkpoint."""
@@ -94,10 +88,11 @@ class KeypointNetTrainer:
         row = {"epoch": training.step // training.epoch_steps}
         row |= {name: float(np.mean([values[name] for values in of_epoch])) for name in of_epoch[0]}
         if self._held_out:
-            row |= asdict(validate(training.weights(), self._held_out, self._options.seed))
+            row |= validate(training.weights(), self._held_out, self._options.seed)
         self._history.append(row)
         training.save(self._job.out / CHECKPOINT, self._history)
-        _write_csv(self._job.out / LOG, self._history)
+        # Epochs of lessons have other losses than those that follow.
+        pd.DataFrame(self._history).to_csv(self._job.out / LOG, index=False)
         return row
 
     def _write_weights(self) -> None:
@@ -111,7 +106,7 @@ class KeypointNetTrainer:
         }
         made = self._training.weights()
         ranges = measure_ranges(made, self._sample)
-        weights.save(self._job.out / WEIGHTS, made.tensors, made.architecture, card, ranges)
+        weights.save(self._job.out / WEIGHTS, replace(made, card=card, activation_ranges=ranges))
 
 
 class Training:
@@ -143,15 +138,14 @@ class Training:
     def total_steps(self) -> int:
         return self.epoch_steps * self.options.epochs
 
-    def start_from(self, tensors: Mapping[str, NDArray[Any]]) -> None:
+    def start_from(self, other: weights.Weights) -> None:
         """Fine-tune: begin with the weights of a network of the same architecture."""
-        state = {name: torch.from_numpy(np.array(values)) for name, values in tensors.items()}
-        try:
-            missing, unexpected = self.network.load_state_dict(state, strict=False)
-        except RuntimeError as error:
-            raise ConfigError(_OTHER_NETWORK.format(self.options.network)) from error
-        if unexpected or any(not name.endswith("num_batches_tracked") for name in missing):
-            raise ConfigError(_OTHER_NETWORK.format(self.options.network))
+        if other.architecture.shapes != self.options.architecture.shapes:
+            raise ConfigError(
+                f"the weights to start from are of the network {other.architecture.name}, not of "
+                f"{self.options.architecture.name}; choose it with -o network= and -o width="
+            )
+        fill(self.network, other)
 
     def steps(self) -> Iterator[Mapping[str, float]]:
         """Train to the end; yields each step's losses by name."""
@@ -166,7 +160,8 @@ class Training:
                 group["lr"] = rate
             taught = epoch < self.options.lesson_epochs
             corners_taught = taught and not self.options.descriptors_only
-            pairs = batch(self._pictures, self.options, self.step, corners_taught=corners_taught).to(self._device)
+            pairs = batch(self._pictures, self.options, self.step, corners_taught=corners_taught)
+            pairs = Pair(*(tensor.to(self._device) for tensor in pairs))
             # Dropout, too, depends on the number of the step alone.
             torch.manual_seed(int(np.random.default_rng([self.options.seed, 3, self.step]).integers(2**62)))
             values = step_losses(self.network, self.judge, self.options, pairs, taught=taught)
@@ -223,7 +218,7 @@ def step_losses(
     network: KeypointNet,
     judge: InlierOutlierNet,
     options: TrainingOptions,
-    pairs: Batch,
+    pairs: Pair[Tensor],
     *,
     taught: bool = False,
 ) -> dict[str, Tensor]:
@@ -245,22 +240,15 @@ def step_losses(
     return values
 
 
-@dataclass(frozen=True, slots=True)
-class Validation:
-    """Means over the held-out images."""
+def validate(made: weights.Weights, pictures: Sequence[Picture], seed: int) -> dict[str, float]:
+    """How well points are found again in images not trained on, under one synthetic homography each, at 320 x 240.
 
-    repeatability: float
-    """Share of the 300 strongest points of one view that have one of the other's within 3 px, either way."""
-    localisation_px: float
-    """Mean distance of those."""
-
-
-def validate(made: weights.Weights, pictures: Sequence[Picture], seed: int) -> Validation:
-    """How repeatable points are on images not trained on: under one synthetic homography each, at 320 x 240."""
+    ``repeatability`` is the share of the 300 strongest points of one view that have one of the other's within 3 px,
+    either way, ``localisation_px`` the mean distance of those.
+    """
     import cv2
 
-    run = Torch(made, descriptors=False, device="cpu", precision="float32", threads=0)
-    detector = Detector(run, chooser(made.architecture, Rules(nms_px=4.0, min_contrast=0)), "torch", "float32")
+    detector = Detector(made, KeypointNetOptions(runtime="torch", nms_px=4.0, min_contrast=0))
     scores = []
     for k, picture in enumerate(pictures):
         image = cv2.resize(grey_of(picture.pixels), _VALIDATION_SIZE, interpolation=cv2.INTER_AREA)
@@ -271,29 +259,17 @@ def validate(made: weights.Weights, pictures: Sequence[Picture], seed: int) -> V
         scores.append(score_pair(*found, H_21, _VALIDATION_SIZE, _VALIDATION_TOP))
     # Where nothing was found again there is no distance.
     distances = np.array([score.localisation_px for score in scores], np.float64)
-    return Validation(float(np.mean([score.repeatability for score in scores])), float(np.nanmean(distances)))
+    repeatability = float(np.mean([score.repeatability for score in scores]))
+    return {"repeatability": repeatability, "localisation_px": float(np.nanmean(distances))}
 
 
 def _detecting(network: KeypointNet) -> list[Module]:
     """The layers that keypoints depend on; the rest only serves descriptors and, of a network of peaks, training."""
-    if network.architecture.peaks:
-        names = [*(f"conv{name}" for name, *_ in network.architecture.encoder if name < "3"), "convR"]
-    else:
-        names = [*(f"conv{name}" for name, *_ in network.architecture.encoder), "convDa", "convDb", "convPa", "convPb"]
-    return [network.get_submodule(name) for name in names]
+    heads = ("R",) if network.architecture.peaks else ("Da", "Db", "Pa", "Pb")
+    return [network.get_submodule(f"conv{name}") for name in (*network.architecture.detecting, *heads)]
 
 
 def _device(wanted: str) -> torch.device:
     if wanted == "cuda" and not torch.cuda.is_available():
         raise ConfigError("device is cuda, but torch sees no CUDA device; choose auto or cpu")
     return torch.device("cuda" if wanted != "cpu" and torch.cuda.is_available() else "cpu")
-
-
-def _write_csv(path: Path, rows: list[Mapping[str, float]]) -> None:
-    part = path.with_name(f"{path.name}.part")
-    with part.open("w", newline="", encoding="utf-8") as file:
-        # Epochs of lessons have other losses than those that follow.
-        writer = csv.DictWriter(file, list(dict.fromkeys(column for row in rows for column in row)))
-        writer.writeheader()
-        writer.writerows(rows)
-    os.replace(part, path)

@@ -7,9 +7,10 @@ from dataclasses import dataclass
 from functools import partial
 from itertools import islice
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from vioframe.errors import DatasetError
 from vioframe.interfaces import Dataset
@@ -50,12 +51,17 @@ def find_images(folder: Path) -> list[Path]:
     return files
 
 
-def read_grey(path: Path) -> Image:
-    """(H, W) uint8; raises :class:`DatasetError` where the file cannot be decoded."""
+def read_image(path: Path) -> NDArray[Any]:
+    """An image file as it is, channels in OpenCV's order; raises :class:`DatasetError` where it cannot be decoded."""
     image = decode_image(path.read_bytes())
     if image is None:
         raise DatasetError(f"{path} cannot be decoded; replace it or take it away")
-    return to_gray8(image, 16, str(path))
+    return image
+
+
+def read_grey(path: Path) -> Image:
+    """(H, W) uint8; raises :class:`DatasetError` where the file cannot be decoded."""
+    return to_gray8(read_image(path), 16, str(path))
 
 
 def evenly(items: Sequence[ItemT], count: int | None) -> list[ItemT]:
