@@ -23,7 +23,6 @@ from vioframe_pose_graph.matching import DescriptorIndex, match
 from vioframe_pose_graph.options import PoseGraphOptions
 from vioframe_pose_graph.place import Keyframe, Place
 from vioframe_pose_graph.recognition import Recogniser, Sighting
-from vioframe_pose_graph.verification import ransac
 
 
 class PoseGraph:
@@ -139,5 +138,3 @@ def warm_up() -> None:
     index.add(descriptors, 0)
     index.similarity(descriptors, 1)
     match(descriptors, descriptors, np.zeros((2, 2)), 1, 1.0, 1.0)
-    side, cameras = np.zeros(2, np.int64), np.repeat(np.eye(3)[None], 2, axis=0)
-    ransac(np.eye(2, 3), np.zeros((2, 2)), side, cameras, np.zeros((2, 3)), np.array([[0, 1]]), 1.0)

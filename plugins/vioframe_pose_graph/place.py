@@ -140,10 +140,18 @@ def reprojection(p_WF: Float, xy: Float, R_WC: Float, p_WC: Float) -> tuple[Floa
     The camera is perturbed as ``R_WC <- R_WC Exp(turn)``.
     """
     p_C = (p_WF - p_WC) @ R_WC
+    there, J = projected(p_C, np.concatenate([so3.hat(p_C), np.broadcast_to(-R_WC.T, (len(p_C), 3, 3))], axis=2))
+    return there - xy, J
+
+
+def projected(p_C: Float, J_C: Float) -> tuple[Float, Float]:
+    """Points (M, 3) on the z = 1 plane, (M, 2), and from the points' derivatives (M, 3, n) those there, (M, 2, n).
+
+    NaN for points behind the camera.
+    """
     z = np.where(p_C[:, 2] > 0.0, p_C[:, 2], np.nan)
-    projected = p_C[:, :2] / z[:, None]
-    J_C = np.concatenate([so3.hat(p_C), np.broadcast_to(-R_WC.T, (len(p_C), 3, 3))], axis=2)
-    return projected - xy, (J_C[:, :2] - projected[:, :, None] * J_C[:, 2:]) / z[:, None, None]
+    xy = p_C[:, :2] / z[:, None]
+    return xy, (J_C[:, :2] - xy[:, :, None] * J_C[:, 2:]) / z[:, None, None]
 
 
 def resect(
