@@ -20,7 +20,7 @@ from enum import Enum, auto
 import numpy as np
 
 from vioframe.geometry import so3
-from vioframe.geometry.two_view import rays
+from vioframe.geometry.two_view import median_parallax
 from vioframe.types import Calibration, Float, FrameTracks, Int
 from vioframe_loose_ekf.measurement import VisionPose
 from vioframe_loose_ekf.options import LooseEkfOptions
@@ -260,16 +260,6 @@ class Bootstrap:
 def _enough_in_common(reference: FrameTracks, tracks: FrameTracks) -> bool:
     common = np.isin(reference.ids, tracks.ids).sum()
     return bool(common >= max(_MIN_COMMON, _LEAST_COMMON * len(reference.ids)))
-
-
-def median_parallax(xy_1: Float, xy_2: Float, R_C1C2: Float) -> float:
-    """Median motion of tracks (N, 2) on the first view's z = 1 plane, with the turn ``R_C1C2`` (3, 3) taken out."""
-    turned = rays(xy_2) @ R_C1C2.T
-    ahead = turned[:, 2] > 0.1
-    if not ahead.any():
-        return 0.0
-    moved = turned[ahead, :2] / turned[ahead, 2:] - xy_1[ahead]
-    return float(np.median(np.linalg.norm(moved, axis=1)))
 
 
 def relative_pose(xy_1: Float, xy_2: Float, sigma: float, baseline: float) -> VisionPose | None:

@@ -18,10 +18,10 @@ from vioframe.geometry.trajectory import Trajectory
 from vioframe.types import Calibration, Float, Int, Loop, LoopClosure, Status, Step
 from vioframe_pose_graph.consistency import Odometry, agreed, measured, within_drift
 from vioframe_pose_graph.graph import solve_robustly, wrapped
-from vioframe_pose_graph.keyframes import KeyframeSelector
+from vioframe_pose_graph.keyframes import Keyframe, KeyframeSelector
 from vioframe_pose_graph.matching import DescriptorIndex, match
 from vioframe_pose_graph.options import PoseGraphOptions
-from vioframe_pose_graph.place import Keyframe, Place
+from vioframe_pose_graph.place import Place
 from vioframe_pose_graph.recognition import Recogniser, Sighting
 
 

@@ -19,8 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vioframe.geometry import so3
-from vioframe.geometry.cameras import Camera
 from vioframe.types import Float, Image, Int
+from vioframe_pose_graph.keyframes import Keyframe
 
 _MAX_SIGMAS = 4.0
 
@@ -33,27 +33,6 @@ _PATCH_PX = 31
 _STEEP = 0.35
 _ITERATIONS = 5
 _SIGMA_TURN, _SIGMA_M = np.radians(1.0), 0.03
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Keyframe:
-    """A frame picked by :class:`~vioframe_pose_graph.keyframes.KeyframeSelector`, in the world of the odometry.
-
-    ``segment`` numbers the stretches of tracking between resets. ``R_WC`` and ``p_WC`` are the pose of the camera
-    ``model`` when the image was taken, by the calibration that the back-end had learned by then. ``xy`` (N, 2) px are
-    the tracked features, ``p_WF`` (N, 3) m what is known of them, NaN where nothing is.
-    """
-
-    t_ns: int
-    segment: int
-    R_WB: Float
-    p_WB: Float
-    R_WC: Float
-    p_WC: Float
-    model: Camera
-    image: Image
-    xy: Float
-    p_WF: Float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -81,10 +60,15 @@ class View:
     descriptors: Words
 
 
-def describe(keyframe: Keyframe, describer: Describer, sigma_px: float) -> tuple[Place, View]:
+def corner_finder(max_corners: int) -> cv2.ORB:
+    """What finds up to ``max_corners`` corners, and describes any."""
+    return cv2.ORB.create(max_corners, _SCALE_FACTOR, _LEVELS, patchSize=_PATCH_PX, fastThreshold=_FAST_THRESHOLD)
+
+
+def describe(keyframe: Keyframe, orb: cv2.ORB, sigma_px: float) -> tuple[Place, View]:
     """Find and describe the points of ``keyframe``; its landmarks are known to ``sigma_px`` in the image."""
-    camera, R_WC, p_WC = keyframe.model, keyframe.R_WC, keyframe.p_WC
-    xy, descriptors, which = describer.describe(keyframe.image, keyframe.xy, R_WC)
+    camera, state = keyframe.model, keyframe.state
+    xy, descriptors, which = _described(orb, keyframe.image, keyframe.tracks.xy, image_angle_deg(keyframe.R_WC))
     xy_normalised = camera.undistort(xy)
     seen = np.isfinite(xy_normalised).all(axis=1)
     xy_normalised, descriptors, which = xy_normalised[seen], descriptors[seen], which[seen]
@@ -92,37 +76,29 @@ def describe(keyframe: Keyframe, describer: Describer, sigma_px: float) -> tuple
     p_WF = np.where(which[:, None] >= 0, keyframe.p_WF[which], np.nan)
     known = np.flatnonzero(np.isfinite(p_WF[:, 0]))
     sigma = sigma_px / camera.focal_px
-    R_WC, p_WC, fits = resect(p_WF[known], xy_normalised[known], R_WC, p_WC, sigma, _MAX_SIGMAS * sigma)
+    R_WC, p_WC, fits = resect(
+        p_WF[known], xy_normalised[known], keyframe.R_WC, keyframe.p_WC, sigma, _MAX_SIGMAS * sigma
+    )
     p_WF[known[~fits]] = np.nan
-    p_WB_seen = keyframe.p_WB + p_WC - keyframe.p_WC
-    place = Place(keyframe.t_ns, keyframe.segment, keyframe.R_WB, keyframe.p_WB, p_WB_seen, R_WC, p_WC)
+    p_WB_seen = state.p_WB + p_WC - keyframe.p_WC
+    place = Place(state.t_ns, keyframe.segment, state.R_WB, state.p_WB, p_WB_seen, R_WC, p_WC)
     return place, View(xy_normalised.astype(np.float32), p_WF.astype(np.float32), descriptors)
 
 
-class Describer:
-    """Finds up to ``max_corners`` corners and describes them together with those that are given."""
+def _described(orb: cv2.ORB, image: Image, xy: Float, angle_deg: float) -> tuple[Float, Words, Int]:
+    """Points (K, 2) px, their descriptors (K, 4), and (K,) which of the given ``xy`` (N, 2) px each is, or -1.
 
-    def __init__(self, max_corners: int) -> None:
-        self._orb = cv2.ORB.create(
-            max_corners, _SCALE_FACTOR, _LEVELS, patchSize=_PATCH_PX, fastThreshold=_FAST_THRESHOLD
-        )
-
-    def describe(self, image: Image, xy: Float, R_WC: Float) -> tuple[Float, Words, Int]:
-        """Points (K, 2) px, their descriptors (K, 4), and (K,) which of the given ``xy`` (N, 2) px each is, or -1.
-
-        Points too near to the border to be described are left out. ``R_WC`` is the camera's attitude.
-        """
-        angle = image_angle_deg(R_WC)
-        given = [cv2.KeyPoint(x, y, _PATCH_PX, angle, 0, 0, i) for i, (x, y) in enumerate(xy.tolist())]
-        found = list(self._orb.detect(image))
-        for corner in found:
-            corner.angle = angle
-            corner.class_id = -1
-        kept, descriptors = self._orb.compute(image, given + found)
-        if descriptors is None:
-            return np.empty((0, 2)), np.empty((0, 4), np.uint64), np.empty(0, np.int64)
-        places = np.array([corner.pt for corner in kept])
-        return places, descriptors.view(np.uint64), np.array([corner.class_id for corner in kept], np.int64)
+    Points too near to the border to be described are left out.
+    """
+    given = [cv2.KeyPoint(x, y, _PATCH_PX, angle_deg, 0, 0, i) for i, (x, y) in enumerate(xy.tolist())]
+    found = list(orb.detect(image))
+    for corner in found:
+        corner.angle, corner.class_id = angle_deg, -1
+    kept, descriptors = orb.compute(image, given + found)
+    if descriptors is None:
+        return np.empty((0, 2)), np.empty((0, 4), np.uint64), np.empty(0, np.int64)
+    places = np.array([corner.pt for corner in kept])
+    return places, descriptors.view(np.uint64), np.array([corner.class_id for corner in kept], np.int64)
 
 
 def image_angle_deg(R_WC: Float) -> float:
