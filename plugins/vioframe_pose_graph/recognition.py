@@ -12,8 +12,10 @@ from vioframe_pose_graph.keyframes import Keyframe
 from vioframe_pose_graph.matching import DescriptorIndex
 from vioframe_pose_graph.options import PoseGraphOptions
 from vioframe_pose_graph.place import Float32, Place, View, corner_finder, describe
-from vioframe_pose_graph.verification import Relation, relate
+from vioframe_pose_graph.verification import REPROJECTION_PX, Relation, relate
 
+# Earlier places that each keyframe is compared with in detail: an aliased world has more than one that look alike.
+_MOST_CANDIDATES = 3
 # Keyframes this near to a candidate look the same, and are not compared as well.
 _NEIGHBOURS = 3
 # Enough points to know a place by; the tracked features come first.
@@ -51,7 +53,7 @@ class Recogniser:
     def add(self, keyframe: Keyframe) -> None:
         """Look for the place of ``keyframe`` among the earlier ones, then remember it."""
         watch = Stopwatch()
-        place, view = describe(keyframe, self._orb, 0.5 * self._options.reprojection_px)
+        place, view = describe(keyframe, self._orb, 0.5 * REPROJECTION_PX)
         watch.lap("describe")
         candidates = self._retrieve(place, view)
         number = len(self.places)
@@ -62,7 +64,6 @@ class Recogniser:
                 (self.places[earlier], self._view(earlier)),
                 (place, view),
                 self._focal_px,
-                self._options.reprojection_px,
                 self._options.min_inliers,
             )
             if relation is not None:
@@ -84,7 +85,7 @@ class Recogniser:
         gap_ns = round(self._options.min_gap_s * NS_PER_S)
         before = sum(earlier.t_ns <= place.t_ns - gap_ns for earlier in self.places)
         scores = self._index.similarity(view.descriptors[:_ASKED], before)
-        return _peaks(scores, self._options.max_candidates)
+        return _peaks(scores, _MOST_CANDIDATES)
 
     def _thin_out(self) -> None:
         """Forget how every second of the older half of the remembered places looked."""

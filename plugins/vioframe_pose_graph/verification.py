@@ -19,6 +19,8 @@ from vioframe.types import Float, Int
 from vioframe_pose_graph.matching import match
 from vioframe_pose_graph.place import Place, View, projected
 
+REPROJECTION_PX = 3.0
+"""Within which a point of one keyframe must be seen in the other to support a loop."""
 _MAX_DISTANCE, _RATIO = 64, 0.85
 _APART_PX = 10.0
 _HYPOTHESES = 300
@@ -64,9 +66,9 @@ class Relation:
 Seen = tuple[Place, View]
 
 
-def relate(earlier: Seen, later: Seen, focal_px: float, reprojection_px: float, min_inliers: int) -> Relation | None:
+def relate(earlier: Seen, later: Seen, focal_px: float, min_inliers: int) -> Relation | None:
     """The relation of two keyframes by the points they share, or None where those do not agree on one."""
-    tolerance = reprojection_px / focal_px
+    tolerance = REPROJECTION_PX / focal_px
     seen = correspondences(earlier, later, _APART_PX / focal_px)
     if len(np.unique(seen.pairs[:, 1])) < min_inliers:
         return None
