@@ -22,9 +22,9 @@ import numpy as np
 from vioframe.geometry import so3
 from vioframe.geometry.two_view import median_parallax
 from vioframe.types import Calibration, Float, FrameTracks, Int
-from vioframe_loose_ekf.measurement import VisionPose
 from vioframe_loose_ekf.options import LooseEkfOptions
 from vioframe_loose_ekf.resection import resect
+from vioframe_loose_ekf.state import VisionPose
 from vioframe_loose_ekf.vision_map import Keyframe, VisionMap, adjust
 
 # Known points that must be in sight, and that must agree on where the camera is; and what part of those in sight.
@@ -32,8 +32,9 @@ _MIN_POINTS, _LEAST_INLIERS = 10, 0.3
 # Part of the known points of the last keyframe below which a new one is due.
 _FEW_LEFT = 0.6
 _GIVE_UP_S = 0.5
-# Keyframes that bundle adjustment must leave alone: fewer do not hold the scale.
-_LEAST_HELD = 2
+# Local bundle adjustment: it moves the newest keyframes, in a few steps at most, and leaves the others alone; fewer
+# than two do not hold the scale.
+_ADJUSTED, _STEPS, _LEAST_HELD = 5, 4, 2
 # Tracks that the reference and the newest frame must share, and what part of the reference's; points that must come of
 # them.
 _MIN_COMMON, _LEAST_COMMON, _FEWEST_MADE = 15, 0.3, 12
@@ -44,12 +45,7 @@ _LARGEST_TURN_ERROR_RAD = 0.05
 _BETWEEN = 3
 MEDIAN_DEPTH = 5.0
 """What the unit of V is made such that it is; :func:`~vioframe.geometry.triangulation.triangulate` trusts 0.1 to 60."""
-_ADJUSTMENTS = 10
-# Of a map of two views, which bends as a whole: rotation in units of a pixel's angle, and direction of the first way in
-# units of pixel noise by parallax. Measured over 120 starts on simulated flights.
-_BIRTH_ROTATION, _BIRTH_DIRECTION = 1.2, 0.7
-_LOOK_BACK_S = 0.5
-"""Over which standstill is recognised."""
+_BOOTSTRAP_STEPS = 10
 
 
 class Event(Enum):
@@ -167,13 +163,12 @@ class VisualOdometry:
 
     def _extend(self, scene: VisionMap, tracks: FrameTracks, placement: Placement) -> Placement:
         """Make a keyframe of the frame, triangulate what it shows anew, adjust; where the frame is after that."""
-        options = self._options
         outliers = np.setdiff1d(tracks.ids, placement.ids)
         scene.keep(~np.isin(scene.ids, outliers))
-        scene.add_keyframe(Keyframe.of(placement.pose, tracks), options.keyframes)
+        scene.add_keyframe(Keyframe.of(placement.pose, tracks), self._options.keyframes)
         scene.triangulate(self._sigma)
-        held = max(len(scene.keyframes) - options.adjusted_keyframes, _LEAST_HELD)
-        adjust(scene, self._sigma, held, options.adjustments)
+        held = max(len(scene.keyframes) - _ADJUSTED, _LEAST_HELD)
+        adjust(scene, self._sigma, held, _STEPS)
         placement = self._place(scene, tracks, scene.keyframes[-1].pose) or placement
         self._known_at_keyframe = len(placement.ids)
         return placement
@@ -235,7 +230,7 @@ class Bootstrap:
         if not self._fill_in(scene, pose):
             return None
         _set_unit(scene)
-        adjust(scene, self._sigma, 1, _ADJUSTMENTS)
+        adjust(scene, self._sigma, 1, _BOOTSTRAP_STEPS)
         if len(scene.ids) < max(_FEWEST_MADE, _LEAST_EXPLAINED * len(i)):
             return None
         _set_unit(scene)
@@ -283,39 +278,3 @@ def _set_unit(scene: VisionMap) -> None:
     stretch = MEDIAN_DEPTH / float(np.median(depth))
     scene.p_VF = stretch * scene.p_VF
     scene.keyframes = [replace(k, pose=VisionPose(k.pose.R_VC, stretch * k.pose.p_VC)) for k in scene.keyframes]
-
-
-@dataclass(frozen=True, slots=True)
-class Drifts:
-    """Each a (7,) array of standard deviations: [log-scale, rotation, position] about the anchor.
-
-    Rotation is in rad, position in units of V.
-    """
-
-    options: LooseEkfOptions
-    focal_px: float
-
-    def at_birth(self, first: VisionPose) -> Float:
-        """Of a new vision frame whose first pose is ``first``."""
-        o = self.options
-        direction = _BIRTH_DIRECTION * o.pixel_sigma / o.bootstrap_parallax_px
-        return _stacked(0.0, _BIRTH_ROTATION * o.pixel_sigma / self.focal_px, direction * _length(first.p_VC))
-
-    def since(self, p_VA: Float, keyframe: VisionPose) -> Float:
-        """From the last keyframe at ``p_VA`` (3,) to ``keyframe``."""
-        o = self.options
-        way = _length(keyframe.p_VC - p_VA)
-        return _stacked(o.drift_scale, float(np.deg2rad(o.drift_rotation_deg)), o.drift_position * way)
-
-    def at_rest(self, duration_s: float) -> Float:
-        """While the body passed for still: a picture that creeps less than is noticed is not followed."""
-        unnoticed = self.options.standstill_disparity_px / self.focal_px * (duration_s / _LOOK_BACK_S) ** 0.5
-        return _stacked(0.0, unnoticed, unnoticed * MEDIAN_DEPTH)
-
-
-def _stacked(scale: float, rotation: float, position: float) -> Float:
-    return np.repeat([scale, rotation, position], [1, 3, 3])
-
-
-def _length(v: Float) -> float:
-    return float(np.linalg.norm(v))

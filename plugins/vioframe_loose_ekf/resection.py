@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from vioframe.geometry.kernels import exp
 from vioframe.jit import kernel
 from vioframe.types import Float
-from vioframe_loose_ekf.measurement import VisionPose
+from vioframe_loose_ekf.state import VisionPose
 
 Bool = NDArray[np.bool_]
 

@@ -19,7 +19,7 @@ from vioframe.estimation.factors.reprojection import CALIBRATION_SIZE, Calibrate
 from vioframe.estimation.factors.solver import solve
 from vioframe.geometry.triangulation import triangulate
 from vioframe.types import Float, FrameTracks, Int
-from vioframe_loose_ekf.measurement import VisionPose
+from vioframe_loose_ekf.state import VisionPose
 
 # A track is triangulated from rays that are this far apart: less tells little of its depth.
 _LEAST_ANGLE_RAD = 0.015
