@@ -14,7 +14,7 @@ explain nearly all tracks in all frames, and turn as the gyroscope says.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from enum import Enum, auto
 
 import numpy as np
@@ -25,7 +25,7 @@ from vioframe.types import Calibration, Float, FrameTracks, Int
 from vioframe_loose_ekf.options import LooseEkfOptions
 from vioframe_loose_ekf.resection import resect
 from vioframe_loose_ekf.state import VisionPose
-from vioframe_loose_ekf.vision_map import Keyframe, VisionMap, adjust
+from vioframe_loose_ekf.vision_map import VisionMap, adjust
 
 # Known points that must be in sight, and that must agree on where the camera is; and what part of those in sight.
 _MIN_POINTS, _LEAST_INLIERS = 10, 0.3
@@ -91,27 +91,23 @@ class VisualOdometry:
         self._sigma = options.pixel_sigma / focal_px
         self._parallax = options.keyframe_parallax_px / focal_px
         self._bootstrap = Bootstrap(self._sigma, options.bootstrap_parallax_px / focal_px)
-        self._map: VisionMap | None = None
+        self.map: VisionMap | None = None
+        """Keyframes and points; None while there are none."""
         self._motion = _Motion(VisionPose(np.eye(3), np.zeros(3)), 0)
         self._placed_ns = 0
         self._known_at_keyframe = 0
 
-    @property
-    def map(self) -> VisionMap | None:
-        """Keyframes and points; None while there are none."""
-        return self._map
-
     def restart(self, tracks: FrameTracks) -> Sighting:
         """Forget the map; a new vision frame begins with ``tracks``."""
-        self._map = None
+        self.map = None
         self._bootstrap.begin(tracks)
         return Sighting(Event.REFERENCE)
 
     def track(self, tracks: FrameTracks, R_CbC: Float) -> Sighting:
         """Take in a frame, turned by ``R_CbC`` (3, 3) from the one before as far as anybody knows."""
-        if self._map is None:
+        if self.map is None:
             return self._begin(tracks, R_CbC)
-        return self._follow(self._map, tracks, R_CbC)
+        return self._follow(self.map, tracks, R_CbC)
 
     def _begin(self, tracks: FrameTracks, R_CbC: Float) -> Sighting:
         if not self._bootstrap.add(tracks, R_CbC):
@@ -119,17 +115,17 @@ class VisualOdometry:
         scene = self._bootstrap.attempt()
         if scene is None:
             return Sighting(Event.WAITING)
-        first = self._place(scene, tracks, scene.keyframes[-1].pose)
+        first = self._place(scene, tracks, scene.poses[-1])
         if first is None:
             return Sighting(Event.WAITING)
-        self._map = scene
+        self.map = scene
         self._motion = _Motion(first.pose, tracks.t_ns)
         self._placed_ns = tracks.t_ns
         self._known_at_keyframe = len(first.ids)
         return Sighting(Event.BEGUN, first)
 
     def _follow(self, scene: VisionMap, tracks: FrameTracks, R_CbC: Float) -> Sighting:
-        if np.isin(scene.ids, tracks.ids).sum() < _MIN_POINTS:
+        if np.isin(scene.ids[scene.known], tracks.ids).sum() < _MIN_POINTS:
             return self.restart(tracks)  # tracks that ended never come back
         guess = self._motion.predicted(tracks.t_ns, R_CbC)
         placement = self._place(scene, tracks, guess)
@@ -154,22 +150,23 @@ class VisualOdometry:
         return Placement(found.pose, found.cov, ids[found.inliers], p_VF[found.inliers])
 
     def _keyframe_is_due(self, scene: VisionMap, tracks: FrameTracks, placement: Placement) -> bool:
-        last = scene.keyframes[-1]
         if len(placement.ids) < _FEW_LEFT * self._known_at_keyframe:
             return True
-        _, i, j = np.intersect1d(last.ids, tracks.ids, assume_unique=True, return_indices=True)
-        moved = median_parallax(last.xy[i], tracks.xy_normalised[j], last.pose.R_VC.T @ placement.pose.R_VC)
-        return moved > self._parallax
+        last = scene.seen[:, -1]
+        _, i, j = np.intersect1d(scene.ids[last], tracks.ids, assume_unique=True, return_indices=True)
+        turn = scene.poses[-1].R_VC.T @ placement.pose.R_VC
+        return median_parallax(scene.xy_normalised[last, -1][i], tracks.xy_normalised[j], turn) > self._parallax
 
     def _extend(self, scene: VisionMap, tracks: FrameTracks, placement: Placement) -> Placement:
         """Make a keyframe of the frame, triangulate what it shows anew, adjust; where the frame is after that."""
-        outliers = np.setdiff1d(tracks.ids, placement.ids)
-        scene.keep(~np.isin(scene.ids, outliers))
-        scene.add_keyframe(Keyframe.of(placement.pose, tracks), self._options.keyframes)
+        scene.known &= ~np.isin(scene.ids, np.setdiff1d(tracks.ids, placement.ids))
+        scene.add_keyframe(placement.pose, tracks)
+        if len(scene.poses) > self._options.keyframes:
+            scene.forget_oldest()
         scene.triangulate(self._sigma)
-        held = max(len(scene.keyframes) - _ADJUSTED, _LEAST_HELD)
+        held = max(len(scene.poses) - _ADJUSTED, _LEAST_HELD)
         adjust(scene, self._sigma, held, _STEPS)
-        placement = self._place(scene, tracks, scene.keyframes[-1].pose) or placement
+        placement = self._place(scene, tracks, scene.poses[-1]) or placement
         self._known_at_keyframe = len(placement.ids)
         return placement
 
@@ -223,33 +220,39 @@ class Bootstrap:
         pose = relative_pose(xy_1, xy_2, self._sigma, MEDIAN_DEPTH * self._parallax)
         if pose is None or np.linalg.norm(so3.log(pose.R_VC.T @ self._R_RC[-1])) > _LARGEST_TURN_ERROR_RAD:
             return None
-        scene = VisionMap([Keyframe.of(VisionPose(np.eye(3), np.zeros(3)), reference), Keyframe.of(pose, newest)])
+        scene = VisionMap()
+        scene.add_keyframe(VisionPose(np.eye(3), np.zeros(3)), reference)
+        scene.add_keyframe(pose, newest)
         scene.triangulate(self._sigma)
-        if len(scene.ids) < max(_FEWEST_MADE, _LEAST_EXPLAINED * len(i)):
+        enough = max(_FEWEST_MADE, _LEAST_EXPLAINED * len(i))
+        if scene.known.sum() < enough:
             return None
-        if not self._fill_in(scene, pose):
+        whole = self._filled_in(scene)
+        if whole is None:
             return None
-        _set_unit(scene)
-        adjust(scene, self._sigma, 1, _BOOTSTRAP_STEPS)
-        if len(scene.ids) < max(_FEWEST_MADE, _LEAST_EXPLAINED * len(i)):
+        _set_unit(whole)
+        adjust(whole, self._sigma, 1, _BOOTSTRAP_STEPS)
+        if whole.known.sum() < enough:
             return None
-        _set_unit(scene)
-        return scene
+        _set_unit(whole)
+        return whole
 
-    def _fill_in(self, scene: VisionMap, newest: VisionPose) -> bool:
-        """Put some of the frames between among the keyframes; False where one does not agree with the map."""
-        count = len(self._frames)
-        between = np.unique(np.linspace(0, count - 1, _BETWEEN + 2).round().astype(int))[1:-1]
-        filled = [scene.keyframes[0]]
-        for k in between:
+    def _filled_in(self, scene: VisionMap) -> VisionMap | None:
+        """``scene`` with some of the frames between its two keyframes; None where one does not agree with it."""
+        last = len(self._frames) - 1
+        first_pose, last_pose = scene.poses
+        whole = VisionMap()
+        whole.add_keyframe(first_pose, self._frames[0])
+        for k in np.unique(np.linspace(0, last, _BETWEEN + 2).round().astype(int))[1:-1]:
             _, p_VF, xy = scene.seen_in(self._frames[k])
-            guess = VisionPose(self._R_RC[k], newest.p_VC * (k / (count - 1)))
-            found = resect(guess, p_VF, xy, self._sigma)
+            found = resect(VisionPose(self._R_RC[k], last_pose.p_VC * (k / last)), p_VF, xy, self._sigma)
             if found is None or found.inliers.mean() < _LEAST_AGREEING:
-                return False
-            filled.append(Keyframe.of(found.pose, self._frames[k]))
-        scene.keyframes = [*filled, scene.keyframes[-1]]
-        return True
+                return None
+            whole.add_keyframe(found.pose, self._frames[k])
+        whole.add_keyframe(last_pose, self._frames[-1])
+        whole.known = np.isin(whole.ids, scene.ids[scene.known])
+        whole.p_VF[whole.known] = scene.p_VF[scene.known]
+        return whole
 
 
 def _enough_in_common(reference: FrameTracks, tracks: FrameTracks) -> bool:
@@ -273,8 +276,6 @@ def relative_pose(xy_1: Float, xy_2: Float, sigma: float, baseline: float) -> Vi
 
 def _set_unit(scene: VisionMap) -> None:
     """Stretch the map so that the median depth in the newest keyframe is ``MEDIAN_DEPTH``."""
-    newest = scene.keyframes[-1].pose
-    depth = (scene.p_VF - newest.p_VC) @ newest.R_VC[:, 2]
-    stretch = MEDIAN_DEPTH / float(np.median(depth))
-    scene.p_VF = stretch * scene.p_VF
-    scene.keyframes = [replace(k, pose=VisionPose(k.pose.R_VC, stretch * k.pose.p_VC)) for k in scene.keyframes]
+    newest = scene.poses[-1]
+    depth = (scene.p_VF[scene.known] - newest.p_VC) @ newest.R_VC[:, 2]
+    scene.stretch(MEDIAN_DEPTH / float(np.median(depth)))
