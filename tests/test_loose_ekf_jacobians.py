@@ -12,7 +12,6 @@ from vioframe.geometry import so3
 from vioframe.simulation import simulated_sequence
 from vioframe.types import DP, DTHETA, ImuSegment, NavState, g_W
 from vioframe_loose_ekf.fusion import Fusion
-from vioframe_loose_ekf.resection import reproject
 from vioframe_loose_ekf.state import DP_WA, DTHETA_WV, IMU, LOG_SCALE, SIZE, FilterState, VisionPose
 
 CAMERA = CALIBRATION.cameras[0]
@@ -54,25 +53,6 @@ def test_the_pose_jacobian_is_the_derivative_on_the_manifold(seed):
 
     numeric = np.column_stack([(moved(d) - moved(-d)) / (2 * STEP) for d in STEP * np.eye(SIZE)])
     np.testing.assert_allclose(state.pose_jacobian(CAMERA), numeric, atol=1e-7)
-
-
-@SEEDS
-def test_the_reprojection_jacobian_is_the_derivative_on_the_manifold(seed):
-    rng = np.random.default_rng(seed)
-    R, p = so3.exp(rng.normal(size=3)), rng.normal(size=3)
-    p_VF = p + R @ np.array([0.5, -0.3, 4.0])
-    sigma = 0.002
-
-    def error(d):
-        e, J = np.empty(2), np.empty((2, 6))
-        assert reproject(R @ so3.exp(d[:3]), p + d[3:6], p_VF + d[6:], np.array([0.1, 0.0]), sigma, e, J)
-        return e, J
-
-    e, J = error(np.zeros(9))
-    numeric = np.column_stack([(error(d)[0] - error(-d)[0]) / (2 * STEP) for d in STEP * np.eye(9)])
-    np.testing.assert_allclose(np.hstack([J, -J[:, 3:]]), numeric, rtol=1e-6, atol=1e-4)
-    np.testing.assert_allclose(e * sigma, [0.125 - 0.1, -0.075], atol=1e-12)
-    assert not reproject(R, p, p - R[:, 2], np.zeros(2), sigma, e, J)
 
 
 @SEEDS

@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vioframe.geometry import so3
+from vioframe.geometry.resection import resect
 from vioframe.types import Float, Image, Int
 from vioframe_pose_graph.keyframes import Keyframe
 
@@ -31,8 +31,8 @@ _LEVELS, _SCALE_FACTOR, _FAST_THRESHOLD = 4, 1.3, 12
 _PATCH_PX = 31
 # Sine of the angle between the optical axis and the vertical below which the world's x axis says what is up.
 _STEEP = 0.35
-_ITERATIONS = 5
-_SIGMA_TURN, _SIGMA_M = np.radians(1.0), 0.03
+# How well the odometry knows its camera against what it sees: to a degree, and to 3 cm.
+_PRIOR = np.repeat([np.radians(1.0), 0.03], 3) ** -2.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -76,10 +76,8 @@ def describe(keyframe: Keyframe, orb: cv2.ORB, sigma_px: float) -> tuple[Place, 
     p_WF = np.where(which[:, None] >= 0, keyframe.p_WF[which], np.nan)
     known = np.flatnonzero(np.isfinite(p_WF[:, 0]))
     sigma = sigma_px / camera.focal_px
-    R_WC, p_WC, fits = resect(
-        p_WF[known], xy_normalised[known], keyframe.R_WC, keyframe.p_WC, sigma, _MAX_SIGMAS * sigma
-    )
-    p_WF[known[~fits]] = np.nan
+    R_WC, p_WC, _, squared = resect(keyframe.R_WC, keyframe.p_WC, p_WF[known], xy_normalised[known], sigma, 1.0, _PRIOR)
+    p_WF[known[squared > _MAX_SIGMAS**2]] = np.nan
     p_WB_seen = state.p_WB + p_WC - keyframe.p_WC
     place = Place(state.t_ns, keyframe.segment, state.R_WB, state.p_WB, p_WB_seen, R_WC, p_WC)
     return place, View(xy_normalised.astype(np.float32), p_WF.astype(np.float32), descriptors)
@@ -108,45 +106,3 @@ def image_angle_deg(R_WC: Float) -> float:
     """
     direction_C = R_WC[2] if np.hypot(R_WC[2, 0], R_WC[2, 1]) > _STEEP else R_WC[0]
     return float(np.degrees(np.arctan2(-direction_C[1], -direction_C[0])))
-
-
-def reprojection(p_WF: Float, xy: Float, R_WC: Float, p_WC: Float) -> tuple[Float, Float]:
-    """(M, 2) on the z = 1 plane, and (M, 2, 6) their derivatives by [turn, p_WC]; NaN for points behind the camera.
-
-    The camera is perturbed as ``R_WC <- R_WC Exp(turn)``.
-    """
-    p_C = (p_WF - p_WC) @ R_WC
-    there, J = projected(p_C, np.concatenate([so3.hat(p_C), np.broadcast_to(-R_WC.T, (len(p_C), 3, 3))], axis=2))
-    return there - xy, J
-
-
-def projected(p_C: Float, J_C: Float) -> tuple[Float, Float]:
-    """Points (M, 3) on the z = 1 plane, (M, 2), and from the points' derivatives (M, 3, n) those there, (M, 2, n).
-
-    NaN for points behind the camera.
-    """
-    z = np.where(p_C[:, 2] > 0.0, p_C[:, 2], np.nan)
-    xy = p_C[:, :2] / z[:, None]
-    return xy, (J_C[:, :2] - xy[:, :, None] * J_C[:, 2:]) / z[:, None, None]
-
-
-def resect(
-    p_WF: Float, xy: Float, R_WC: Float, p_WC: Float, sigma: float, tolerance: float
-) -> tuple[Float, Float, NDArray[np.bool_]]:
-    """The camera's pose that fits the landmarks (M, 3) seen at ``xy`` (M, 2), and (M,) which of them then fit.
-
-    The pose given is the prior. A landmark is seen to ``sigma``, counts less the further it lies off (Cauchy), and fits
-    if it lies within ``tolerance``; both are lengths on the z = 1 plane.
-    """
-    R, p = R_WC, p_WC
-    prior = np.repeat([_SIGMA_TURN**-2, _SIGMA_M**-2], 3)
-    for _ in range(_ITERATIONS):
-        r, J = reprojection(p_WF, xy, R, p)
-        r, J = np.nan_to_num(r), np.nan_to_num(J)
-        w = 1.0 / (sigma**2 + np.sum(r**2, axis=1))
-        off = np.concatenate([so3.log(R_WC.T @ R), p - p_WC])
-        H = np.einsum("m,mki,mkj->ij", w, J, J) + np.diag(prior)
-        step = np.linalg.solve(H, -np.einsum("m,mki,mk->i", w, J, r) - prior * off)
-        R, p = R @ so3.exp(step[:3]), p + step[3:]
-    error = np.linalg.norm(reprojection(p_WF, xy, R, p)[0], axis=1)
-    return R, p, np.asarray(error < tolerance)

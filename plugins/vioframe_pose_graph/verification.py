@@ -13,11 +13,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from vioframe.geometry import so3
+from vioframe.geometry.resection import projected
 from vioframe.geometry.so3 import rotation_z, yaw_of
 from vioframe.geometry.two_view import rays
 from vioframe.types import Float, Int
 from vioframe_pose_graph.matching import match
-from vioframe_pose_graph.place import Place, View, projected
+from vioframe_pose_graph.place import Place, View
 
 REPROJECTION_PX = 3.0
 """Within which a point of one keyframe must be seen in the other to support a loop."""
