@@ -1,15 +1,14 @@
 """The extended Kalman filter: filterpy holds the error state and its covariance, the mean lives on the manifold.
 
-The error is zero whenever nothing is under way: each update leaves it in filterpy's ``x``, from where it moves the mean
-and is set to zero again. Predictions and changes of variables are filterpy's ``predict`` with the F and Q of what
-happened, so that every change of the covariance goes through the library's equations.
+The error is zero whenever nothing is under way, so what is measured, and its derivative, are taken at the mean. Each
+update leaves the error in filterpy's ``x``, from where it moves the mean and is set to zero again. Predictions and
+changes of variables are filterpy's ``predict`` with the F and Q of what happened, so that every change of the
+covariance goes through the library's equations.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 from filterpy.kalman import ExtendedKalmanFilter
@@ -18,10 +17,8 @@ from vioframe.errors import DivergedError
 from vioframe.estimation.inertial.propagation import propagate
 from vioframe.estimation.standstill import STANDSTILL_GATE, Standstill
 from vioframe.geometry import so3
-from vioframe.types import DBA, DBG, DP, DTHETA, Calibration, Float, ImuNoise, ImuSegment, NavState
-from vioframe_loose_ekf import measurement
-from vioframe_loose_ekf.measurement import VisionPose
-from vioframe_loose_ekf.state import DP_WA, DTHETA_WV, IMU, LOG_SCALE, SIZE, FilterState
+from vioframe.types import DBA, DBG, DP, DTHETA, CameraOnBody, Float, ImuNoise, ImuSegment, NavState
+from vioframe_loose_ekf.state import DP_WA, DTHETA_WV, IMU, LOG_SCALE, SIZE, FilterState, VisionPose
 
 # A new vision frame's scale may be wrong by a factor of two before the first pose says what it is.
 _NEW_LOG_SCALE_SIGMA = 0.7
@@ -30,10 +27,10 @@ _LEAST_AGREEMENT = 0.3
 
 
 class Fusion:
-    """Mean and covariance of body and vision frame; ``calibration`` is that of the sensors."""
+    """Mean and covariance of body and vision frame."""
 
-    def __init__(self, nav: NavState, calibration: Calibration) -> None:
-        self._calibration = calibration
+    def __init__(self, nav: NavState, camera: CameraOnBody) -> None:
+        self._camera = camera
         self.state = FilterState.begin(nav)
         self._kalman = ExtendedKalmanFilter(dim_x=SIZE, dim_z=6)
         self._kalman.x = np.zeros(SIZE)
@@ -78,7 +75,7 @@ class Fusion:
         self._predict(np.eye(SIZE), Q)
 
     def _tie(self, measured: VisionPose, cov: Float) -> None:
-        s, R_BC, p_BC = self.state, self._calibration.cameras[0].R_BC, self._calibration.cameras[0].p_BC
+        s, R_BC, p_BC = self.state, self._camera.R_BC, self._camera.p_BC
         R_VC = measured.R_VC
         R_WV = s.R_WB @ R_BC @ R_VC.T
         self.state = replace(s, R_WV=R_WV, p_WA=s.p_WB + s.R_WB @ p_BC, p_VA=measured.p_VC)
@@ -94,7 +91,7 @@ class Fusion:
     def begin_scale(self, p_VC: Float) -> bool:
         """Take the scale from how far the readings say the camera has come; False where they say nothing like it."""
         s = self.state
-        p_AC = s.R_WV.T @ (s.p_WB + s.R_WB @ self._calibration.cameras[0].p_BC - s.p_WA)
+        p_AC = s.R_WV.T @ (s.p_WB + s.R_WB @ self._camera.p_BC - s.p_WA)
         moved_V = p_VC - s.p_VA
         along = float(p_AC @ moved_V) / float(moved_V @ moved_V)
         if along * np.linalg.norm(moved_V) < _LEAST_AGREEMENT * np.linalg.norm(p_AC):
@@ -102,11 +99,11 @@ class Fusion:
         self.state = replace(s, log_scale=-float(np.log(along)))
         return True
 
-    def move_anchor(self, p_VA: Float, drift: Float) -> None:
-        """Tie V to W at its point ``p_VA`` (3,) from now on; V has drifted by ``drift`` (7,), standard deviations.
+    def move_anchor(self, p_VA: Float, drift: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> None:
+        """Tie V to W at its point ``p_VA`` (3,) from now on.
 
-        The drift is that of [log-scale, rotation, position] about the new anchor; the first two in their own units, the
-        position in units of V.
+        V has drifted by ``drift``, standard deviations of [log-scale, rotation, position] about the new anchor: rad,
+        and units of V.
         """
         s = self.state
         along_W = s.R_WV @ (p_VA - s.p_VA) / s.scale
@@ -115,8 +112,7 @@ class Fusion:
         F[DP_WA, DTHETA_WV] = -s.R_WV @ so3.hat(p_VA - s.p_VA) / s.scale
         self.state = replace(s, p_WA=s.p_WA + along_W, p_VA=p_VA)
         sigma = np.zeros(SIZE)
-        sigma[IMU:] = drift
-        sigma[DP_WA] /= s.scale
+        sigma[LOG_SCALE], sigma[DTHETA_WV], sigma[DP_WA] = drift[0], drift[1], drift[2] / s.scale
         self._predict(F, np.diag(sigma**2))
 
     def update_pose(self, measured: VisionPose, cov: Float, gate: float) -> bool:
@@ -124,32 +120,19 @@ class Fusion:
 
         ``cov`` (6, 6) is the noise of [rotation in the camera, position in V].
         """
-        return self._update(
-            measured,
-            lambda x: measurement.jacobian(self.state.retract(x), self._calibration),
-            lambda x: measurement.predicted_pose(self.state.retract(x), self._calibration),
-            cov,
-            gate,
-            measurement.residual,
-        )
+        residual = measured.beyond(self.state.pose(self._camera))
+        return self._update(residual, self.state.pose_jacobian(self._camera), cov, gate)
 
     def hold_still(self, imu: ImuSegment, noise: ImuNoise) -> bool:
         """Update with the readings of ``imu`` as those of a body at rest, unless they contradict it.
 
         They serve as measurements here, and so do not propagate the pose as well.
         """
-        still = Standstill.over(imu, noise)
-
-        def excess(x: Float) -> Float:
-            s = self.state.retract(x)
-            return -still.residual(s.R_WB, s.v_WB, s.bias_gyro_B, s.bias_accel_B)
-
-        def slope(x: Float) -> Float:
-            H = np.zeros((9, SIZE))
-            H[:, :IMU] = still.jacobian(self.state.retract(x).R_WB)
-            return H
-
-        if not self._update(np.zeros(9), slope, excess, np.diag(still.sigma**2), STANDSTILL_GATE, np.subtract):
+        still, s = Standstill.over(imu, noise), self.state
+        residual = still.residual(s.R_WB, s.v_WB, s.bias_gyro_B, s.bias_accel_B)
+        H = np.zeros((9, SIZE))
+        H[:, :IMU] = still.jacobian(s.R_WB)
+        if not self._update(residual, H, np.diag(still.sigma**2), STANDSTILL_GATE):
             return False
         Q = np.zeros((SIZE, SIZE))
         Q[DBG, DBG] = noise.gyro_walk**2 * imu.duration_s * np.eye(3)
@@ -161,18 +144,10 @@ class Fusion:
         self._kalman.F, self._kalman.Q = F, Q
         self._kalman.predict()
 
-    def _update(
-        self,
-        z: Any,
-        H_of: Callable[[Float], Float],
-        h_of: Callable[[Float], Any],
-        R: Float,
-        gate: float,
-        minus: Callable[[Any, Any], Float],
-    ) -> bool:
+    def _update(self, r: Float, H: Float, R: Float, gate: float) -> bool:
+        """Update with the residual ``r`` (m,) of noise ``R`` (m, m), unless its squared Mahalanobis distance is beyond
+        ``gate``."""
         kalman = self._kalman
-        H = H_of(kalman.x)
-        r = minus(z, h_of(kalman.x))
         S = H @ kalman.P @ H.T + R
         try:
             distance = float(r @ np.linalg.solve(S, r))
@@ -182,7 +157,7 @@ class Fusion:
             raise DivergedError("the innovation covariance is not positive definite")
         if distance > gate:
             return False
-        kalman.update(z, H_of, h_of, R=R, residual=minus)
+        kalman.update(r, lambda _: H, lambda _: np.zeros(len(r)), R=R)
         kalman.P = 0.5 * (kalman.P + kalman.P.T)
         self.state = self.state.retract(kalman.x)
         kalman.x = np.zeros(SIZE)

@@ -14,26 +14,27 @@ explain nearly all tracks in all frames, and turn as the gyroscope says.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from enum import Enum, auto
 
 import numpy as np
 
 from vioframe.geometry import so3
-from vioframe.geometry.two_view import rays
+from vioframe.geometry.two_view import median_parallax
 from vioframe.types import Calibration, Float, FrameTracks, Int
-from vioframe_loose_ekf.measurement import VisionPose
 from vioframe_loose_ekf.options import LooseEkfOptions
 from vioframe_loose_ekf.resection import resect
-from vioframe_loose_ekf.vision_map import Keyframe, VisionMap, adjust
+from vioframe_loose_ekf.state import VisionPose
+from vioframe_loose_ekf.vision_map import VisionMap, adjust
 
 # Known points that must be in sight, and that must agree on where the camera is; and what part of those in sight.
 _MIN_POINTS, _LEAST_INLIERS = 10, 0.3
 # Part of the known points of the last keyframe below which a new one is due.
 _FEW_LEFT = 0.6
 _GIVE_UP_S = 0.5
-# Keyframes that bundle adjustment must leave alone: fewer do not hold the scale.
-_LEAST_HELD = 2
+# Local bundle adjustment: it moves the newest keyframes, in a few steps at most, and leaves the others alone; fewer
+# than two do not hold the scale.
+_ADJUSTED, _STEPS, _LEAST_HELD = 5, 4, 2
 # Tracks that the reference and the newest frame must share, and what part of the reference's; points that must come of
 # them.
 _MIN_COMMON, _LEAST_COMMON, _FEWEST_MADE = 15, 0.3, 12
@@ -44,12 +45,7 @@ _LARGEST_TURN_ERROR_RAD = 0.05
 _BETWEEN = 3
 MEDIAN_DEPTH = 5.0
 """What the unit of V is made such that it is; :func:`~vioframe.geometry.triangulation.triangulate` trusts 0.1 to 60."""
-_ADJUSTMENTS = 10
-# Of a map of two views, which bends as a whole: rotation in units of a pixel's angle, and direction of the first way in
-# units of pixel noise by parallax. Measured over 120 starts on simulated flights.
-_BIRTH_ROTATION, _BIRTH_DIRECTION = 1.2, 0.7
-_LOOK_BACK_S = 0.5
-"""Over which standstill is recognised."""
+_BOOTSTRAP_STEPS = 10
 
 
 class Event(Enum):
@@ -95,27 +91,23 @@ class VisualOdometry:
         self._sigma = options.pixel_sigma / focal_px
         self._parallax = options.keyframe_parallax_px / focal_px
         self._bootstrap = Bootstrap(self._sigma, options.bootstrap_parallax_px / focal_px)
-        self._map: VisionMap | None = None
+        self.map: VisionMap | None = None
+        """Keyframes and points; None while there are none."""
         self._motion = _Motion(VisionPose(np.eye(3), np.zeros(3)), 0)
         self._placed_ns = 0
         self._known_at_keyframe = 0
 
-    @property
-    def map(self) -> VisionMap | None:
-        """Keyframes and points; None while there are none."""
-        return self._map
-
     def restart(self, tracks: FrameTracks) -> Sighting:
         """Forget the map; a new vision frame begins with ``tracks``."""
-        self._map = None
+        self.map = None
         self._bootstrap.begin(tracks)
         return Sighting(Event.REFERENCE)
 
     def track(self, tracks: FrameTracks, R_CbC: Float) -> Sighting:
         """Take in a frame, turned by ``R_CbC`` (3, 3) from the one before as far as anybody knows."""
-        if self._map is None:
+        if self.map is None:
             return self._begin(tracks, R_CbC)
-        return self._follow(self._map, tracks, R_CbC)
+        return self._follow(self.map, tracks, R_CbC)
 
     def _begin(self, tracks: FrameTracks, R_CbC: Float) -> Sighting:
         if not self._bootstrap.add(tracks, R_CbC):
@@ -123,17 +115,17 @@ class VisualOdometry:
         scene = self._bootstrap.attempt()
         if scene is None:
             return Sighting(Event.WAITING)
-        first = self._place(scene, tracks, scene.keyframes[-1].pose)
+        first = self._place(scene, tracks, scene.poses[-1])
         if first is None:
             return Sighting(Event.WAITING)
-        self._map = scene
+        self.map = scene
         self._motion = _Motion(first.pose, tracks.t_ns)
         self._placed_ns = tracks.t_ns
         self._known_at_keyframe = len(first.ids)
         return Sighting(Event.BEGUN, first)
 
     def _follow(self, scene: VisionMap, tracks: FrameTracks, R_CbC: Float) -> Sighting:
-        if np.isin(scene.ids, tracks.ids).sum() < _MIN_POINTS:
+        if np.isin(scene.ids[scene.known], tracks.ids).sum() < _MIN_POINTS:
             return self.restart(tracks)  # tracks that ended never come back
         guess = self._motion.predicted(tracks.t_ns, R_CbC)
         placement = self._place(scene, tracks, guess)
@@ -158,23 +150,23 @@ class VisualOdometry:
         return Placement(found.pose, found.cov, ids[found.inliers], p_VF[found.inliers])
 
     def _keyframe_is_due(self, scene: VisionMap, tracks: FrameTracks, placement: Placement) -> bool:
-        last = scene.keyframes[-1]
         if len(placement.ids) < _FEW_LEFT * self._known_at_keyframe:
             return True
-        _, i, j = np.intersect1d(last.ids, tracks.ids, assume_unique=True, return_indices=True)
-        moved = median_parallax(last.xy[i], tracks.xy_normalised[j], last.pose.R_VC.T @ placement.pose.R_VC)
-        return moved > self._parallax
+        last = scene.seen[:, -1]
+        _, i, j = np.intersect1d(scene.ids[last], tracks.ids, assume_unique=True, return_indices=True)
+        turn = scene.poses[-1].R_VC.T @ placement.pose.R_VC
+        return median_parallax(scene.xy_normalised[last, -1][i], tracks.xy_normalised[j], turn) > self._parallax
 
     def _extend(self, scene: VisionMap, tracks: FrameTracks, placement: Placement) -> Placement:
         """Make a keyframe of the frame, triangulate what it shows anew, adjust; where the frame is after that."""
-        options = self._options
-        outliers = np.setdiff1d(tracks.ids, placement.ids)
-        scene.keep(~np.isin(scene.ids, outliers))
-        scene.add_keyframe(Keyframe.of(placement.pose, tracks), options.keyframes)
+        scene.known &= ~np.isin(scene.ids, np.setdiff1d(tracks.ids, placement.ids))
+        scene.add_keyframe(placement.pose, tracks)
+        if len(scene.poses) > self._options.keyframes:
+            scene.forget_oldest()
         scene.triangulate(self._sigma)
-        held = max(len(scene.keyframes) - options.adjusted_keyframes, _LEAST_HELD)
-        adjust(scene, self._sigma, held, options.adjustments)
-        placement = self._place(scene, tracks, scene.keyframes[-1].pose) or placement
+        held = max(len(scene.poses) - _ADJUSTED, _LEAST_HELD)
+        adjust(scene, self._sigma, held, _STEPS)
+        placement = self._place(scene, tracks, scene.poses[-1]) or placement
         self._known_at_keyframe = len(placement.ids)
         return placement
 
@@ -228,48 +220,44 @@ class Bootstrap:
         pose = relative_pose(xy_1, xy_2, self._sigma, MEDIAN_DEPTH * self._parallax)
         if pose is None or np.linalg.norm(so3.log(pose.R_VC.T @ self._R_RC[-1])) > _LARGEST_TURN_ERROR_RAD:
             return None
-        scene = VisionMap([Keyframe.of(VisionPose(np.eye(3), np.zeros(3)), reference), Keyframe.of(pose, newest)])
+        scene = VisionMap()
+        scene.add_keyframe(VisionPose(np.eye(3), np.zeros(3)), reference)
+        scene.add_keyframe(pose, newest)
         scene.triangulate(self._sigma)
-        if len(scene.ids) < max(_FEWEST_MADE, _LEAST_EXPLAINED * len(i)):
+        enough = max(_FEWEST_MADE, _LEAST_EXPLAINED * len(i))
+        if scene.known.sum() < enough:
             return None
-        if not self._fill_in(scene, pose):
+        whole = self._filled_in(scene)
+        if whole is None:
             return None
-        _set_unit(scene)
-        adjust(scene, self._sigma, 1, _ADJUSTMENTS)
-        if len(scene.ids) < max(_FEWEST_MADE, _LEAST_EXPLAINED * len(i)):
+        _set_unit(whole)
+        adjust(whole, self._sigma, 1, _BOOTSTRAP_STEPS)
+        if whole.known.sum() < enough:
             return None
-        _set_unit(scene)
-        return scene
+        _set_unit(whole)
+        return whole
 
-    def _fill_in(self, scene: VisionMap, newest: VisionPose) -> bool:
-        """Put some of the frames between among the keyframes; False where one does not agree with the map."""
-        count = len(self._frames)
-        between = np.unique(np.linspace(0, count - 1, _BETWEEN + 2).round().astype(int))[1:-1]
-        filled = [scene.keyframes[0]]
-        for k in between:
+    def _filled_in(self, scene: VisionMap) -> VisionMap | None:
+        """``scene`` with some of the frames between its two keyframes; None where one does not agree with it."""
+        last = len(self._frames) - 1
+        first_pose, last_pose = scene.poses
+        whole = VisionMap()
+        whole.add_keyframe(first_pose, self._frames[0])
+        for k in np.unique(np.linspace(0, last, _BETWEEN + 2).round().astype(int))[1:-1]:
             _, p_VF, xy = scene.seen_in(self._frames[k])
-            guess = VisionPose(self._R_RC[k], newest.p_VC * (k / (count - 1)))
-            found = resect(guess, p_VF, xy, self._sigma)
+            found = resect(VisionPose(self._R_RC[k], last_pose.p_VC * (k / last)), p_VF, xy, self._sigma)
             if found is None or found.inliers.mean() < _LEAST_AGREEING:
-                return False
-            filled.append(Keyframe.of(found.pose, self._frames[k]))
-        scene.keyframes = [*filled, scene.keyframes[-1]]
-        return True
+                return None
+            whole.add_keyframe(found.pose, self._frames[k])
+        whole.add_keyframe(last_pose, self._frames[-1])
+        whole.known = np.isin(whole.ids, scene.ids[scene.known])
+        whole.p_VF[whole.known] = scene.p_VF[scene.known]
+        return whole
 
 
 def _enough_in_common(reference: FrameTracks, tracks: FrameTracks) -> bool:
     common = np.isin(reference.ids, tracks.ids).sum()
     return bool(common >= max(_MIN_COMMON, _LEAST_COMMON * len(reference.ids)))
-
-
-def median_parallax(xy_1: Float, xy_2: Float, R_C1C2: Float) -> float:
-    """Median motion of tracks (N, 2) on the first view's z = 1 plane, with the turn ``R_C1C2`` (3, 3) taken out."""
-    turned = rays(xy_2) @ R_C1C2.T
-    ahead = turned[:, 2] > 0.1
-    if not ahead.any():
-        return 0.0
-    moved = turned[ahead, :2] / turned[ahead, 2:] - xy_1[ahead]
-    return float(np.median(np.linalg.norm(moved, axis=1)))
 
 
 def relative_pose(xy_1: Float, xy_2: Float, sigma: float, baseline: float) -> VisionPose | None:
@@ -288,44 +276,6 @@ def relative_pose(xy_1: Float, xy_2: Float, sigma: float, baseline: float) -> Vi
 
 def _set_unit(scene: VisionMap) -> None:
     """Stretch the map so that the median depth in the newest keyframe is ``MEDIAN_DEPTH``."""
-    newest = scene.keyframes[-1].pose
-    depth = (scene.p_VF - newest.p_VC) @ newest.R_VC[:, 2]
-    stretch = MEDIAN_DEPTH / float(np.median(depth))
-    scene.p_VF = stretch * scene.p_VF
-    scene.keyframes = [replace(k, pose=VisionPose(k.pose.R_VC, stretch * k.pose.p_VC)) for k in scene.keyframes]
-
-
-@dataclass(frozen=True, slots=True)
-class Drifts:
-    """Each a (7,) array of standard deviations: [log-scale, rotation, position] about the anchor.
-
-    Rotation is in rad, position in units of V.
-    """
-
-    options: LooseEkfOptions
-    focal_px: float
-
-    def at_birth(self, first: VisionPose) -> Float:
-        """Of a new vision frame whose first pose is ``first``."""
-        o = self.options
-        direction = _BIRTH_DIRECTION * o.pixel_sigma / o.bootstrap_parallax_px
-        return _stacked(0.0, _BIRTH_ROTATION * o.pixel_sigma / self.focal_px, direction * _length(first.p_VC))
-
-    def since(self, p_VA: Float, keyframe: VisionPose) -> Float:
-        """From the last keyframe at ``p_VA`` (3,) to ``keyframe``."""
-        o = self.options
-        way = _length(keyframe.p_VC - p_VA)
-        return _stacked(o.drift_scale, float(np.deg2rad(o.drift_rotation_deg)), o.drift_position * way)
-
-    def at_rest(self, duration_s: float) -> Float:
-        """While the body passed for still: a picture that creeps less than is noticed is not followed."""
-        unnoticed = self.options.standstill_disparity_px / self.focal_px * (duration_s / _LOOK_BACK_S) ** 0.5
-        return _stacked(0.0, unnoticed, unnoticed * MEDIAN_DEPTH)
-
-
-def _stacked(scale: float, rotation: float, position: float) -> Float:
-    return np.repeat([scale, rotation, position], [1, 3, 3])
-
-
-def _length(v: Float) -> float:
-    return float(np.linalg.norm(v))
+    newest = scene.poses[-1]
+    depth = (scene.p_VF[scene.known] - newest.p_VC) @ newest.R_VC[:, 2]
+    scene.stretch(MEDIAN_DEPTH / float(np.median(depth)))

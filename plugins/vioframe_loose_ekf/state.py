@@ -1,8 +1,14 @@
-"""What the filter estimates: the body, and the vision frame's scale and place in the world.
+"""What the filter estimates: the body, and the vision frame's scale and place in the world; and what follows from it.
 
 V is the frame of the visual odometry: right in shape, but of unknown scale, orientation and position. Its map is new
 at one end and gone at the other, so what V is drifts; it is therefore tied to the world at an *anchor*, a point
 ``p_VA`` of V near the camera, rather than at its origin, which may lie a hundred metres back.
+
+What the visual odometry should say of the camera is eq. (13)-(14) of Weiss et al. (2012), with the anchor in place of
+V's origin and the error of the rotation on the right:
+
+    p_VC = p_VA + lambda R_WV^T (p_WB + R_WB p_BC - p_WA)
+    R_VC = R_WV^T R_WB R_BC
 """
 
 from __future__ import annotations
@@ -12,7 +18,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from vioframe.geometry import so3
-from vioframe.types import DBA, DBG, DP, DTHETA, DV, Float, NavState
+from vioframe.types import DBA, DBG, DP, DTHETA, DV, CameraOnBody, Float, NavState
 
 # The error state: [dtheta dp dv dbg dba] of the body, then what ties V to W.
 IMU = 15
@@ -20,6 +26,18 @@ LOG_SCALE = slice(15, 16)
 DTHETA_WV = slice(16, 19)
 DP_WA = slice(19, 22)
 SIZE = 22
+
+
+@dataclass(frozen=True, slots=True)
+class VisionPose:
+    """Pose of the camera in V: ``R_VC`` (3, 3) and ``p_VC`` (3,) in V's units."""
+
+    R_VC: Float
+    p_VC: Float
+
+    def beyond(self, other: VisionPose) -> Float:
+        """(6,) [rotation, position] from ``other`` to this; the rotation in the axes of the other camera, rad."""
+        return np.concatenate([so3.log(other.R_VC.T @ self.R_VC), self.p_VC - other.p_VC])
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,3 +87,23 @@ class FilterState:
     def in_world(self, p_V: Float) -> Float:
         """Points (N, 3) of V in W, m."""
         return self.p_WA + (p_V - self.p_VA) @ self.R_WV.T / self.scale
+
+    def pose(self, camera: CameraOnBody) -> VisionPose:
+        """Of ``camera`` in V."""
+        p_WC = self.p_WB + self.R_WB @ camera.p_BC
+        R_VB = self.R_WV.T @ self.R_WB
+        return VisionPose(R_VB @ camera.R_BC, self.p_VA + self.scale * self.R_WV.T @ (p_WC - self.p_WA))
+
+    def pose_jacobian(self, camera: CameraOnBody) -> Float:
+        """(6, 22) of :meth:`pose`, in the tangent space of :meth:`VisionPose.beyond`, by the error state."""
+        scale, R_VW = self.scale, self.R_WV.T
+        p_AC = R_VW @ (self.p_WB + self.R_WB @ camera.p_BC - self.p_WA)  # m, in the axes of V
+        H = np.zeros((6, SIZE))
+        H[0:3, DTHETA] = camera.R_BC.T
+        H[0:3, DTHETA_WV] = -(R_VW @ self.R_WB @ camera.R_BC).T
+        H[3:6, DTHETA] = -scale * R_VW @ self.R_WB @ so3.hat(camera.p_BC)
+        H[3:6, DP] = scale * R_VW
+        H[3:6, LOG_SCALE] = scale * p_AC[:, None]
+        H[3:6, DTHETA_WV] = scale * so3.hat(p_AC)
+        H[3:6, DP_WA] = -scale * R_VW
+        return H

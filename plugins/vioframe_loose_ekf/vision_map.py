@@ -8,18 +8,18 @@ for. Factors and solver are those of :mod:`vioframe.estimation.factors`, of whos
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-
 import numpy as np
 
+from vioframe.arrays import Bool
 from vioframe.estimation.factors.inertial import ImuFactors, StateArrays
 from vioframe.estimation.factors.landmarks import in_hosts, positions
 from vioframe.estimation.factors.problem import Prior, Problem, Variables, pose_columns
 from vioframe.estimation.factors.reprojection import CALIBRATION_SIZE, Calibrated, Sightings
 from vioframe.estimation.factors.solver import solve
+from vioframe.estimation.factors.tracks import TrackTable
 from vioframe.geometry.triangulation import triangulate
 from vioframe.types import Float, FrameTracks, Int
-from vioframe_loose_ekf.measurement import VisionPose
+from vioframe_loose_ekf.state import VisionPose
 
 # A track is triangulated from rays that are this far apart: less tells little of its depth.
 _LEAST_ANGLE_RAD = 0.015
@@ -31,81 +31,57 @@ _WIDTH = 2.0
 _UNSEEING = 1e-6
 
 
-@dataclass(frozen=True, slots=True)
-class Keyframe:
-    """A frame of the map: the camera's ``pose`` in V, and what it saw, ``ids`` (N,) ascending at ``xy`` (N, 2)."""
+class VisionMap(TrackTable):
+    """The tracks of the keyframes, whose cameras' ``poses`` are in V, the oldest first.
 
-    pose: VisionPose
-    ids: Int
-    xy: Float
+    Tracks that are ``known`` (F,) have a point at ``p_VF`` (F, 3).
+    """
 
-    @classmethod
-    def of(cls, pose: VisionPose, tracks: FrameTracks) -> Keyframe:
-        order = np.argsort(tracks.ids)
-        return cls(pose, tracks.ids[order], tracks.xy_normalised[order])
+    _by_track = ("ids", "known", "p_VF")
 
-
-class VisionMap:
-    """``keyframes``, the oldest first; points ``ids`` (L,) ascending at ``p_VF`` (L, 3)."""
-
-    def __init__(self, keyframes: list[Keyframe]) -> None:
-        self.keyframes = keyframes
-        self.ids: Int = np.empty(0, np.int64)
+    def __init__(self) -> None:
+        super().__init__()
+        self.poses: list[VisionPose] = []
+        self.known: Bool = np.empty(0, dtype=bool)
         self.p_VF: Float = np.empty((0, 3))
+
+    def add_keyframe(self, pose: VisionPose, tracks: FrameTracks) -> None:
+        """Append a keyframe; its tracks are known where they were before."""
+        self.add_frame(tracks)
+        self.poses.append(pose)
+
+    def forget_oldest(self) -> None:
+        """Drop the oldest keyframe, and with it the tracks that no other one sees."""
+        self.drop_frame(0)
+        del self.poses[0]
 
     def seen_in(self, tracks: FrameTracks) -> tuple[Int, Float, Float]:
         """The known points among ``tracks``: ids (M,), p_VF (M, 3), and where they are seen, (M, 2) normalised."""
-        ids, known, seen = np.intersect1d(self.ids, tracks.ids, assume_unique=True, return_indices=True)
-        return ids, self.p_VF[known], tracks.xy_normalised[seen]
-
-    def add_keyframe(self, keyframe: Keyframe, most: int) -> None:
-        """Append a keyframe; of more than ``most`` the oldest goes, and with it the points that no other one sees."""
-        self.keyframes = [*self.keyframes, keyframe][-most:]
-        self.keep(np.isin(self.ids, np.concatenate([k.ids for k in self.keyframes])))
-
-    def keep(self, keep: np.ndarray) -> None:
-        """Only the points ``keep`` (L,)."""
-        self.ids, self.p_VF = self.ids[keep], self.p_VF[keep]
-
-    def sightings(self, ids: Int) -> Float:
-        """Where each keyframe saw the tracks ``ids`` (L,): (K, L, 2) on the z = 1 plane, NaN where it did not."""
-        xy = np.full((len(self.keyframes), len(ids), 2), np.nan)
-        for k, keyframe in enumerate(self.keyframes):
-            _, column, row = np.intersect1d(ids, keyframe.ids, assume_unique=True, return_indices=True)
-            xy[k, column] = keyframe.xy[row]
-        return xy
-
-    def poses(self) -> tuple[Float, Float]:
-        """R_VC (K, 3, 3) and p_VC (K, 3) of the keyframes."""
-        return np.stack([k.pose.R_VC for k in self.keyframes]), np.stack([k.pose.p_VC for k in self.keyframes])
+        ids, known, seen = np.intersect1d(self.ids[self.known], tracks.ids, assume_unique=True, return_indices=True)
+        return ids, self.p_VF[self.known][known], tracks.xy_normalised[seen]
 
     def triangulate(self, sigma: float) -> None:
         """Points of the tracks in the newest keyframe that have none yet and are seen with enough parallax."""
-        tracks = np.setdiff1d(self.keyframes[-1].ids, self.ids, assume_unique=True)
-        xy = self.sightings(tracks)
-        R_VC, p_VC = self.poses()
-        rays_V = np.concatenate([xy, np.ones((*xy.shape[:2], 1))], axis=2) @ np.swapaxes(R_VC, 1, 2)
+        tracks = np.flatnonzero(self.seen[:, -1] & ~self.known)
+        seen, xy = self.seen[tracks], self.xy_normalised[tracks]
+        R_VC, p_VC = _stacked(self.poses)
+        rays_V = np.concatenate([xy, np.ones((*xy.shape[:2], 1))], axis=2).swapaxes(0, 1) @ np.swapaxes(R_VC, 1, 2)
         rays_V /= np.linalg.norm(rays_V, axis=2, keepdims=True)
-        apart = np.linalg.norm(rays_V - rays_V[-1], axis=2)
-        wide = np.flatnonzero((apart > _LEAST_ANGLE_RAD).any(axis=0))  # NaN is never larger
-        ids, points = [], []
-        for column in wide:
-            views = np.flatnonzero(~np.isnan(apart[:, column]))
-            R, p, seen = R_VC[views], p_VC[views], xy[views, column]
-            trusted, p_VF = triangulate(R, p, seen, sigma)
+        apart = np.linalg.norm(rays_V - rays_V[-1], axis=2).T
+        for row in np.flatnonzero((seen & (apart > _LEAST_ANGLE_RAD)).any(axis=1)):
+            views = np.flatnonzero(seen[row])
+            R, p, there = R_VC[views], p_VC[views], xy[row, views]
+            trusted, p_VF = triangulate(R, p, there, sigma)
             if not trusted:
                 continue
             q = (np.swapaxes(R, 1, 2) @ (p_VF - p)[..., None])[..., 0]
-            if np.linalg.norm(q[:, :2] / q[:, 2:] - seen, axis=1).max() < _LARGEST_ERROR * sigma:
-                ids.append(tracks[column])
-                points.append(p_VF)
-        if ids:
-            self._merge(np.array(ids), np.array(points))
+            if np.linalg.norm(q[:, :2] / q[:, 2:] - there, axis=1).max() < _LARGEST_ERROR * sigma:
+                self.known[tracks[row]], self.p_VF[tracks[row]] = True, p_VF
 
-    def _merge(self, ids: Int, p_VF: Float) -> None:
-        ids, p_VF = np.concatenate([self.ids, ids]), np.concatenate([self.p_VF, p_VF])
-        order = np.argsort(ids)
-        self.ids, self.p_VF = ids[order], p_VF[order]
+    def stretch(self, factor: float) -> None:
+        """Make it ``factor`` times as large."""
+        self.p_VF = factor * self.p_VF
+        self.poses = [VisionPose(pose.R_VC, factor * pose.p_VC) for pose in self.poses]
 
 
 def adjust(scene: VisionMap, sigma: float, held: int, iterations: int) -> None:
@@ -113,13 +89,13 @@ def adjust(scene: VisionMap, sigma: float, held: int, iterations: int) -> None:
 
     ``sigma`` is the noise on the z = 1 plane.
     """
-    xy = np.ascontiguousarray(np.swapaxes(scene.sightings(scene.ids), 0, 1))
-    seen = ~np.isnan(xy[..., 0])
+    rows = np.flatnonzero(scene.known)
+    seen, xy = scene.seen[rows], scene.xy_normalised[rows]
     hosts = seen.argmax(axis=1)
-    R_VC, p_VC = scene.poses()
+    R_VC, p_VC = _stacked(scene.poses)
     states = StateArrays(R_VC, p_VC, *np.zeros((3, len(p_VC), 3)))
     camera = Calibrated(np.eye(3), np.zeros(3))
-    landmarks, in_front = in_hosts(states, camera, hosts, scene.p_VF)
+    landmarks, in_front = in_hosts(states, camera, hosts, scene.p_VF[rows])
     seen &= in_front[:, None]
 
     columns = pose_columns(len(states))[:-CALIBRATION_SIZE]
@@ -130,8 +106,12 @@ def adjust(scene: VisionMap, sigma: float, held: int, iterations: int) -> None:
     problem = Problem(weak, ImuFactors.stack([]), {}, sightings, first_estimates=False)
     x = solve(problem, Variables(states, camera, landmarks), columns[6 * held :], iterations).variables
 
-    poses = zip(scene.keyframes, x.states.R_WB, x.states.p_WB, strict=True)
-    scene.keyframes = [replace(keyframe, pose=VisionPose(R, p)) for keyframe, R, p in poses]
-    scene.p_VF = positions(x.states, camera, hosts, x.landmarks)
+    scene.poses = [VisionPose(R, p) for R, p in zip(x.states.R_WB, x.states.p_WB, strict=True)]
+    scene.p_VF[rows] = positions(x.states, camera, hosts, x.landmarks)
     errors = np.sqrt(2.0) * sightings.errors(x.poses, camera, x.landmarks)
-    scene.keep(in_front & (errors < _LARGEST_ERROR) & (x.landmarks[:, 2] > 0.0))
+    scene.known[rows] = in_front & (errors < _LARGEST_ERROR) & (x.landmarks[:, 2] > 0.0)
+
+
+def _stacked(poses: list[VisionPose]) -> tuple[Float, Float]:
+    """R_VC (K, 3, 3) and p_VC (K, 3)."""
+    return np.stack([pose.R_VC for pose in poses]), np.stack([pose.p_VC for pose in poses])

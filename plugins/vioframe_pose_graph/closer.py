@@ -13,18 +13,16 @@ from time import perf_counter
 
 import numpy as np
 
-from vioframe.geometry import so3
 from vioframe.geometry.so3 import rotation_z, yaw_of
 from vioframe.geometry.trajectory import Trajectory
 from vioframe.types import Calibration, Float, Int, Loop, LoopClosure, Status, Step
-from vioframe_pose_graph.consistency import GATE, Odometry, agreed, measured, within_drift
-from vioframe_pose_graph.graph import Edges, root_of, solve_robustly
-from vioframe_pose_graph.keyframes import KeyframeSelector
+from vioframe_pose_graph.consistency import Odometry, agreed, measured, within_drift
+from vioframe_pose_graph.graph import solve_robustly, wrapped
+from vioframe_pose_graph.keyframes import Keyframe, KeyframeSelector
 from vioframe_pose_graph.matching import DescriptorIndex, match
 from vioframe_pose_graph.options import PoseGraphOptions
-from vioframe_pose_graph.place import Keyframe, Place
+from vioframe_pose_graph.place import Place
 from vioframe_pose_graph.recognition import Recogniser, Sighting
-from vioframe_pose_graph.verification import ransac
 
 
 class PoseGraph:
@@ -72,13 +70,10 @@ class PoseGraph:
         segment = np.array([place.segment for place in places])
         odometry = Odometry.of(t_ns, np.array([place.p_WB for place in places]), segment, self._options)
 
-        i, j, z, turn, cov = measured(sightings)
-        edges, sound = Edges(i, j, z, turn, root_of(cov)), agreed(sightings, odometry, t_ns)
-        trusted = sound & within_drift(sightings, odometry)
+        said = measured(sightings)
+        sound, likely = agreed(said, odometry, t_ns), within_drift(said, odometry)
         accepted = np.zeros(len(sightings), bool)
-        p, yaw, accepted[sound] = solve_robustly(
-            odometry.p, odometry.edges(), edges.select(sound), trusted[sound], GATE
-        )
+        p, yaw, accepted[sound] = solve_robustly(odometry.p, odometry.edges(), said.select(sound), likely[sound])
         trajectory = self._corrected(t_ns, segment, odometry.p, p, yaw)
         loops = tuple(_loop(s, places, good) for s, good in zip(sightings, accepted.tolist(), strict=True))
         return LoopClosure(trajectory, t_ns, loops, {**self._recogniser.seconds, "solve": perf_counter() - begin})
@@ -99,8 +94,7 @@ def _loop(sighting: Sighting, places: Sequence[Place], accepted: bool) -> Loop:
     earlier, later, relation = places[sighting.earlier], places[sighting.later], sighting.relation
     heading = float(yaw_of(earlier.R_WB))
     p_L = rotation_z(heading).T @ relation.z
-    yaw = float(yaw_of(later.R_WB)) + relation.yaw - heading
-    yaw = float(np.arctan2(np.sin(yaw), np.cos(yaw)))
+    yaw = float(wrapped(yaw_of(later.R_WB) + relation.yaw - heading))
     return Loop(earlier.t_ns, later.t_ns, p_L, yaw, relation.inliers, accepted)
 
 
@@ -117,14 +111,14 @@ def carry(
     t_ns, segment, R_WB, p_WB = frames
     key_t_ns, key_segment, key_p = keys
     left, right, fraction = _between(t_ns, segment, key_t_ns, key_segment)
-    turn = np.arctan2(np.sin(yaw[right] - yaw[left]), np.cos(yaw[right] - yaw[left]))
+    turn = wrapped(yaw[right] - yaw[left])
 
     def carried(by: Int) -> Float:
-        moved = np.einsum("fij,fj->fi", _rotations_z(yaw[by]), p_WB - key_p[by])
+        moved = np.einsum("fij,fj->fi", rotation_z(yaw[by]), p_WB - key_p[by])
         return np.asarray(p_corrected[by] + moved)
 
     p = (1.0 - fraction)[:, None] * carried(left) + fraction[:, None] * carried(right)
-    return _rotations_z(yaw[left] + fraction * turn) @ R_WB, p
+    return rotation_z(yaw[left] + fraction * turn) @ R_WB, p
 
 
 def _between(t_ns: Int, segment: Int, key_t_ns: Int, key_segment: Int) -> tuple[Int, Int, Float]:
@@ -137,11 +131,6 @@ def _between(t_ns: Int, segment: Int, key_t_ns: Int, key_segment: Int) -> tuple[
     return left, right, np.clip((t_ns - key_t_ns[left]) / span, 0.0, 1.0)
 
 
-def _rotations_z(yaw: Float) -> Float:
-    """(N,) rad -> (N, 3, 3)."""
-    return so3.exp(np.column_stack([np.zeros((len(yaw), 2)), yaw]))
-
-
 def warm_up() -> None:
     """Call every kernel once with the types that it will be called with."""
     descriptors = np.zeros((2, 4), np.uint64)
@@ -149,5 +138,3 @@ def warm_up() -> None:
     index.add(descriptors, 0)
     index.similarity(descriptors, 1)
     match(descriptors, descriptors, np.zeros((2, 2)), 1, 1.0, 1.0)
-    side, cameras = np.zeros(2, np.int64), np.repeat(np.eye(3)[None], 2, axis=0)
-    ransac(np.eye(2, 3), np.zeros((2, 2)), side, cameras, np.zeros((2, 3)), np.array([[0, 1]]), 1.0)

@@ -12,12 +12,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy.stats import chi2
 
-from vioframe.geometry import so3
+from vioframe.arrays import Bool
+from vioframe.geometry.so3 import rotation_z
 from vioframe.types import NS_PER_S, Float, Int
-from vioframe_pose_graph.graph import Edges, root_of
+from vioframe_pose_graph.graph import GATE, Edges, mahalanobis_squared, wrapped
 from vioframe_pose_graph.options import PoseGraphOptions
 from vioframe_pose_graph.recognition import Sighting
 
@@ -27,9 +26,6 @@ _SPAN = 4
 _HOVERING_M_S = 0.1
 # Between two segments nothing is known but that the body cannot have gone far.
 _LOST_SPEED_M_S, _LOST_M, _LOST_YAW = 5.0, 5.0, 1.0
-GATE = float(chi2.ppf(0.999, 4))
-"""Squared Mahalanobis distance in [x y z yaw] that a correct sighting stays below in 999 of 1000 cases."""
-
 _REPEAT_NS = 3 * NS_PER_S
 # Points seen to a pixel place a camera to millimetres; but the points themselves were placed by the odometry, whose
 # scale is off by some per cent.
@@ -72,7 +68,7 @@ class Odometry:
         cov = np.zeros((len(i), 4, 4))
         cov[:, [0, 1, 2], [0, 1, 2]] = share * (sum_p[j] - sum_p[i])[:, None]
         cov[:, 3, 3] = share * (sum_yaw[j] - sum_yaw[i])
-        return Edges(i, j, self.p[j] - self.p[i], np.zeros(len(i)), root_of(cov))
+        return Edges(i, j, self.p[j] - self.p[i], np.zeros(len(i)), cov)
 
     def cov(self, i: Int, j: Int) -> Float:
         """(M, 4, 4) covariance of [position yaw] of keyframes j (M,) as seen from keyframes i (M,), i <= j.
@@ -97,38 +93,33 @@ class Odometry:
         return cov
 
 
-def measured(sightings: Sequence[Sighting]) -> tuple[Int, Int, Float, Float, Float]:
-    """Earlier and later keyframes (S,), z (S, 3) m, yaw (S,) rad and covariances (S, 4, 4) of [z yaw]."""
+def measured(sightings: Sequence[Sighting]) -> Edges:
+    """What the sightings (S,) say, as edges from the earlier to the later keyframe."""
     relations = [sighting.relation for sighting in sightings]
     z = np.array([relation.z for relation in relations]).reshape(-1, 3)
     cov = np.array([relation.cov for relation in relations]).reshape(-1, 4, 4)
     variance = _SIGMA_M**2 + _SIGMA_PART**2 * np.sum(z**2, axis=1)
     cov[:, [0, 1, 2], [0, 1, 2]] += variance[:, None]
     cov[:, 3, 3] += _SIGMA_YAW**2
-    return (
-        np.array([sighting.earlier for sighting in sightings], np.int64),
-        np.array([sighting.later for sighting in sightings], np.int64),
-        z,
-        np.array([relation.yaw for relation in relations]),
-        cov,
-    )
+    i, j = np.array([(s.earlier, s.later) for s in sightings], np.int64).reshape(-1, 2).T
+    return Edges(i, j, z, np.array([relation.yaw for relation in relations]), cov)
 
 
-def within_drift(sightings: Sequence[Sighting], odometry: Odometry) -> NDArray[np.bool_]:
-    """(S,) whether what a sighting says is as near to what the odometry says as its drift can explain."""
-    i, j, z, yaw, cov = measured(sightings)
-    error = np.column_stack([z - (odometry.p[j] - odometry.p[i]), yaw])
-    return _squares(error, odometry.cov(i, j) + cov) < GATE
+def within_drift(loops: Edges, odometry: Odometry) -> Bool:
+    """(S,) whether what a loop says is as near to what the odometry says as its drift can explain."""
+    i, j = loops.i, loops.j
+    error = np.column_stack([loops.z - (odometry.p[j] - odometry.p[i]), loops.turn])
+    return np.asarray(mahalanobis_squared(error, odometry.cov(i, j) + loops.cov) < GATE)
 
 
-def agreed(sightings: Sequence[Sighting], odometry: Odometry, t_ns: Int) -> NDArray[np.bool_]:
-    """(S,) whether another keyframe, soon before or after, says the same as a sighting, and its own nothing else."""
-    later = np.array([sighting.later for sighting in sightings], np.int64)
-    # The sightings come in the order of their later keyframes.
+def agreed(loops: Edges, odometry: Odometry, t_ns: Int) -> Bool:
+    """(S,) whether another keyframe, soon before or after, says the same as a loop, and its own nothing else."""
+    later = loops.j
+    # The loops come in the order of their later keyframes.
     ends = np.searchsorted(t_ns[later], t_ns[later] + _REPEAT_NS, side="right")
     a = np.repeat(np.arange(len(later)), ends - np.arange(len(later)) - 1)
     b = np.concatenate([np.empty(0, np.int64), *(np.arange(k + 1, end) for k, end in enumerate(ends))])
-    agree = _disagreement(sightings, odometry, a, b) < GATE
+    agree = _disagreement(loops, odometry, a, b) < GATE
     own = later[a] == later[b]
     repeated, contradicted = np.zeros(len(later), bool), np.zeros(len(later), bool)
     for side in (a, b):
@@ -137,25 +128,25 @@ def agreed(sightings: Sequence[Sighting], odometry: Odometry, t_ns: Int) -> NDAr
     return np.asarray(repeated & ~contradicted)
 
 
-def _disagreement(sightings: Sequence[Sighting], odometry: Odometry, a: Int, b: Int) -> Float:
-    """(P,) squared Mahalanobis distances between where sightings ``b`` (P,) put their later bodies and where sightings
-    ``a`` (P,), no later ones, say that these are.
+def _disagreement(loops: Edges, odometry: Odometry, a: Int, b: Int) -> Float:
+    """(P,) squared Mahalanobis distances between where loops ``b`` (P,) put their later bodies and where loops ``a``
+    (P,), no later ones, say that these are.
 
     Both say how the world in which the later keyframe was placed lies to that of the earlier one; between the two later
     keyframes, and between the two earlier ones, these worlds drifted.
     """
-    earlier, later, z, yaw, cov = measured(sightings)
+    earlier, later, yaw = loops.i, loops.j, loops.turn
     R = np.zeros((len(a), 4, 4))
-    R[:, :3, :3] = so3.exp(np.column_stack([np.zeros((len(a), 2)), yaw[a]]))
+    R[:, :3, :3] = rotation_z(yaw[a])
     R[:, 3, 3] = 1.0
     moved = np.einsum("pij,pj->pi", R[:, :3, :3], odometry.p[later[b]] - odometry.p[later[a]])
-    p_a, p_b = odometry.p[earlier[a]] + z[a], odometry.p[earlier[b]] + z[b]
-    turned = np.arctan2(np.sin(yaw[a] - yaw[b]), np.cos(yaw[a] - yaw[b]))
-    error = np.column_stack([p_a + moved - p_b, turned])
+    p_a, p_b = odometry.p[earlier[a]] + loops.z[a], odometry.p[earlier[b]] + loops.z[b]
+    error = np.column_stack([p_a + moved - p_b, wrapped(yaw[a] - yaw[b])])
     between_later = R @ odometry.cov(later[a], later[b]) @ R.transpose(0, 2, 1)
     first, last = np.minimum(earlier[a], earlier[b]), np.maximum(earlier[a], earlier[b])
     between_earlier = _seen_from_afar(odometry.cov(first, last), p_b - odometry.p[last])
-    return _squares(error, _seen_from_afar(cov[a], moved) + cov[b] + between_later + between_earlier)
+    said = _seen_from_afar(loops.cov[a], moved) + loops.cov[b]
+    return mahalanobis_squared(error, said + between_later + between_earlier)
 
 
 def _seen_from_afar(cov: Float, lever: Float) -> Float:
@@ -163,8 +154,3 @@ def _seen_from_afar(cov: Float, lever: Float) -> Float:
     G = np.broadcast_to(np.eye(4), cov.shape).copy()
     G[:, 0, 3], G[:, 1, 3] = -lever[:, 1], lever[:, 0]
     return np.asarray(G @ cov @ G.transpose(0, 2, 1))
-
-
-def _squares(error: Float, cov: Float) -> Float:
-    """(P,) squared Mahalanobis distances of (P, 4)."""
-    return np.asarray(np.einsum("pi,pi->p", error, np.linalg.solve(cov, error[..., None])[..., 0]))

@@ -17,14 +17,19 @@ covariance of what the loop measures in the solution with it, both whitened, its
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy.sparse import csc_array
+from scipy.sparse import bsr_array, csr_array
 from scipy.sparse.linalg import SuperLU, splu
+from scipy.stats import chi2
 
+from vioframe.arrays import Bool
+from vioframe.geometry.so3 import rotation_z
 from vioframe.types import Float, Int
+
+GATE = float(chi2.ppf(0.999, 4))
+"""Squared Mahalanobis distance in [x y z yaw] that a correct loop stays below in 999 of 1000 cases."""
 
 _ITERATIONS = 50
 _CONVERGED = 1e-6
@@ -39,47 +44,37 @@ _WORST = 0.5
 class Edges:
     """E edges: ``i`` (E,) and ``j`` (E,) their nodes, ``z`` (E, 3) m and ``turn`` (E,) rad the measurements.
 
-    ``root`` (E, 4, 4) are the square roots L^T of the information of [z turn].
+    ``cov`` (E, 4, 4) are the covariances of [z turn].
     """
 
     i: Int
     j: Int
     z: Float
     turn: Float
-    root: Float
+    cov: Float
 
     def __add__(self, other: Edges) -> Edges:
-        pairs = ((getattr(self, name), getattr(other, name)) for name in ("i", "j", "z", "turn", "root"))
-        return Edges(*(np.concatenate(pair) for pair in pairs))
+        return Edges(*(np.concatenate([getattr(self, f.name), getattr(other, f.name)]) for f in fields(self)))
 
     def __len__(self) -> int:
         return len(self.i)
 
-    def select(self, which: NDArray[np.bool_]) -> Edges:
+    def select(self, which: Bool) -> Edges:
         """The edges that ``which`` (E,) marks."""
-        return Edges(self.i[which], self.j[which], self.z[which], self.turn[which], self.root[which])
-
-
-def root_of(cov: Float) -> Float:
-    """(..., 4, 4) covariance -> L^T with L L^T its inverse."""
-    return np.linalg.inv(np.linalg.cholesky(cov))
+        return Edges(*(getattr(self, f.name)[which] for f in fields(self)))
 
 
 def residuals(p: Float, yaw: Float, edges: Edges) -> tuple[Float, Float, Float]:
     """(E, 4) whitened, and (E, 4, 4) their derivatives by [p yaw] of node i and of node j."""
-    cos, sin = np.cos(yaw[edges.i]), np.sin(yaw[edges.i])
-    zero, one = np.zeros(len(edges)), np.ones(len(edges))
-    R_T = np.stack([cos, sin, zero, -sin, cos, zero, zero, zero, one], axis=1).reshape(-1, 3, 3)
+    R_T = np.swapaxes(rotation_z(yaw[edges.i]), 1, 2)
     seen = np.einsum("eij,ej->ei", R_T, p[edges.j] - p[edges.i])
-    r = np.empty((len(edges), 4))
-    r[:, :3] = seen - edges.z
-    turned = yaw[edges.j] - yaw[edges.i] - edges.turn
-    r[:, 3] = np.arctan2(np.sin(turned), np.cos(turned))
+    r = np.column_stack([seen - edges.z, wrapped(yaw[edges.j] - yaw[edges.i] - edges.turn)])
     J_i, J_j = np.zeros((len(edges), 4, 4)), np.zeros((len(edges), 4, 4))
     J_i[:, :3, :3], J_j[:, :3, :3] = -R_T, R_T
     J_i[:, 0, 3], J_i[:, 1, 3] = seen[:, 1], -seen[:, 0]
     J_i[:, 3, 3], J_j[:, 3, 3] = -1.0, 1.0
-    return np.einsum("eij,ej->ei", edges.root, r), edges.root @ J_i, edges.root @ J_j
+    root = np.linalg.inv(np.linalg.cholesky(edges.cov))  # L^T with L L^T the information
+    return np.einsum("eij,ej->ei", root, r), root @ J_i, root @ J_j
 
 
 def solve(p: Float, yaw: Float, edges: Edges) -> tuple[Float, Float]:
@@ -87,23 +82,23 @@ def solve(p: Float, yaw: Float, edges: Edges) -> tuple[Float, Float]:
 
     Levenberg-Marquardt on the normal equations, which a sparse factorisation solves.
     """
-    blocks = _Blocks(len(p), edges)
     damping = 1e-6
-    r, J_i, J_j = residuals(p, yaw, edges)
+    r, *blocks = residuals(p, yaw, edges)
     cost = float(np.sum(r**2))
     for _ in range(_ITERATIONS):
-        step = -blocks.factorised(J_i, J_j, damping).solve(blocks.gradient(r, J_i, J_j)).reshape(-1, 4)
-        new_p, new_yaw = p.copy(), yaw.copy()
-        new_p[1:], new_yaw[1:] = p[1:] + step[:, :3], yaw[1:] + step[:, 3]
-        new = residuals(new_p, new_yaw, edges)
-        new_cost = float(np.sum(new[0] ** 2))
+        J = _jacobian(len(p), edges, *blocks)
+        step = np.zeros((len(p), 4))
+        step[1:] = -_factorised(J, damping).solve(J.T @ r.ravel()).reshape(-1, 4)
+        new_p, new_yaw = p + step[:, :3], yaw + step[:, 3]
+        new_r, *new_blocks = residuals(new_p, new_yaw, edges)
+        new_cost = float(np.sum(new_r**2))
         if new_cost > cost:
             damping *= 10.0
             if damping > _MAX_DAMPING:
                 break
             continue
         done = cost - new_cost <= _CONVERGED * cost
-        p, yaw, (r, J_i, J_j), cost = new_p, new_yaw, new, new_cost
+        p, yaw, r, blocks, cost = new_p, new_yaw, new_r, new_blocks, new_cost
         damping *= 0.1
         if done:
             break
@@ -112,87 +107,71 @@ def solve(p: Float, yaw: Float, edges: Edges) -> tuple[Float, Float]:
 
 def uncertainty(p: Float, yaw: Float, edges: Edges, of: Edges) -> Float:
     """(M, 4, 4) covariance of what the edges ``of`` measure, by the solution of ``edges``; whitened as ``of`` are."""
-    _, J_i, J_j = residuals(p, yaw, edges)
-    factor = _Blocks(len(p), edges).factorised(J_i, J_j, 0.0)
-    _, J_i, J_j = residuals(p, yaw, of)
+    factor = _factorised(_jacobian(len(p), edges, *residuals(p, yaw, edges)[1:]), 0.0)
+    J = _jacobian(len(p), of, *residuals(p, yaw, of)[1:])
     cov = np.empty((len(of), 4, 4))
     for begin in range(0, len(of), _AT_A_TIME):
-        part = slice(begin, begin + _AT_A_TIME)
-        count = len(of.i[part])
-        # The rows of the Jacobian as columns: (4 N, 4 count).
-        J_T = np.zeros((len(p), 4, count, 4))
-        number = np.arange(count)
-        J_T[of.i[part], :, number] += J_i[part].transpose(0, 2, 1)
-        J_T[of.j[part], :, number] += J_j[part].transpose(0, 2, 1)
-        columns = J_T[1:].reshape(4 * (len(p) - 1), 4 * count)
-        solved = factor.solve(columns).reshape(-1, count, 4)
-        cov[part] = np.einsum("nka,nkb->kab", columns.reshape(-1, count, 4), solved)
+        rows_T = J[4 * begin : 4 * (begin + _AT_A_TIME)].T.toarray()
+        blocks = (rows_T.shape[0], -1, 4)
+        cov[begin : begin + _AT_A_TIME] = np.einsum(
+            "nka,nkb->kab", rows_T.reshape(blocks), factor.solve(rows_T).reshape(blocks)
+        )
     return cov
 
 
-class _Blocks:
-    """Where the blocks of the normal equations go, which does not change between iterations; node 0 has none."""
-
-    def __init__(self, nodes: int, edges: Edges) -> None:
-        self._size, self._i, self._j = 4 * nodes, edges.i, edges.j
-        block = np.arange(4)
-        rows_i, rows_j = 4 * edges.i[:, None] + block, 4 * edges.j[:, None] + block
-        pairs = [(a, b) for a in (rows_i, rows_j) for b in (rows_i, rows_j)]
-        self._rows = np.concatenate([np.repeat(a, 4, axis=1).ravel() for a, _ in pairs])
-        self._columns = np.concatenate([np.tile(b, 4).ravel() for _, b in pairs])
-
-    def factorised(self, J_i: Float, J_j: Float, damping: float) -> SuperLU:
-        """The factors of J^T J, its diagonal raised by the part ``damping``."""
-        blocks = [np.einsum("eki,ekj->eij", a, b).ravel() for a in (J_i, J_j) for b in (J_i, J_j)]
-        whole = csc_array((np.concatenate(blocks), (self._rows, self._columns)), shape=(self._size, self._size))
-        H = whole[4:, 4:].tocsc()
-        H.setdiag(H.diagonal() * (1.0 + damping))
-        return splu(H, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True})
-
-    def gradient(self, r: Float, J_i: Float, J_j: Float) -> Float:
-        """(4 (N - 1),) J^T r."""
-        g = np.zeros((self._size // 4, 4))
-        np.add.at(g, self._i, np.einsum("eki,ek->ei", J_i, r))
-        np.add.at(g, self._j, np.einsum("eki,ek->ei", J_j, r))
-        return g.ravel()[4:]
+def _jacobian(nodes: int, edges: Edges, J_i: Float, J_j: Float) -> csr_array:
+    """(4 E, 4 (N - 1)) of its blocks by node i and by node j; node 0, which is held, has no columns."""
+    blocks = np.stack([J_i, J_j], axis=1).reshape(-1, 4, 4)
+    columns = np.column_stack([edges.i, edges.j]).ravel()
+    starts = 2 * np.arange(len(edges) + 1)
+    return bsr_array((blocks, columns, starts), shape=(4 * len(edges), 4 * nodes)).tocsr()[:, 4:]
 
 
-def solve_robustly(
-    p: Float, odometry: Edges, loops: Edges, trusted: NDArray[np.bool_], gate: float
-) -> tuple[Float, Float, NDArray[np.bool_]]:
+def _factorised(J: csr_array, damping: float) -> SuperLU:
+    """The factors of J^T J, its diagonal raised by the part ``damping``."""
+    H = (J.T @ J).tocsc()
+    H.setdiag(H.diagonal() * (1.0 + damping))
+    return splu(H, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True})
+
+
+def solve_robustly(p: Float, odometry: Edges, loops: Edges, trusted: Bool) -> tuple[Float, Float, Bool]:
     """Positions (N, 3), yaws (N,) and which of the ``loops`` (L,) were believed.
 
     ``p`` (N, 3) are the positions by the odometry alone. The ``trusted`` loops (L,) are used until they prove wrong,
-    the others only if they agree with what came of those: lie within ``gate``, a squared Mahalanobis distance.
+    the others only if they agree with what came of those.
     """
     used = trusted.copy()
-    q, yaw = _eliminate(p, odometry, loops, used, gate)
+    q, yaw = _eliminate(p, odometry, loops, used)
     doubted = ~used
     if doubted.any() and used.any():
         edges, asked = odometry + loops.select(used), loops.select(doubted)
-        r = residuals(q, yaw, asked)[0]
         cov = np.eye(4) + uncertainty(q, yaw, edges, asked)
-        used[doubted] = _squares(r, cov) < gate
+        used[doubted] = mahalanobis_squared(residuals(q, yaw, asked)[0], cov) < GATE
         if used[doubted].any():
-            q, yaw = _eliminate(p, odometry, loops, used, gate)
+            q, yaw = _eliminate(p, odometry, loops, used)
     return q, yaw, used
 
 
-def _eliminate(p: Float, odometry: Edges, loops: Edges, used: NDArray[np.bool_], gate: float) -> tuple[Float, Float]:
+def _eliminate(p: Float, odometry: Edges, loops: Edges, used: Bool) -> tuple[Float, Float]:
     """Solve, and let go of the loops that the rest contradicts (``used`` is changed) until there are none."""
     q, yaw = p, np.zeros(len(p))
     while used.any():
         chosen = loops.select(used)
         edges = odometry + chosen
         q, yaw = solve(q, yaw, edges)
-        r = residuals(q, yaw, chosen)[0]
-        rest = np.linalg.inv(np.eye(4) - uncertainty(q, yaw, edges, chosen))
-        squares = np.einsum("ei,eij,ej->e", r, rest, r)
-        if squares.max() < gate:
+        left = np.eye(4) - uncertainty(q, yaw, edges, chosen)
+        squares = mahalanobis_squared(residuals(q, yaw, chosen)[0], left)
+        if squares.max() < GATE:
             return q, yaw
-        used[np.flatnonzero(used)[squares > max(gate, _WORST * squares.max())]] = False
+        used[np.flatnonzero(used)[squares > max(GATE, _WORST * squares.max())]] = False
     return p, np.zeros(len(p))
 
 
-def _squares(r: Float, cov: Float) -> Float:
-    return np.asarray(np.einsum("ei,ei->e", r, np.linalg.solve(cov, r[..., None])[..., 0]))
+def mahalanobis_squared(error: Float, cov: Float) -> Float:
+    """(E,) of errors (E, 4) with covariances (E, 4, 4)."""
+    return np.asarray(np.einsum("ei,ei->e", error, np.linalg.solve(cov, error[..., None])[..., 0]))
+
+
+def wrapped(angle: Float) -> Float:
+    """The same angles (...,) rad within -pi and pi."""
+    return np.arctan2(np.sin(angle), np.cos(angle))

@@ -3,30 +3,40 @@
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from vioframe.geometry import so3
-from vioframe.types import NS_PER_S, Calibration, CameraOnBody, Float, FrameTracks, Image, NavState, Status, Step
-from vioframe_pose_graph.place import Keyframe
+from vioframe.geometry.cameras import Camera
+from vioframe.geometry.two_view import median_parallax
+from vioframe.types import NS_PER_S, Calibration, Float, FrameTracks, Image, NavState, Status, Step
 
 # A feature may get its position later than the frame that sees it: from the frames that follow.
 _WAIT_NS = NS_PER_S
 _MIN_COMMON = 0.5
 # From one frame to the next a body turns steadily, if they are no farther apart.
 _STEADY_S = 0.2
+_UNKNOWN = np.full(3, np.nan)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Pending:
+class Keyframe:
+    """A frame of the graph, in the world of the odometry.
+
+    ``segment`` numbers the stretches of tracking between resets. ``R_WC`` and ``p_WC`` are the pose of the camera
+    ``model`` when the image was taken, by the calibration that the back-end had learned by then. ``p_WF`` (N, 3) m is
+    what is known of the tracked features a second later, NaN where nothing is.
+    """
+
     state: NavState
     segment: int
     image: Image
     tracks: FrameTracks
-    camera: CameraOnBody
+    model: Camera
     R_WC: Float
     p_WC: Float
+    p_WF: Float
 
 
 class KeyframeSelector:
@@ -37,8 +47,8 @@ class KeyframeSelector:
         self._offset_ns = self._camera.time_offset_ns
         self._parallax = parallax_px / self._camera.model.focal_px
         self._previous: NavState | None = None
-        self._pending: deque[_Pending] = deque()
-        self._last: _Pending | None = None
+        self._pending: deque[Keyframe] = deque()
+        self._last: Keyframe | None = None
         self._p_WF: dict[int, Float] = {}
         self._tracking = False
         self.segment = -1
@@ -62,7 +72,7 @@ class KeyframeSelector:
         image = next(iter(step.frames.images), None)
         due = self._last is None or (estimate.is_keyframe and self._moved_on(self._last, step.tracks, R_WC))
         if due and image is not None:
-            self._last = _Pending(state, self.segment, image, step.tracks, self._camera, R_WC, p_WC)
+            self._last = Keyframe(state, self.segment, image, step.tracks, self._camera.model, R_WC, p_WC, _UNKNOWN)
             self._pending.append(self._last)
             self._forget(step.tracks)
         while self._pending and step.frames.t_ns - self._pending[0].state.t_ns >= _WAIT_NS:
@@ -87,34 +97,18 @@ class KeyframeSelector:
             R_WB, p_WB = R_WB @ so3.exp(rate_B * late_s), p_WB + state.v_WB * late_s
         return R_WB @ self._camera.R_BC, p_WB + R_WB @ self._camera.p_BC
 
-    def _moved_on(self, last: _Pending, tracks: FrameTracks, R_WC: Float) -> bool:
+    def _moved_on(self, last: Keyframe, tracks: FrameTracks, R_WC: Float) -> bool:
         _, i, j = np.intersect1d(last.tracks.ids, tracks.ids, assume_unique=True, return_indices=True)
         if len(i) < _MIN_COMMON * len(last.tracks.ids):
             return True
-        R = R_WC.T @ last.R_WC
-        rays = np.column_stack([last.tracks.xy_normalised[i], np.ones(len(i))]) @ R.T
-        ahead = rays[:, 2] > 0.0
-        moved = tracks.xy_normalised[j][ahead] - rays[ahead, :2] / rays[ahead, 2:]
-        return bool(np.median(np.linalg.norm(moved, axis=1)) > self._parallax) if ahead.any() else True
+        before, now = last.tracks.xy_normalised[i], tracks.xy_normalised[j]
+        return median_parallax(now, before, R_WC.T @ last.R_WC) > self._parallax
 
     def _forget(self, tracks: FrameTracks) -> None:
         """Drop the positions that no keyframe in waiting and no track of now asks for."""
         needed = set(tracks.ids.tolist()).union(*(pending.tracks.ids.tolist() for pending in self._pending))
         self._p_WF = {i: p for i, p in self._p_WF.items() if i in needed}
 
-    def _complete(self, pending: _Pending) -> Keyframe:
-        unknown = np.full(3, np.nan)
-        ids, state = pending.tracks.ids.tolist(), pending.state
-        p_WF = np.array([self._p_WF.get(i, unknown) for i in ids]).reshape(-1, 3)
-        return Keyframe(
-            state.t_ns,
-            pending.segment,
-            state.R_WB,
-            state.p_WB,
-            pending.R_WC,
-            pending.p_WC,
-            pending.camera.model,
-            pending.image,
-            pending.tracks.xy,
-            p_WF,
-        )
+    def _complete(self, pending: Keyframe) -> Keyframe:
+        known = [self._p_WF.get(i, _UNKNOWN) for i in pending.tracks.ids.tolist()]
+        return replace(pending, p_WF=np.array(known).reshape(-1, 3))

@@ -8,11 +8,14 @@ import numpy as np
 
 from vioframe.stopwatch import Stopwatch
 from vioframe.types import NS_PER_S, Float
+from vioframe_pose_graph.keyframes import Keyframe
 from vioframe_pose_graph.matching import DescriptorIndex
 from vioframe_pose_graph.options import PoseGraphOptions
-from vioframe_pose_graph.place import Describer, Float32, Keyframe, Place, View, describe
-from vioframe_pose_graph.verification import Relation, relate
+from vioframe_pose_graph.place import Float32, Place, View, corner_finder, describe
+from vioframe_pose_graph.verification import REPROJECTION_PX, Relation, relate
 
+# Earlier places that each keyframe is compared with in detail: an aliased world has more than one that look alike.
+_MOST_CANDIDATES = 3
 # Keyframes this near to a candidate look the same, and are not compared as well.
 _NEIGHBOURS = 3
 # Enough points to know a place by; the tracked features come first.
@@ -30,15 +33,6 @@ class Sighting:
     relation: Relation
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Remembered:
-    """How a place looked; its descriptors are rows of the index."""
-
-    xy_normalised: Float32
-    p_WF: Float32
-    rows: slice
-
-
 class Recogniser:
     """Remembers the keyframes it is given; what it finds depends on their order and on nothing else.
 
@@ -48,9 +42,10 @@ class Recogniser:
 
     def __init__(self, focal_px: float, options: PoseGraphOptions) -> None:
         self._focal_px, self._options = focal_px, options
-        self._describer = Describer(options.max_corners)
+        self._orb = corner_finder(options.max_corners)
         self._index = DescriptorIndex()
-        self._remembered: dict[int, _Remembered] = {}
+        # How a place looked: points and positions as in its view; its descriptors are rows of the index.
+        self._remembered: dict[int, tuple[Float32, Float32, slice]] = {}
         self.places: list[Place] = []
         self.sightings: list[Sighting] = []
         self.seconds: dict[str, float] = {}
@@ -58,7 +53,7 @@ class Recogniser:
     def add(self, keyframe: Keyframe) -> None:
         """Look for the place of ``keyframe`` among the earlier ones, then remember it."""
         watch = Stopwatch()
-        place, view = describe(keyframe, self._describer, 0.5 * self._options.reprojection_px)
+        place, view = describe(keyframe, self._orb, 0.5 * REPROJECTION_PX)
         watch.lap("describe")
         candidates = self._retrieve(place, view)
         number = len(self.places)
@@ -69,13 +64,12 @@ class Recogniser:
                 (self.places[earlier], self._view(earlier)),
                 (place, view),
                 self._focal_px,
-                self._options.reprojection_px,
                 self._options.min_inliers,
             )
             if relation is not None:
                 self.sightings.append(Sighting(earlier, number, relation))
         self.places.append(place)
-        self._remembered[number] = _Remembered(view.xy_normalised, view.p_WF, rows)
+        self._remembered[number] = view.xy_normalised, view.p_WF, rows
         if len(self._remembered) > _MOST_REMEMBERED:
             self._thin_out()
         watch.lap("verify")
@@ -83,25 +77,24 @@ class Recogniser:
             self.seconds[stage] = self.seconds.get(stage, 0.0) + seconds
 
     def _view(self, number: int) -> View:
-        remembered = self._remembered[number]
-        return View(remembered.xy_normalised, remembered.p_WF, self._index.descriptors(remembered.rows))
+        xy_normalised, p_WF, rows = self._remembered[number]
+        return View(xy_normalised, p_WF, self._index.descriptors(rows))
 
     def _retrieve(self, place: Place, view: View) -> list[int]:
         """Numbers of the earlier keyframes that look most like ``place``, no two of them neighbours."""
         gap_ns = round(self._options.min_gap_s * NS_PER_S)
         before = sum(earlier.t_ns <= place.t_ns - gap_ns for earlier in self.places)
         scores = self._index.similarity(view.descriptors[:_ASKED], before)
-        return _peaks(scores, self._options.max_candidates)
+        return _peaks(scores, _MOST_CANDIDATES)
 
     def _thin_out(self) -> None:
         """Forget how every second of the older half of the remembered places looked."""
         old, index = self._remembered, DescriptorIndex()
         older = set(list(old)[1 : len(old) // 2 : 2])
         self._remembered = {}
-        for number, place in old.items():
+        for number, (xy_normalised, p_WF, rows) in old.items():
             if number not in older:
-                rows = index.add(self._index.descriptors(place.rows), number)
-                self._remembered[number] = _Remembered(place.xy_normalised, place.p_WF, rows)
+                self._remembered[number] = xy_normalised, p_WF, index.add(self._index.descriptors(rows), number)
         self._index = index
 
 

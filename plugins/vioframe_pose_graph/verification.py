@@ -8,18 +8,20 @@ begin, least squares refines; ``docs/derivations/pose_graph.md``, section 1.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
 
 from vioframe.geometry import so3
+from vioframe.geometry.resection import projected
 from vioframe.geometry.so3 import rotation_z, yaw_of
-from vioframe.jit import kernel
+from vioframe.geometry.two_view import rays
 from vioframe.types import Float, Int
 from vioframe_pose_graph.matching import match
 from vioframe_pose_graph.place import Place, View
 
+REPROJECTION_PX = 3.0
+"""Within which a point of one keyframe must be seen in the other to support a loop."""
 _MAX_DISTANCE, _RATIO = 64, 0.85
 _APART_PX = 10.0
 _HYPOTHESES = 300
@@ -65,18 +67,16 @@ class Relation:
 Seen = tuple[Place, View]
 
 
-def relate(earlier: Seen, later: Seen, focal_px: float, reprojection_px: float, min_inliers: int) -> Relation | None:
+def relate(earlier: Seen, later: Seen, focal_px: float, min_inliers: int) -> Relation | None:
     """The relation of two keyframes by the points they share, or None where those do not agree on one."""
-    tolerance = reprojection_px / focal_px
+    tolerance = REPROJECTION_PX / focal_px
     seen = correspondences(earlier, later, _APART_PX / focal_px)
     if len(np.unique(seen.pairs[:, 1])) < min_inliers:
         return None
-    support, model = ransac(
-        seen.points, seen.xy, seen.side, seen.R_WC, seen.p_WC, _draw_pairs(seen.side), _COARSE * tolerance
-    )
+    support, yaw, t = ransac(seen, _draw_pairs(seen.side), _COARSE * tolerance)
     if support < min_inliers:
         return None
-    return _refined(seen, model, earlier[0].p_WB_seen, later[0].p_WB_seen, tolerance, min_inliers)
+    return _refined(seen, rotation_z(yaw), t, earlier[0].p_WB_seen, later[0].p_WB_seen, tolerance, min_inliers)
 
 
 def correspondences(earlier: Seen, later: Seen, apart: float) -> Correspondences:
@@ -123,30 +123,26 @@ def residuals(seen: Correspondences, p_B: Float, p_AB: Float, R_AB: Float) -> tu
     p_C = np.einsum("mij,mj->mi", R_CW, there - seen.p_WC[seen.side])
     d_there = np.concatenate([np.broadcast_to(np.eye(3), (len(turned), 3, 3)), -so3.hat(turned)], axis=2)
     d_there[seen.side == 1] = -R_AB.T @ d_there[seen.side == 1]
-    z = np.where(p_C[:, 2] > 0.0, p_C[:, 2], np.nan)
-    xy = p_C[:, :2] / z[:, None]
-    J_C = R_CW @ d_there
-    J = (J_C[:, :2] - xy[:, :, None] * J_C[:, 2:]) / z[:, None, None]
+    xy, J = projected(p_C, R_CW @ d_there)
     return xy - seen.xy, J
 
 
 def _refined(
-    seen: Correspondences, model: Float, p_A: Float, p_B: Float, tolerance: float, min_inliers: int
+    seen: Correspondences, R_AB: Float, t: Float, p_A: Float, p_B: Float, tolerance: float, min_inliers: int
 ) -> Relation | None:
     """Iterate to the least-squares fit of what lies within ``tolerance``, which is decided anew each time.
 
     The tilt is free within what two attitudes of an odometry may disagree: forced to zero, half a degree of it would
     become several centimetres of position, as the points are metres away.
     """
-    R_AB = rotation_z(float(model[0]))
-    p_AB = R_AB @ p_B + model[1:]
+    p_AB = R_AB @ p_B + t
     for _ in range(_ITERATIONS):
         r, J = residuals(seen, p_B, p_AB, R_AB)
         inlier = np.linalg.norm(r, axis=1) < tolerance
         if inlier.sum() < min_inliers:
             return None
         variance = max(float(np.mean(r[inlier] ** 2)), (_LEAST_SIGMA * tolerance) ** 2)
-        tilt = so3.log(R_AB @ rotation_z(float(yaw_of(R_AB))).T)[:2]
+        tilt = so3.log(R_AB @ rotation_z(yaw_of(R_AB)).T)[:2]
         J_in = J[inlier].reshape(-1, 6)
         H, g = J_in.T @ J_in / variance, J_in.T @ r[inlier].ravel() / variance
         H[[3, 4], [3, 4]] += 1.0 / _TILT_SIGMA**2
@@ -162,107 +158,55 @@ def _refined(
     return Relation(p_AB - p_A, float(yaw_of(R_AB)), np.linalg.inv(H)[np.ix_(which, which)], supporting)
 
 
-@kernel
-def solve(p_1: Float, p_2: Float, ray_1: Float, ray_2: Float, centre: Float) -> tuple[int, Float]:
-    """Two points (3,) in B, seen along the rays (3,) from ``centre`` (3,) in A -> number of solutions, (2, 4) [yaw t].
+def hypotheses(p_1: Float, p_2: Float, ray_1: Float, ray_2: Float, centre: Float) -> tuple[Float, Float]:
+    """Pairs of points (H, 3) in B, seen along the rays (H, 3) from ``centre`` (H, 3) in A -> yaw (H, 2), t (H, 2, 3).
 
-    Both points lie ahead along their rays in every solution.
+    Both points lie ahead along their rays in every solution; NaN where there is none.
     """
-    out = np.zeros((2, 4))
-    d = p_1 - p_2
-    n = np.array(
-        [
-            ray_1[1] * ray_2[2] - ray_1[2] * ray_2[1],
-            ray_1[2] * ray_2[0] - ray_1[0] * ray_2[2],
-            ray_1[0] * ray_2[1] - ray_1[1] * ray_2[0],
-        ]
-    )
+    n, d = np.cross(ray_1, ray_2), p_1 - p_2
     # R_z(yaw) d lies in the plane of the rays: a cos(yaw) + b sin(yaw) + c = 0.
-    a = n[0] * d[0] + n[1] * d[1]
-    b = n[1] * d[0] - n[0] * d[1]
-    c = n[2] * d[2]
-    amplitude = math.sqrt(a * a + b * b)
-    n2 = n[0] * n[0] + n[1] * n[1] + n[2] * n[2]
-    if amplitude < _PARALLEL or n2 < _PARALLEL * _PARALLEL or abs(c) > amplitude:
-        return 0, out
-    middle, half = math.atan2(b, a), math.acos(-c / amplitude)
-    count = 0
-    for sign in (-1.0, 1.0):
-        yaw = middle + sign * half
-        cos, sin = math.cos(yaw), math.sin(yaw)
-        x, y, z = cos * d[0] - sin * d[1], sin * d[0] + cos * d[1], d[2]
-        # [x y z] = depth_1 ray_1 - depth_2 ray_2: depth_1 from the cross product with ray_2, and vice versa.
-        depth_1 = (
-            (y * ray_2[2] - z * ray_2[1]) * n[0]
-            + (z * ray_2[0] - x * ray_2[2]) * n[1]
-            + (x * ray_2[1] - y * ray_2[0]) * n[2]
-        ) / n2
-        depth_2 = (
-            (y * ray_1[2] - z * ray_1[1]) * n[0]
-            + (z * ray_1[0] - x * ray_1[2]) * n[1]
-            + (x * ray_1[1] - y * ray_1[0]) * n[2]
-        ) / n2
-        if depth_1 <= 0.0 or depth_2 <= 0.0:
-            continue
-        out[count, 0] = yaw
-        out[count, 1] = centre[0] + depth_1 * ray_1[0] - (cos * p_1[0] - sin * p_1[1])
-        out[count, 2] = centre[1] + depth_1 * ray_1[1] - (sin * p_1[0] + cos * p_1[1])
-        out[count, 3] = centre[2] + depth_1 * ray_1[2] - p_1[2]
-        count += 1
-    return count, out
+    a, b, c = n[:, 0] * d[:, 0] + n[:, 1] * d[:, 1], n[:, 1] * d[:, 0] - n[:, 0] * d[:, 1], n[:, 2] * d[:, 2]
+    amplitude, n2 = np.hypot(a, b), np.sum(n * n, axis=1)
+    solvable = (amplitude > _PARALLEL) & (n2 > _PARALLEL**2) & (np.abs(c) <= amplitude)
+    half = np.arccos(np.divide(-c, amplitude, out=np.full(len(c), np.nan), where=solvable))
+    yaw = np.arctan2(b, a)[:, None] + half[:, None] * [-1.0, 1.0]
+    R = rotation_z(yaw)
+    # R d = depth_1 ray_1 - depth_2 ray_2: depth_1 from the cross product with ray_2, and vice versa.
+    turned = (R @ d[:, None, :, None])[..., 0]
+    depth_1, depth_2 = (
+        np.sum(np.cross(turned, ray[:, None]) * n[:, None], axis=2) / np.where(solvable, n2, np.nan)[:, None]
+        for ray in (ray_2, ray_1)
+    )
+    t = centre[:, None] + depth_1[..., None] * ray_1[:, None] - (R @ p_1[:, None, :, None])[..., 0]
+    return np.where((depth_1 > 0.0) & (depth_2 > 0.0), yaw, np.nan), t
 
 
-@kernel
-def reprojection(model: Float, p: Float, xy: Float, side: int, R_WC: Float, p_WC: Float) -> float:
-    """Squared distance on the z = 1 plane of a point (3,) from where it was seen; infinite for a point behind.
+def ransac(seen: Correspondences, pairs: Int, tolerance: float) -> tuple[int, float, Float]:
+    """The largest support that any of ``pairs`` (P, 2) finds, each of one side, and its yaw and t (3,).
 
-    ``side`` 0: the point is in B and the camera, ``R_WC`` (3, 3) and ``p_WC`` (3,), in A; 1: the other way round.
+    A point supports where it reprojects to within ``tolerance`` on the z = 1 plane.
     """
-    cos, sin = math.cos(model[0]), math.sin(model[0])
-    if side == 0:
-        x = cos * p[0] - sin * p[1] + model[1] - p_WC[0]
-        y = sin * p[0] + cos * p[1] + model[2] - p_WC[1]
-        z = p[2] + model[3] - p_WC[2]
-    else:
-        dx, dy = p[0] - model[1], p[1] - model[2]
-        x = cos * dx + sin * dy - p_WC[0]
-        y = -sin * dx + cos * dy - p_WC[1]
-        z = p[2] - model[3] - p_WC[2]
-    depth = R_WC[0, 2] * x + R_WC[1, 2] * y + R_WC[2, 2] * z
-    if depth <= 0.0:
-        return np.inf
-    u = (R_WC[0, 0] * x + R_WC[1, 0] * y + R_WC[2, 0] * z) / depth - xy[0]
-    v = (R_WC[0, 1] * x + R_WC[1, 1] * y + R_WC[2, 1] * z) / depth - xy[1]
-    return float(u * u + v * v)
+    i, j = pairs.T
+    side = seen.side[i]
+    rays_W = (seen.R_WC[seen.side] @ rays(seen.xy)[..., None])[..., 0]
+    yaw, t = hypotheses(seen.points[i], seen.points[j], rays_W[i], rays_W[j], seen.p_WC[side])
+    yaw, t = yaw.ravel(), t.reshape(-1, 3)
+    from_A = np.repeat(side == 1, 2)  # these lead from A to B
+    t[from_A] = _turned(-t[from_A], -yaw[from_A])
+    yaw[from_A] *= -1.0
+    support = np.zeros(len(yaw), np.int64)
+    for there, (R, p) in enumerate(((rotation_z(yaw), t), (rotation_z(-yaw), _turned(-t, -yaw)))):
+        of = seen.side == there
+        R_C, p_C = seen.R_WC[there].T @ R, (p - seen.p_WC[there]) @ seen.R_WC[there]
+        points_C = seen.points[of] @ np.swapaxes(R_C, 1, 2) + p_C[:, None]  # (hypotheses, points, 3)
+        ahead = points_C[..., 2] > 0.0
+        depth = np.where(ahead, points_C[..., 2], np.nan)[..., None]
+        off = points_C[..., :2] / depth - seen.xy[of]
+        support += (np.sum(off * off, axis=2) < tolerance**2).sum(axis=1)
+    best = int(np.argmax(support))
+    return int(support[best]), float(yaw[best]), t[best]
 
 
-@kernel
-def ransac(
-    points: Float, xy: Float, side: Int, R_WC: Float, p_WC: Float, pairs: Int, tolerance: float
-) -> tuple[int, Float]:
-    """Try each of ``pairs`` (P, 2), both of one side -> the largest support found and its [yaw t] (4,).
-
-    ``points`` (M, 3) are those of side 0 in B and of side 1 in A, seen at ``xy`` (M, 2) in the camera of the other
-    side; ``R_WC`` (2, 3, 3) and ``p_WC`` (2, 3) are the camera in A and the camera in B.
-    """
-    most = 0
-    best = np.zeros(4)
-    for k in range(len(pairs)):
-        i, j = pairs[k]
-        s = side[i]
-        ray_i = R_WC[s] @ np.array([xy[i, 0], xy[i, 1], 1.0])
-        ray_j = R_WC[s] @ np.array([xy[j, 0], xy[j, 1], 1.0])
-        count, models = solve(points[i], points[j], ray_i, ray_j, p_WC[s])
-        for c in range(count):
-            model = models[c]
-            if s == 1:  # it leads from A to B
-                cos, sin = math.cos(model[0]), math.sin(model[0])
-                x, y = -cos * model[1] - sin * model[2], sin * model[1] - cos * model[2]
-                model = np.array([-model[0], x, y, -model[3]])
-            support = 0
-            for m in range(len(points)):
-                error = reprojection(model, points[m], xy[m], side[m], R_WC[side[m]], p_WC[side[m]])
-                support += error < tolerance * tolerance
-            if support > most:
-                most, best = support, model
-    return most, best
+def _turned(vectors: Float, yaw: Float) -> Float:
+    """(N, 3), each turned by its ``yaw`` (N,) about z."""
+    return np.asarray((rotation_z(yaw) @ vectors[..., None])[..., 0])

@@ -133,10 +133,13 @@ def yaw_of(R: Float) -> Float:
     return np.asarray(np.arctan2(R[..., 1, 0] - R[..., 0, 1], R[..., 0, 0] + R[..., 1, 1]))
 
 
-def rotation_z(yaw: float) -> Float:
-    """(3, 3) rotation by ``yaw`` rad about z."""
-    c, s = np.cos(yaw), np.sin(yaw)
-    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+def rotation_z(yaw: ArrayLike) -> Float:
+    """(...,) rad -> (..., 3, 3), about z."""
+    out = np.zeros((*np.shape(yaw), 3, 3))
+    out[..., 0, 0] = out[..., 1, 1] = np.cos(yaw)
+    out[..., 1, 0], out[..., 0, 1] = np.sin(yaw), -np.sin(yaw)
+    out[..., 2, 2] = 1.0
+    return out
 
 
 def level_rotation(up_B: Float) -> Float:

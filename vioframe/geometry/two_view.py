@@ -30,6 +30,16 @@ def rays(xy_normalised: Float) -> Float:
     return np.column_stack([xy_normalised, np.ones(len(xy_normalised))])
 
 
+def median_parallax(xy_1: Float, xy_2: Float, R_C1C2: Float) -> float:
+    """Median motion of tracks (N, 2) on the first view's z = 1 plane, with the turn ``R_C1C2`` (3, 3) taken out."""
+    turned = rays(xy_2) @ R_C1C2.T
+    ahead = turned[:, 2] > 0.1
+    if not ahead.any():
+        return 0.0
+    moved = turned[ahead, :2] / turned[ahead, 2:] - xy_1[ahead]
+    return float(np.median(np.linalg.norm(moved, axis=1)))
+
+
 def essential_matrix(R_C2C1: Float, p_C2C1: Float) -> Float:
     """E = [p]x R (9.12), (3, 3)."""
     E: Float = so3.hat(p_C2C1) @ R_C2C1
