@@ -99,35 +99,8 @@ def test_association_interpolates_the_truth_where_it_covers_the_estimate():
     np.testing.assert_allclose(interpolated.p_WB, (truth.p_WB[1:] + truth.p_WB[:-1]) / 2, atol=1e-6)
 
 
-@pytest.mark.parametrize("swapped", [False, True])
-def test_nearest_association_pairs_each_pose_once(swapped):
-    dense = flight(100)
-    sparse = dense.select(np.arange(5, 100, 10))
-    jitter_ns = np.random.default_rng(0).integers(-9_000_000, 9_000_000, len(sparse))
-    sparse = Trajectory(sparse.t_ns + jitter_ns, sparse.R_WB, sparse.p_WB)
-    first, second = associate(*((dense, sparse) if swapped else (sparse, dense)), "nearest", max_dt_s=0.01)
-    np.testing.assert_array_equal(first.p_WB, second.p_WB)
-    assert len(first) == len(sparse)
-
-
-def test_nearest_association_gives_a_pose_wanted_twice_to_the_closer_one():
-    ms = 1_000_000
-    R, p = np.tile(np.eye(3), (4, 1, 1)), np.zeros((4, 3))
-    dense = Trajectory(np.array([0, 100, 200, 300]) * ms, R, p)
-    sparse = Trajectory(np.array([93, 104, 209]) * ms, R[:3], p[:3])
-    first, second = associate(sparse, dense, "nearest", max_dt_s=0.01)
-    np.testing.assert_array_equal(first.t_ns, np.array([104, 209]) * ms)
-    np.testing.assert_array_equal(second.t_ns, np.array([100, 200]) * ms)
-
-
-@pytest.mark.parametrize("method", ["interpolate", "nearest"])
-def test_trajectories_of_different_clocks_are_told_apart(method):
+def test_trajectories_of_different_clocks_are_told_apart():
     truth = flight()
     later = Trajectory(truth.t_ns + 3_600_000_000_000, truth.R_WB, truth.p_WB)
     with pytest.raises(TrajectoryError, match="no stamps in common"):
-        associate(later, truth, method)
-
-
-def test_an_unknown_association_is_an_error():
-    with pytest.raises(TrajectoryError, match="unknown association 'linear'; use interpolate or nearest"):
-        associate(flight(), flight(), "linear")
+        associate(later, truth)

@@ -1,9 +1,7 @@
 """Trajectories: files, association, alignment and error metrics. Everything is pure; nothing mutates its input."""
 
 from vioframe.evaluation.alignment import ALIGNED_BY, ALIGNMENTS, Alignment
-from vioframe.evaluation.association import associate
-from vioframe.evaluation.comparison import Comparison
-from vioframe.evaluation.evaluation import TrajectoryErrors, evaluate
+from vioframe.evaluation.evaluation import Comparison, TrajectoryErrors, associate, evaluate
 from vioframe.evaluation.metrics import RelativeErrors, Stats
 from vioframe.evaluation.nees import Nees
 

@@ -1,16 +1,16 @@
-"""The one function that turns an estimate and its ground truth into numbers."""
+"""An estimate beside the truth, and the one function that turns the two into numbers."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from vioframe.errors import TrajectoryError
 from vioframe.evaluation.alignment import ALIGNMENTS, Alignment, align_posyaw_by_attitude, align_se3, align_sim3
-from vioframe.evaluation.association import Association, associate
 from vioframe.evaluation.metrics import (
     RelativeErrors,
     Stats,
@@ -101,24 +101,42 @@ class TrajectoryErrors:
         }
 
 
-def evaluate(
-    estimate: Trajectory,
-    ground_truth: Trajectory,
-    *,
-    alignment: str = "posyaw",
-    association: Association = "interpolate",
-    max_gap_s: float = 0.1,
-    max_dt_s: float = 0.01,
-    lengths_m: Sequence[float] = LENGTHS_M,
-) -> TrajectoryErrors:
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """What a metric looks at: ``estimate`` in its own world and ``ground_truth`` at its own rate, both whole.
+
+    ``errors`` are those of the poses that belong together, aligned by position and yaw, the gauge that a
+    visual-inertial system leaves open.
+    """
+
+    estimate: Trajectory
+    ground_truth: Trajectory
+    errors: TrajectoryErrors
+
+    @classmethod
+    def of(cls, estimate: Trajectory, ground_truth: Trajectory) -> Self:
+        """Raises :class:`TrajectoryError` where the two cannot be compared."""
+        return cls(estimate, ground_truth, evaluate(estimate, ground_truth))
+
+    @property
+    def truth(self) -> Trajectory:
+        """The true pose, interpolated, for each of the N poses of the estimate that have one."""
+        return self.errors.truth
+
+    @property
+    def unaligned(self) -> Trajectory:
+        """Those N poses of the estimate, in its own world."""
+        return self.estimate.select(np.isin(self.estimate.t_ns, self.truth.t_ns))
+
+
+def evaluate(estimate: Trajectory, ground_truth: Trajectory, *, alignment: str = "posyaw") -> TrajectoryErrors:
     """Associate, align and measure. The estimate is moved, never the truth; neither is changed.
 
-    ``alignment`` is one of :data:`ALIGNMENTS`; ``association`` and its limits are those of :func:`associate`. Raises
-    :class:`TrajectoryError` where the two cannot be compared.
+    ``alignment`` is one of :data:`ALIGNMENTS`. Raises :class:`TrajectoryError` where the two cannot be compared.
     """
     if alignment not in ALIGNMENTS:
         raise TrajectoryError(f"unknown alignment {alignment!r}; use one of {', '.join(ALIGNMENTS)}")
-    raw, truth = associate(estimate, ground_truth, association, max_gap_s=max_gap_s, max_dt_s=max_dt_s)
+    raw, truth = associate(estimate, ground_truth)
     at_rest = _spread_m(truth) < _AT_REST_M
     fit = align_posyaw_by_attitude if at_rest and alignment == "posyaw" else ALIGNMENTS[alignment]
     transform = fit(raw, truth)
@@ -126,7 +144,7 @@ def evaluate(
     rotation_rpy_deg = rotation_error_rpy_deg(aligned, truth)
     position_m = position_error_W(aligned, truth)
     path_m = truth.path_length_m
-    by_length = {} if at_rest else relative_errors(aligned, truth, {length: length for length in lengths_m})
+    by_length = {} if at_rest else relative_errors(aligned, truth, {length: length for length in LENGTHS_M})
     by_fraction = {} if at_rest else relative_errors(aligned, truth, {part: part * path_m for part in FRACTIONS})
     ate_se3_m, scale = (None, None) if at_rest else _se3_ate_and_scale(raw, truth)
     return TrajectoryErrors(
@@ -147,6 +165,20 @@ def evaluate(
         coverage=min(1.0, raw.duration_s / ground_truth.duration_s) if len(ground_truth) > 1 else 1.0,
         notes=tuple(_notes(estimate, raw, aligned, truth, at_rest)),
     )
+
+
+def associate(estimate: Trajectory, ground_truth: Trajectory) -> tuple[Trajectory, Trajectory]:
+    """The poses of ``estimate`` that have a true one, and those, pairwise.
+
+    The ground truth, the denser of the two, is brought onto the estimate's stamps wherever it :meth:`covers
+    <Trajectory.covers>` them. Raises :class:`TrajectoryError` where it covers none.
+    """
+    covered = ground_truth.covers(estimate.t_ns)
+    if not covered.any():
+        spans = " and ".join(f"{x.t_ns[0] * 1e-9:.3f} .. {x.t_ns[-1] * 1e-9:.3f} s" for x in (estimate, ground_truth))
+        raise TrajectoryError(f"no stamps in common: the trajectories span {spans}; are they of one flight and clock?")
+    matched = estimate.select(covered)
+    return matched, ground_truth.at(matched.t_ns)
 
 
 def _spread_m(trajectory: Trajectory) -> float:
