@@ -39,25 +39,15 @@ def test_projection_agrees_with_opencv(camera):
 
 
 @CASES
-def test_jacobian_is_the_derivative(camera):
-    n, eps = camera.undistort(_pixels(camera)), 1e-6
-    numeric = np.stack([(camera.distort(n + eps * e) - camera.distort(n - eps * e)) / (2 * eps) for e in np.eye(2)], -1)
-    np.testing.assert_allclose(camera.distort_jacobian(n), numeric, atol=1e-5)
-
-
-@CASES
 def test_compiled_twins_agree(camera):
-    model, k = kernels.intrinsics_of(camera)
-    for xy, n, J in zip(
-        _pixels(camera),
-        camera.undistort(_pixels(camera)),
-        camera.distort_jacobian(camera.undistort(_pixels(camera))),
-        strict=True,
-    ):
-        drawn, drawn_J = kernels.distort(model, k, *n)
+    (model, k), eps = kernels.intrinsics_of(camera), 1e-6
+    n = camera.undistort(_pixels(camera))
+    J = np.stack([(camera.distort(n + eps * e) - camera.distort(n - eps * e)) / (2 * eps) for e in np.eye(2)], axis=-1)
+    for xy, n_i, J_i in zip(_pixels(camera), n, J, strict=True):
+        drawn, drawn_J = kernels.distort(model, k, *n_i)
         np.testing.assert_allclose(drawn, xy, atol=1e-8)
-        np.testing.assert_allclose(drawn_J, J, rtol=1e-9, atol=1e-9)
-        np.testing.assert_allclose(kernels.undistort(model, k, *xy, *(n + 0.01)), n, atol=1e-8)
+        np.testing.assert_allclose(drawn_J, J_i, atol=1e-5)
+        np.testing.assert_allclose(kernels.undistort(model, k, *xy, *(n_i + 0.01)), n_i, atol=1e-8)
 
 
 @CASES

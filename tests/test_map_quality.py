@@ -11,8 +11,7 @@ from trajectory_helpers import disturbed, flight, moved, write_run
 
 from vioframe.cli import main
 from vioframe.errors import ConfigError, RunError
-from vioframe.evaluation.landmarks import Landmarks, belonging, read_landmarks
-from vioframe.evaluation.map_quality import MapQuality
+from vioframe.evaluation.landmarks import Landmarks, MapQuality, belonging, read_landmarks
 from vioframe.geometry import so3
 from vioframe.geometry.meshes import distances, read_mesh
 from vioframe.io.trajectories import write_tum
@@ -62,7 +61,7 @@ def test_the_figures_are_those_of_the_distances():
     assert quality.median_m == pytest.approx(0.08, abs=1e-6)
     assert quality.rmse_m == pytest.approx(np.sqrt(np.mean(FAR_M**2)), abs=1e-6)
     assert quality.q90_m == pytest.approx(0.3, abs=1e-6)  # 0.15 and 0.4 are the 75 and 100 % quantiles
-    assert quality.within == ((0.05, 0.4), (0.1, 0.6), (0.2, 0.8))
+    assert quality.within == {"5cm": 0.4, "10cm": 0.6, "20cm": 0.8}
 
 
 @pytest.mark.parametrize("yaw", [0.0, 2.0])

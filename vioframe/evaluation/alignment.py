@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from types import MappingProxyType
 
 import numpy as np
 
@@ -70,14 +69,15 @@ def align_sim3(estimate: Trajectory, truth: Trajectory) -> Alignment:
     return _umeyama(estimate, truth, with_scale=True)
 
 
-ALIGNMENTS: Mapping[str, Callable[[Trajectory, Trajectory], Alignment]] = MappingProxyType(
-    {"posyaw": align_posyaw, "se3": align_se3, "sim3": align_sim3, "first": align_first}
-)
+ALIGNMENTS: Mapping[str, Callable[[Trajectory, Trajectory], Alignment]] = {
+    "posyaw": align_posyaw,
+    "se3": align_se3,
+    "sim3": align_sim3,
+    "first": align_first,
+}
 """By the names that the command line and :func:`vioframe.evaluation.evaluate` use."""
 
-ALIGNED_BY: Mapping[str, str] = MappingProxyType(
-    {"posyaw": "position + yaw", "se3": "SE(3)", "sim3": "Sim(3)", "first": "first pose"}
-)
+ALIGNED_BY = {"posyaw": "position + yaw", "se3": "SE(3)", "sim3": "Sim(3)", "first": "first pose"}
 """What each of them fits, in words."""
 
 

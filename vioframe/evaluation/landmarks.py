@@ -1,12 +1,15 @@
-"""The landmark cloud of a run: reading it, and telling the landmarks that stand alone from those that belong.
+"""The landmark cloud of a run: reading it, telling landmarks that stand alone from those that belong, and its quality.
 
-A run folder keeps every landmark that its back-end spoke of. Cleaning is the reader's choice, made here.
+A run folder keeps every landmark that its back-end spoke of. Cleaning is the reader's choice, made here. What is
+measured against the surfaces of a simulated world, the only one known well enough, are all of them, the outliers too: a
+metric that cleans first hides what it should show. Median and quantiles are not led by a few far ones; RMSE is.
 """
 
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
 from io import StringIO
 from pathlib import Path
 
@@ -15,7 +18,10 @@ from numpy.typing import NDArray
 
 from vioframe.errors import RunError
 from vioframe.evaluation import Alignment
+from vioframe.geometry.meshes import distances
 from vioframe.types import Float, Int
+
+WITHIN_CM = (5, 10, 20)
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,3 +74,32 @@ def belonging(p_WF: Float, neighbours: int = 20, std_ratio: float = 2.0) -> NDAr
     k = min(neighbours, len(p_WF))
     distance = np.asarray(KDTree(p_WF).query(p_WF, k=k)[0]).reshape(len(p_WF), k).mean(axis=1)
     return np.asarray(distance <= distance.mean() + std_ratio * distance.std(ddof=1))
+
+
+@dataclass(frozen=True)
+class MapQuality:
+    """Unsigned distances of ``landmarks`` from the mesh ``world``; ``within`` is a part by distance, such as "5cm"."""
+
+    world: str
+    landmarks: int
+    median_m: float
+    rmse_m: float
+    q90_m: float
+    within: Mapping[str, float]
+
+    @classmethod
+    def of(cls, p_GF: Float, corners: Float, world: Path) -> MapQuality:
+        """Of landmarks (M, 3) m, M >= 1, in the world of the triangles ``corners`` (T, 3, 3) m."""
+        distance = distances(p_GF, corners)
+        return cls(
+            world=str(world),
+            landmarks=len(distance),
+            median_m=float(np.median(distance)),
+            rmse_m=float(np.sqrt(np.mean(distance**2))),
+            q90_m=float(np.quantile(distance, 0.9)),
+            within={f"{limit}cm": float(np.mean(distance <= 0.01 * limit)) for limit in WITHIN_CM},
+        )
+
+    def to_dict(self) -> dict[str, object]:
+        """Plain values for JSON."""
+        return asdict(self)

@@ -92,10 +92,6 @@ class Camera:
         guess[~solved] = np.nan
         return guess
 
-    def distort_jacobian(self, xy_normalised: ArrayLike) -> Float:
-        """d xy / d xy_normalised, (N, 2, 2) px."""
-        return self._distort_jacobian(np.asarray(xy_normalised, dtype=np.float64)) * self._focal[:, None]
-
     def contains(self, xy: ArrayLike, border_px: float = 0.0) -> NDArray[np.bool_]:
         """(N,) whether pixels lie in the image, at least ``border_px`` from its outermost pixel centres."""
         xy = np.asarray(xy, dtype=np.float64).reshape(-1, 2)
@@ -105,39 +101,36 @@ class Camera:
     def _distort(self, xy: Float) -> Float:
         x, y = xy[:, 0], xy[:, 1]
         r2 = x * x + y * y
-        if self.distortion_model == "radtan":
-            k1, k2, p1, p2 = self.distortion
-            radial = 1.0 + r2 * (k1 + k2 * r2)
-            return np.stack(
-                [
-                    x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x),
-                    y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y,
-                ],
-                axis=1,
-            )
-        return xy * self._equidistant_scale(r2)[0][:, None]
+        scale, _ = self._radial(r2)
+        p1, p2 = self._tangential
+        return np.stack(
+            [
+                x * scale + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x),
+                y * scale + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y,
+            ],
+            axis=1,
+        )
 
     def _distort_jacobian(self, xy: Float) -> Float:
         x, y = xy[:, 0], xy[:, 1]
-        r2 = x * x + y * y
+        scale, slope = self._radial(x * x + y * y)
+        p1, p2 = self._tangential
         J = np.empty((len(xy), 2, 2))
-        if self.distortion_model == "radtan":
-            k1, k2, p1, p2 = self.distortion
-            radial = 1.0 + r2 * (k1 + k2 * r2)
-            slope = 2.0 * (k1 + 2.0 * k2 * r2)  # d radial / d r2, times 2
-            J[:, 0, 0] = radial + slope * x * x + 2.0 * p1 * y + 6.0 * p2 * x
-            J[:, 1, 1] = radial + slope * y * y + 6.0 * p1 * y + 2.0 * p2 * x
-            J[:, 0, 1] = J[:, 1, 0] = slope * x * y + 2.0 * p1 * x + 2.0 * p2 * y
-            return J
-        scale, slope = self._equidistant_scale(r2)
-        J[:, 0, 0] = scale + slope * x * x
-        J[:, 1, 1] = scale + slope * y * y
-        J[:, 0, 1] = J[:, 1, 0] = slope * x * y
+        J[:, 0, 0] = scale + slope * x * x + 2.0 * p1 * y + 6.0 * p2 * x
+        J[:, 1, 1] = scale + slope * y * y + 6.0 * p1 * y + 2.0 * p2 * x
+        J[:, 0, 1] = J[:, 1, 0] = slope * x * y + 2.0 * p1 * x + 2.0 * p2 * y
         return J
 
-    def _equidistant_scale(self, r2: Float) -> tuple[Float, Float]:
-        """theta_d / r, and its derivative by r divided by r (Kannala and Brandt 2006)."""
+    @property
+    def _tangential(self) -> tuple[float, float]:
+        return self.distortion[2:] if self.distortion_model == "radtan" else (0.0, 0.0)
+
+    def _radial(self, r2: Float) -> tuple[Float, Float]:
+        """How far out a point is moved, as a factor of its radius r, and the factor's derivative by r divided by r."""
         k1, k2, k3, k4 = self.distortion
+        if self.distortion_model == "radtan":
+            return 1.0 + r2 * (k1 + k2 * r2), 2.0 * (k1 + 2.0 * k2 * r2)
+        # theta_d / r (Kannala and Brandt 2006).
         r = np.sqrt(r2)
         small = r < 1e-6
         safe = np.where(small, 1.0, r)

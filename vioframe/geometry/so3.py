@@ -63,11 +63,6 @@ def right_jacobian(phi: ArrayLike) -> Float:
     return out
 
 
-def left_jacobian(phi: ArrayLike) -> Float:
-    """J_l(phi) = J_r(-phi) [145], (..., 3, 3)."""
-    return right_jacobian(-np.asarray(phi, dtype=np.float64))
-
-
 def right_jacobian_inverse(phi: ArrayLike) -> Float:
     """J_r^-1 with ``Log(Exp(phi) Exp(d)) ~ phi + J_r^-1(phi) d`` [144], (..., 3, 3)."""
     phi = np.asarray(phi, dtype=np.float64)

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from vioframe.errors import ConfigError, RunError
-from vioframe.evaluation.map_quality import MapQuality
+from vioframe.evaluation.landmarks import MapQuality
 from vioframe.geometry.meshes import read_mesh
 from vioframe.types import Float
 

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from vioframe.evaluation import ALIGNED_BY
-from vioframe.evaluation.map_quality import WITHIN_M
+from vioframe.evaluation.landmarks import WITHIN_CM
 from vioframe.report.table import UNKNOWN, markdown
 from vioframe.runs.evaluated import Evaluated
 
@@ -54,9 +54,7 @@ _MAP = {
     "median": "{map[median_m]:.4f}",
     "90 % are within": "{map[q90_m]:.4f}",
     "RMSE": "{map[rmse_m]:.4f}",
-    "within " + ", ".join(f"{100 * limit:g}" for limit in WITHIN_M) + " cm": ", ".join(
-        f"{{map[within][{100 * limit:g}cm]:.1%}}" for limit in WITHIN_M
-    ),
+    f"within {', '.join(map(str, WITHIN_CM))} cm": ", ".join(f"{{map[within][{limit}cm]:.1%}}" for limit in WITHIN_CM),
 }
 
 

@@ -12,8 +12,7 @@ import numpy as np
 
 from vioframe.errors import RunError, VioframeError
 from vioframe.evaluation import Comparison, TrajectoryErrors, associate, evaluate
-from vioframe.evaluation.landmarks import Landmarks, belonging
-from vioframe.evaluation.map_quality import MapQuality
+from vioframe.evaluation.landmarks import Landmarks, MapQuality, belonging
 from vioframe.geometry.trajectory import Trajectory
 from vioframe.io.trajectories import load_trajectory, write_tum
 from vioframe.runs.folder import RunFolder
