@@ -24,7 +24,7 @@ Speed = Annotated[float, Field(gt=0.0, le=10.0, description="how many times as f
 
 def standstill(duration_s: float, R_LB: Float) -> ShapedFlight:
     """At rest and level."""
-    return _scaled(duration_s, R_LB, _still, _still, 1.0, 1.0)
+    return _scaled(duration_s, R_LB, _waves(), _waves(), 1.0, 1.0)
 
 
 def hover(duration_s: float, R_LB: Float, *, size: Size = 1.0, speed: Speed = 1.0) -> ShapedFlight:
@@ -109,12 +109,12 @@ def tour(
 def pure_rotation(duration_s: float, R_LB: Float, *, speed: Speed = 1.0) -> ShapedFlight:
     """Turning on the spot, without any translation of the body."""
     attitude = _waves((0, 0.8, 6.0, 0.0), (1, 0.3, 3.7, 0.0), (2, 0.3, 4.3, 0.0))
-    return _scaled(duration_s, R_LB, _still, attitude, 1.0, speed)
+    return _scaled(duration_s, R_LB, _waves(), attitude, 1.0, speed)
 
 
 def constant_velocity(duration_s: float, R_LB: Float, *, speed: Speed = 1.0) -> ShapedFlight:
     """Straight ahead at 1 m/s without turning: nothing that an accelerometer could tell from rest."""
-    return _scaled(duration_s, R_LB, _ahead, _still, 1.0, speed)
+    return _scaled(duration_s, R_LB, lambda t_s: np.outer(t_s, [1.0, 0.0, 0.0]), _waves(), 1.0, speed)
 
 
 _TOUR = (0.6, 0.3, 0.1)
@@ -168,7 +168,7 @@ def _scaled(
 
 
 def _waves(*terms: tuple[int, float, float, float]) -> Shape:
-    """Sum of sines in three channels; a term is (channel, amplitude, period in s, phase in turns)."""
+    """Sum of sines in three channels; a term is (channel, amplitude, period in s, phase in turns). None is rest."""
 
     def shape(t_s: Float) -> Float:
         out = np.zeros((len(t_s), 3))
@@ -177,14 +177,6 @@ def _waves(*terms: tuple[int, float, float, float]) -> Shape:
         return out
 
     return shape
-
-
-def _still(t_s: Float) -> Float:
-    return np.zeros((len(t_s), 3))
-
-
-def _ahead(t_s: Float) -> Float:
-    return np.outer(t_s, [1.0, 0.0, 0.0])
 
 
 def _stop_and_go(shape: Shape) -> Shape:
@@ -200,14 +192,5 @@ def _stop_and_go(shape: Shape) -> Shape:
 
 @hookimpl
 def vioframe_flights() -> Mapping[str, FlightFactory]:
-    return {
-        "standstill": standstill,
-        "hover": hover,
-        "figure_eight": figure_eight,
-        "aggressive": aggressive,
-        "stop_and_go": stop_and_go,
-        "inspection": inspection,
-        "tour": tour,
-        "pure_rotation": pure_rotation,
-        "constant_velocity": constant_velocity,
-    }
+    flights = (standstill, hover, figure_eight, aggressive, stop_and_go, inspection, tour)
+    return {flight.__name__: flight for flight in (*flights, pure_rotation, constant_velocity)}

@@ -12,6 +12,7 @@ from vioframe.geometry import so3
 from vioframe.geometry.cameras import Camera
 from vioframe.io.calibration import packaged_calibration
 from vioframe.simulation.camera import Photographer, Shot, Studio, take_pictures
+from vioframe.simulation.conditions import Conditions
 from vioframe.simulation.renderer import Renderer
 from vioframe.simulation.textures import SIZE, images_as_textures, procedural_textures
 from vioframe.simulation.world import MeshBuilder, MeshWorld, draw_movers
@@ -127,7 +128,7 @@ def shots(count: int, instants: int = 1) -> list[Shot]:
 
 
 def test_the_number_of_processes_makes_no_difference():
-    studio = Studio((SMALL,), board(), noise_deviation=0.05)
+    studio = Studio((SMALL,), board(), conditions=Conditions(noise=0.6))
     alone, together = (list(take_pictures(studio, shots(11), workers)) for workers in (1, 2))
     assert len(alone) == len(together) == 11
     assert all(np.array_equal(a, b) for a, b in zip(alone, together, strict=True))
@@ -140,10 +141,10 @@ def test_noise_is_as_strong_as_asked_and_gain_saturates():
     (shot,) = shots(1)
     inside = np.s_[40:80, 60:130]
     clean = Photographer(studio).take(shot)[inside].astype(float)
-    noisy = Photographer(replace(studio, noise_deviation=0.05)).take(shot)[inside].astype(float)
-    assert (noisy - clean).std() == pytest.approx(0.05 * 255, rel=0.1)
+    noisy = Photographer(replace(studio, conditions=Conditions(noise=0.6))).take(shot)[inside].astype(float)
+    assert (noisy - clean).std() == pytest.approx(0.048 * 255, rel=0.1)
     assert abs((noisy - clean).mean()) < 1.0
-    dark = Photographer(replace(studio, light=0.03)).take(shot)[inside].astype(float)
+    dark = Photographer(replace(studio, conditions=Conditions(low_light=1.0))).take(shot)[inside].astype(float)
     assert dark.mean() == pytest.approx(clean.mean(), abs=2.0)
     assert (dark - clean).std() > 8.0
     assert (Photographer(studio).take(replace(shot, gain=8.0))[inside] == 255).all()

@@ -7,8 +7,8 @@ from simulated_imu import dead_reckoning_error_m
 from vioframe.errors import ConfigError, TrajectoryError
 from vioframe.geometry import so3
 from vioframe.geometry.trajectory import Trajectory
-from vioframe.io.trajectories import load_trajectory, write_tum
-from vioframe.simulation.flights import fit_flight, flight, flight_from_file
+from vioframe.io.trajectories import load_trajectory
+from vioframe.simulation.flights import fit_flight, flight
 from vioframe.testing import check_flight
 
 EUROC = {
@@ -73,22 +73,6 @@ def test_a_turn_through_many_revolutions_stays_smooth():
     np.testing.assert_allclose(motion.omega_B, np.tile(3.0 * axis, (700, 1)), atol=1e-3)
 
 
-@pytest.mark.parametrize("suffix", ["tum", "tum.gz", "csv", "csv.gz"])
-def test_reads_tum_and_euroc_files(tmp_path, suffix):
-    import gzip
-
-    trajectory, path = recording(), tmp_path / f"flight.{suffix}"
-    if "tum" in suffix:
-        write_tum(trajectory, path)
-    else:
-        rows = zip(trajectory.t_ns.tolist(), trajectory.p_WB, trajectory.quat_xyzw[:, [3, 0, 1, 2]], strict=True)
-        text = "".join(f"{t},{','.join(f'{x:.12f}' for x in [*p, *q])}\n" for t, p, q in rows)
-        path.write_bytes(gzip.compress(text.encode()) if suffix.endswith("gz") else text.encode())
-    found, expected = (f.at(np.linspace(0.0, 5.0, 50)) for f in (flight_from_file(path), fit_flight(trajectory)))
-    np.testing.assert_allclose(found.p_WB, expected.p_WB, atol=1e-7)
-    np.testing.assert_allclose(found.omega_B, expected.omega_B, atol=1e-7)
-
-
 def test_a_piece_is_the_same_motion_from_its_start_on():
     trajectory = recording()
     whole, piece = fit_flight(trajectory), fit_flight(trajectory, 3.0, 5.0)
@@ -151,22 +135,10 @@ def test_settings_out_of_range_are_refused(options):
         fit_flight(recording(), **options)
 
 
-def test_repeated_and_unordered_stamps_are_refused_with_the_line(tmp_path):
-    write_tum(recording(), tmp_path / "flight.tum")
-    lines = (tmp_path / "flight.tum").read_text().splitlines()
-    for name, spoilt, why in (
-        ("repeat", [*lines[:50], lines[49], *lines[50:]], "line 51: the stamp .* repeats"),
-        ("swap", [*lines[:50], lines[51], lines[50], *lines[52:]], "line 52: the stamp .* is before"),
-    ):
-        (tmp_path / f"{name}.tum").write_text("\n".join(spoilt) + "\n")
-        with pytest.raises(TrajectoryError, match=why):
-            flight_from_file(tmp_path / f"{name}.tum")
-
-
 @pytest.mark.parametrize("name", EUROC)
 def test_a_real_flight_is_near_its_ground_truth_and_turns_as_its_gyroscope_says(shared_data, name):
     truth = load_trajectory(shared_data / EUROC[name])
-    path = flight_from_file(shared_data / EUROC[name])
+    path = fit_flight(truth)
     motion = path.at((truth.t_ns - truth.t_ns[0]) * 1e-9)
     off_m, off_deg = np.linalg.norm(motion.p_WB - truth.p_WB, axis=1), angle_deg(motion.R_WB, truth.R_WB)
     assert off_m.max() < 0.03  # half of the step in MH_05
@@ -189,4 +161,4 @@ def test_a_real_flight_is_near_its_ground_truth_and_turns_as_its_gyroscope_says(
 
 @pytest.mark.parametrize(("name", "start_s"), [("MH_05_difficult", 20.0), ("V1_02_medium", 20.0)])
 def test_exact_readings_integrate_back_to_a_recorded_flight(shared_data, name, start_s):
-    assert dead_reckoning_error_m(flight_from_file(shared_data / EUROC[name], start_s, 10.0)) < 1e-3
+    assert dead_reckoning_error_m(fit_flight(load_trajectory(shared_data / EUROC[name]), start_s, 10.0)) < 1e-3

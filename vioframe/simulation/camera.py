@@ -8,7 +8,7 @@ from collections import deque
 from collections.abc import Iterable, Iterator
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from multiprocessing import get_context, parent_process
 from threading import Thread
 
@@ -18,6 +18,7 @@ from vioframe.arrays import Float, Image
 from vioframe.errors import DatasetError
 from vioframe.geometry.cameras import Camera
 from vioframe.interfaces import World
+from vioframe.simulation.conditions import Conditions
 from vioframe.simulation.renderer import Float32, Renderer
 from vioframe.simulation.world import Movers
 
@@ -46,41 +47,33 @@ class Shot:
 
 @dataclass(frozen=True)
 class Studio:
-    """All that is the same for every picture: world, optics and sensors. Small enough to be sent to other processes.
-
-    ``light`` is the part of full light there is, which the gain makes up for; ``noise_deviation`` is added to that of
-    the sensor itself, 1 is white; ``dynamic_range`` is the exponent of light around middle grey.
-    """
+    """All that is the same for every picture: world, optics and sensors. Small enough to be sent to other processes."""
 
     cameras: tuple[Camera, ...]
     world: World
     movers: Movers | None = None
-    contrast: float = 1.0
-    fog_per_m: float = 0.0
-    light: float = 1.0
-    noise_deviation: float = 0.0
-    dynamic_range: float = 1.0
+    conditions: Conditions = field(default_factory=Conditions)
 
 
 class Photographer:
     """Takes the pictures of a studio, the same ones for the same shots."""
 
     def __init__(self, studio: Studio) -> None:
-        self._studio = studio
+        self._conditions = conditions = studio.conditions
         self._renderers = [
-            Renderer(camera, studio.world, studio.movers, contrast=studio.contrast, fog_per_m=studio.fog_per_m)
+            Renderer(camera, studio.world, studio.movers, contrast=conditions.contrast, fog_per_m=conditions.fog_per_m)
             for camera in studio.cameras
         ]
 
     def take(self, shot: Shot) -> Image:
         """(height, width) uint8."""
-        studio, renderer = self._studio, self._renderers[shot.camera]
+        conditions, renderer = self._conditions, self._renderers[shot.camera]
         movers = [None] * len(shot.p_WC) if shot.p_WM is None else shot.p_WM
         light = np.mean([renderer.render(*at) for at in zip(shot.R_WC, shot.p_WC, movers, strict=True)], axis=0)
-        if studio.dynamic_range != 1.0:
-            light = _MIDDLE_GREY * (light / _MIDDLE_GREY) ** studio.dynamic_range
-        rng = np.random.default_rng(shot.seed)
-        return digitise(light, rng, gain=shot.gain, exposed=studio.light, noise_deviation=studio.noise_deviation)
+        if conditions.dynamic_range != 1.0:
+            light = _MIDDLE_GREY * (light / _MIDDLE_GREY) ** conditions.dynamic_range
+        rng, noise_deviation = np.random.default_rng(shot.seed), conditions.noise_deviation
+        return digitise(light, rng, gain=shot.gain, exposed=conditions.light, noise_deviation=noise_deviation)
 
 
 def digitise(

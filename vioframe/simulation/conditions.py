@@ -85,11 +85,12 @@ class Conditions(Section):
 
     @property
     def light(self) -> float:
+        """The part of full light there is, which the gain makes up for."""
         return 1.0 - 0.97 * self.low_light
 
     @property
     def noise_deviation(self) -> float:
-        """Of the read-out noise, where white is 1."""
+        """Of noise beside that of the sensor itself, where white is 1."""
         return 0.08 * self.noise
 
     @property

@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -20,7 +19,6 @@ from vioframe.errors import ConfigError, TrajectoryError
 from vioframe.geometry import so3
 from vioframe.geometry.trajectory import Trajectory
 from vioframe.interfaces import Flight
-from vioframe.io.trajectories import load_trajectory
 from vioframe.parts import registry
 from vioframe.types import NS_PER_S, Motion
 
@@ -146,22 +144,16 @@ class RecordedFlight:
         return Motion(so3.from_quat_xyzw(quat), p_WB, v_WB, a_WB, omega_B)
 
 
-def flight_from_file(path: str | Path, start_s: float = 0.0, duration_s: float | None = None) -> RecordedFlight:
-    """The flight along the TUM or EuRoC file ``path``, whose poses are the body's in a world with z up.
-
-    ``start_s`` counts from the file's first pose; ``duration_s`` None, or more than there is, is to its last. Motion
-    faster than the knots, 0.1 s apart or two poses where that is more, is smoothed, and so are steps of the recording,
-    which no body could fly. Raises :class:`TrajectoryError`, with the time, for gaps and jumps, and for a motion that
-    comes out beyond what a vehicle can do.
-    """
-    path = Path(path)
-    return fit_flight(load_trajectory(path), start_s, duration_s, name=path.name)
-
-
 def fit_flight(
     trajectory: Trajectory, start_s: float = 0.0, duration_s: float | None = None, *, name: str = "the trajectory"
 ) -> RecordedFlight:
-    """As :func:`flight_from_file`, from poses at hand; errors call them ``name``."""
+    """The flight along ``trajectory``, the body's poses in a world with z up; errors call it ``name``.
+
+    ``start_s`` counts from its first pose; ``duration_s`` None, or more than there is, is to its last. Motion faster
+    than the knots, 0.1 s apart or two poses where that is more, is smoothed, and so are steps of the recording, which
+    no body could fly. Raises :class:`TrajectoryError`, with the time, for gaps and jumps, and for a motion that comes
+    out beyond what a vehicle can do.
+    """
     from scipy.interpolate import make_lsq_spline
 
     if not (0.0 <= start_s < np.inf and (duration_s is None or 0.0 < duration_s < np.inf)):

@@ -11,11 +11,12 @@ from vioframe.arrays import Float, Int
 from vioframe.errors import ConfigError
 from vioframe.interfaces import Flight
 from vioframe.io.calibration import load_calibration, packaged_calibration
+from vioframe.io.trajectories import load_trajectory
 from vioframe.parts.registry import Registry
 from vioframe.simulation.camera import Shot, Studio, take_pictures
 from vioframe.simulation.conditions import Conditions
 from vioframe.simulation.config import SimulationConfig
-from vioframe.simulation.flights import flight_from_file, levelled
+from vioframe.simulation.flights import fit_flight, levelled
 from vioframe.simulation.imu import ImuErrors, vibration
 from vioframe.simulation.scenario import Scenario, fly, load_euroc
 from vioframe.simulation.world import MeshWorld, check_clear, draw_movers
@@ -80,8 +81,9 @@ class SimulatedRecording:
         if config.recorded is not None:
             return load_euroc(config.recorded, start_s=config.start_s, duration_s=config.duration_s)
         if config.trajectory is not None:
-            flight: Flight = flight_from_file(config.trajectory, config.start_s, config.duration_s)
-            name = config.trajectory.name.partition(".")[0]
+            file, poses = config.trajectory.name, load_trajectory(config.trajectory)
+            flight: Flight = fit_flight(poses, config.start_s, config.duration_s, name=file)
+            name = file.partition(".")[0]
         else:
             # The first camera looks ahead.
             R_LB = levelled(calibration.cameras[0].R_BC)
@@ -129,17 +131,8 @@ class SimulatedRecording:
 
     def measurements(self) -> Iterator[Measurement]:
         """IMU samples and frames in the order of their stamps."""
-        conditions = self.conditions
-        studio = Studio(
-            tuple(camera.model for camera in self.true_calibration.cameras),
-            self.world,
-            self._movers,
-            contrast=conditions.contrast,
-            fog_per_m=conditions.fog_per_m,
-            light=conditions.light,
-            noise_deviation=conditions.noise_deviation,
-            dynamic_range=conditions.dynamic_range,
-        )
+        models = tuple(camera.model for camera in self.true_calibration.cameras)
+        studio = Studio(models, self.world, self._movers, self.conditions)
         pictures = take_pictures(studio, self._shots(), self._workers)
         samples: Iterable[Measurement] = self._imu
         # As many pictures to a frame as there are cameras.

@@ -26,7 +26,7 @@ _SPARE_NS = 20_000_000
 _IMU_FILES = ("imu0/data.csv", "imu0/data.csv.gz")
 _STAMP_FILES = ("cam0/data.csv", "cam0/timestamps_ns.txt.gz")
 # In the order they are preferred: V1_01 has the recomputed one too, and the orientation in its csv file is off.
-GROUND_TRUTH_FILES = (
+_GROUND_TRUTH_FILES = (
     "groundtruth_pose_recomputed_tum.txt.gz",
     "groundtruth_pose_vel_merged.csv.gz",
     "state_groundtruth_estimate0/data.csv",
@@ -113,8 +113,7 @@ def load_euroc(
     the truth: that of the machine hall jumps, by up to 8 cm from one sample to the next, where its batch solution
     corrects itself, and no IMU feels that. Raises :class:`DatasetError` where a file is missing or no frame is left.
     """
-    folder = sensor_folder(path)
-    readings_file, stamps_file, truth_file = motion_files(folder)
+    readings_file, stamps_file, truth_file = motion_files(path)
     imu_ns, imu = _read_csv(readings_file, range(1, 7))
     frames_ns, _ = _read_csv(stamps_file)
     truth = load_trajectory(truth_file)
@@ -140,6 +139,7 @@ def load_euroc(
         t_ns = np.clip(t_ns, truth.t_ns[0], truth.t_ns[-1])
         return *interpolate_poses(truth.t_ns, truth.R_WB, p_WB, t_ns), _linear(truth.t_ns, v_WB, t_ns)
 
+    folder = readings_file.parent.parent
     # A reading to spare on either side, so that no frame is left without its segment.
     near, known = (
         (t_ns >= frames_ns[0] - _SPARE_NS) & (t_ns <= frames_ns[-1] + _SPARE_NS) for t_ns in (imu_ns, truth.t_ns)
@@ -155,27 +155,24 @@ def load_euroc(
     )
 
 
-def sensor_folder(path: Path) -> Path:
-    """The folder that holds ``imu0``."""
+def motion_files(path: Path) -> tuple[Path, Path, Path]:
+    """Readings, stamps of frames and ground truth of the sequence at ``path``, named as for :func:`load_euroc`.
+
+    Raises :class:`DatasetError` where one is missing.
+    """
     if not path.exists():
         raise DatasetError(f"{path} does not exist; name a EuRoC sequence or its imu0/data.csv")
     path = path.resolve()
     folder = path.parent.parent if path.is_file() else path
-    return folder / "mav0" if (folder / "mav0").is_dir() else folder
+    folder = folder / "mav0" if (folder / "mav0").is_dir() else folder
 
+    def first(names: tuple[str, ...]) -> Path:
+        for name in names:
+            if (folder / name).is_file():
+                return folder / name
+        raise DatasetError(f"{folder} has none of {', '.join(names)}; name a EuRoC sequence with IMU, stamps and truth")
 
-def motion_files(folder: Path) -> tuple[Path, Path, Path]:
-    """Readings, stamps and ground truth in a folder of sensors; raises :class:`DatasetError` where one is missing."""
-    readings, stamps, truth = (find_file(folder, names) for names in (_IMU_FILES, _STAMP_FILES, GROUND_TRUTH_FILES))
-    return readings, stamps, truth
-
-
-def find_file(folder: Path, names: tuple[str, ...]) -> Path:
-    """The first of ``names`` that ``folder`` holds; raises :class:`DatasetError` where it holds none."""
-    for name in names:
-        if (folder / name).is_file():
-            return folder / name
-    raise DatasetError(f"{folder} holds none of {', '.join(names)}; name a EuRoC sequence with IMU, stamps and truth")
+    return first(_IMU_FILES), first(_STAMP_FILES), first(_GROUND_TRUTH_FILES)
 
 
 def interpolate_poses(t_ns: Int, R_WB: Float, p_WB: Float, query_ns: Int) -> tuple[Float, Float]:

@@ -15,7 +15,7 @@ from vioframe.parts.registry import FLIGHT, Registry
 from vioframe.runs.results import Data
 from vioframe.simulation import config as simulation
 from vioframe.simulation.config import MANIFEST, SimulationConfig, simulation_folder
-from vioframe.simulation.scenario import GROUND_TRUTH_FILES, find_file, motion_files, sensor_folder
+from vioframe.simulation.scenario import motion_files
 
 DEFAULT_STAND_IN_S = 30.0
 # EuRoC's own site has MACHINE/SEQUENCE/SEQUENCE.bag.
@@ -143,7 +143,7 @@ def flown(
     config = simulation.complete(SimulationConfig(**settings), installed)
     # Where the motion lies says nothing about it.
     plain = config.model_copy(update={"recorded": None, "made": {}}).model_dump(mode="json")
-    files = [] if config.recorded is None else [*motion_files(sensor_folder(config.recorded))]
+    files = [] if config.recorded is None else [*motion_files(config.recorded)]
     return Flown(data, note, begin_s, fingerprints.of_recordings(files, plain), simulated=config)
 
 
@@ -170,7 +170,7 @@ def _is_motion(path: Path) -> bool:
     if not path.is_dir():
         return False
     try:
-        motion_files(sensor_folder(path))
+        motion_files(path)
     except DatasetError:
         return False
     return True
@@ -192,7 +192,7 @@ def _kind_of(recording: Path, installed: Registry) -> Data:
 def _truth_of(recording: Path, motion: Path | None, installed: Registry) -> Path | None:
     """A file of the ground truth, None where the recording brings it; raises :class:`DatasetError` for neither."""
     if motion is not None:
-        return find_file(sensor_folder(motion), GROUND_TRUTH_FILES)
+        return motion_files(motion)[2]
     if installed.open_dataset(recording).ground_truth is not None:
         return None
     raise DatasetError(
