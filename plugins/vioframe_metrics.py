@@ -9,9 +9,8 @@ import numpy as np
 from pydantic import AfterValidator, Field
 
 from vioframe.errors import TrajectoryError
-from vioframe.evaluation.alignment import align_sim3
 from vioframe.evaluation.evaluation import LENGTHS_M
-from vioframe.evaluation.metrics import Stats, position_error_W, relative_errors
+from vioframe.evaluation.metrics import Stats, relative_errors
 from vioframe.parts.hooks import hookimpl
 
 if TYPE_CHECKING:
@@ -32,12 +31,8 @@ class AbsoluteError:
         """The last three only where the path has the extent that their alignments need."""
         errors = comparison.errors
         figures = {"ate_m": errors.ate_m.rmse}
-        if errors.ate_se3_m is not None and errors.scale is not None:
-            estimate, truth = comparison.unaligned, comparison.truth
-            scaled = align_sim3(estimate, truth).apply(estimate)
-            sim3_m = Stats.of(np.linalg.norm(position_error_W(scaled, truth), axis=1)).rmse
-            figures |= {"ate_se3_m": errors.ate_se3_m, "ate_sim3_m": sim3_m, "scale": errors.scale}
-        return figures
+        others = {"ate_se3_m": errors.ate_se3_m, "ate_sim3_m": errors.ate_sim3_m, "scale": errors.scale}
+        return figures | {name: value for name, value in others.items() if value is not None}
 
 
 class RelativeError:

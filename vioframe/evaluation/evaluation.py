@@ -14,7 +14,6 @@ from vioframe.evaluation.alignment import ALIGNMENTS, Alignment, align_posyaw_by
 from vioframe.evaluation.metrics import (
     RelativeErrors,
     Stats,
-    position_error_W,
     relative_errors,
     rotation_error_deg,
     rotation_error_rpy_deg,
@@ -38,11 +37,11 @@ _SUSPICIOUS_ANGLE_DEG = 10.0
 class TrajectoryErrors:
     """What separates an estimate from the truth; N associated poses in the ground truth's world.
 
-    ``position_m`` (N, 3) estimate minus truth, ``rotation_rpy_deg`` (N, 3) about the world's axes. ``ate_se3_m`` and
-    ``scale``, the factor the estimate would have to be multiplied by, come from alignments of their own and are None
-    where the body did not move enough to tell. ``relative`` is by length in metres, ``relative_by_fraction`` by the
-    fraction of the whole path. NEES is taken in the gauge of the first pose in any case. ``coverage`` is the part of
-    the ground truth's time between the first and the last associated pose.
+    ``position_m`` (N, 3) estimate minus truth, ``rotation_rpy_deg`` (N, 3) about the world's axes. ``ate_se3_m``,
+    ``ate_sim3_m`` and ``scale``, the factor the estimate would have to be multiplied by, come from alignments of their
+    own and are None where the body did not move enough to tell. ``relative`` is by length in metres,
+    ``relative_by_fraction`` by the fraction of the whole path. NEES is taken in the gauge of the first pose in any
+    case. ``coverage`` is the part of the ground truth's time between the first and the last associated pose.
     """
 
     alignment_name: str
@@ -55,6 +54,7 @@ class TrajectoryErrors:
     orientation_deg: Stats
     yaw_deg: Stats
     ate_se3_m: float | None
+    ate_sim3_m: float | None
     scale: float | None
     relative: Mapping[float, RelativeErrors]
     relative_by_fraction: Mapping[float, RelativeErrors]
@@ -142,11 +142,11 @@ def evaluate(estimate: Trajectory, ground_truth: Trajectory, *, alignment: str =
     transform = fit(raw, truth)
     aligned = transform.apply(raw)
     rotation_rpy_deg = rotation_error_rpy_deg(aligned, truth)
-    position_m = position_error_W(aligned, truth)
+    position_m = aligned.p_WB - truth.p_WB
     path_m = truth.path_length_m
     by_length = {} if at_rest else relative_errors(aligned, truth, {length: length for length in LENGTHS_M})
     by_fraction = {} if at_rest else relative_errors(aligned, truth, {part: part * path_m for part in FRACTIONS})
-    ate_se3_m, scale = (None, None) if at_rest else _se3_ate_and_scale(raw, truth)
+    ate_se3_m, ate_sim3_m, scale = (None, None, None) if at_rest else _by_other_alignments(raw, truth)
     return TrajectoryErrors(
         alignment_name=alignment,
         alignment=transform,
@@ -158,6 +158,7 @@ def evaluate(estimate: Trajectory, ground_truth: Trajectory, *, alignment: str =
         orientation_deg=Stats.of(rotation_error_deg(aligned, truth)),
         yaw_deg=Stats.of(rotation_rpy_deg[:, 2]),
         ate_se3_m=ate_se3_m,
+        ate_sim3_m=ate_sim3_m,
         scale=scale,
         relative=by_length,
         relative_by_fraction=by_fraction,
@@ -186,14 +187,15 @@ def _spread_m(trajectory: Trajectory) -> float:
     return float(np.sqrt(trajectory.p_WB.var(axis=0).sum()))
 
 
-def _se3_ate_and_scale(raw: Trajectory, truth: Trajectory) -> tuple[float | None, float | None]:
+def _by_other_alignments(raw: Trajectory, truth: Trajectory) -> tuple[float | None, float | None, float | None]:
+    """ATE by SE(3) and by Sim(3), m, and the scale of the latter."""
     try:
-        se3, sim3 = align_se3(raw, truth), align_sim3(raw, truth)
+        fits = align_se3(raw, truth), align_sim3(raw, truth)
     except TrajectoryError:
         # A straight path leaves a rotation open.
-        return None, None
-    error = np.linalg.norm(position_error_W(se3.apply(raw), truth), axis=1)
-    return Stats.of(error).rmse, sim3.scale
+        return None, None, None
+    se3_m, sim3_m = (Stats.of(np.linalg.norm(fit.apply(raw).p_WB - truth.p_WB, axis=1)).rmse for fit in fits)
+    return se3_m, sim3_m, fits[1].scale
 
 
 def _notes(estimate: Trajectory, raw: Trajectory, aligned: Trajectory, truth: Trajectory, at_rest: bool) -> list[str]:

@@ -35,11 +35,6 @@ class Stats:
         return asdict(self)
 
 
-def position_error_W(aligned: Trajectory, truth: Trajectory) -> Float:
-    """(N, 3) m, estimate minus truth along the axes of the ground truth's world."""
-    return aligned.p_WB - truth.p_WB
-
-
 def rotation_error_rpy_deg(aligned: Trajectory, truth: Trajectory) -> Float:
     """(N, 3) deg, roll, pitch and yaw of E = R_est R_true^T about the world's axes.
 

@@ -43,12 +43,6 @@ class Nees:
         return {"dof": self.dof, "mean": self.mean, "inside_95": self.inside, "band_95": list(self.band)}
 
 
-def pose_error(aligned: Trajectory, truth: Trajectory) -> Float:
-    """(N, 6) [dtheta dp] that takes the estimate to the truth: R_true = R_est Exp(dtheta), p_true = p_est + dp."""
-    dtheta = so3.log(aligned.R_WB.transpose(0, 2, 1) @ truth.R_WB)
-    return np.concatenate([dtheta, truth.p_WB - aligned.p_WB], axis=1)
-
-
 def nees(aligned: Trajectory, truth: Trajectory) -> tuple[Nees, ...]:
     """NEES of orientation, position and pose; ``aligned`` brings its covariance in the ground truth's world.
 
@@ -62,16 +56,15 @@ def nees(aligned: Trajectory, truth: Trajectory) -> tuple[Nees, ...]:
     usable = finite[_well_conditioned(cov[finite])]
     if not usable.size:
         return ()
-    error, cov, t_ns = pose_error(aligned, truth)[usable], cov[usable], aligned.t_ns[usable]
-    return tuple(
-        Nees(part, error[:, s].shape[1], t_ns, mahalanobis(error[:, s], cov[:, s, s]), band(error[:, s].shape[1]))
-        for part, s in _PARTS.items()
-    )
-
-
-def mahalanobis(error: Float, cov: Float) -> Float:
-    """(N,) e^T P^-1 e for (N, D) and (N, D, D)."""
-    return np.asarray(np.einsum("ni,ni->n", error, np.linalg.solve(cov, error[..., None])[..., 0]))
+    # [dtheta dp] takes the estimate to the truth: R_true = R_est Exp(dtheta), p_true = p_est + dp.
+    dtheta = so3.log(aligned.R_WB.transpose(0, 2, 1) @ truth.R_WB)
+    error, cov = np.concatenate([dtheta, truth.p_WB - aligned.p_WB], axis=1)[usable], cov[usable]
+    found = []
+    for name, part in _PARTS.items():
+        e = error[:, part]
+        values = np.einsum("ni,ni->n", e, np.linalg.solve(cov[:, part, part], e[..., None])[..., 0])
+        found.append(Nees(name, e.shape[1], aligned.t_ns[usable], values, band(e.shape[1])))
+    return tuple(found)
 
 
 def band(dof: int) -> tuple[float, float]:

@@ -141,5 +141,4 @@ def images_as_textures(folder: Path, rng: np.random.Generator, count: int) -> tu
 
 def _mirrored(image: NDArray[Any]) -> Image:
     quarter = cv2.resize(image, (SIZE // 2, SIZE // 2), interpolation=cv2.INTER_AREA)
-    half = np.hstack([quarter, quarter[:, ::-1]])
-    return np.vstack([half, half[::-1]]).astype(np.uint8)
+    return np.asarray(cv2.copyMakeBorder(quarter, 0, SIZE // 2, 0, SIZE // 2, cv2.BORDER_REFLECT), np.uint8)

@@ -102,7 +102,7 @@ def simulated_sequence(
     recording would be, unless the frame rate divides the IMU's.
     """
     calibration = calibration or packaged_calibration("euroc", cameras=["cam0"])
-    imu_rng, track_rng = _generators(seed)
+    imu_rng, track_rng = map(np.random.default_rng, np.random.SeedSequence(seed).spawn(2))
     rate_hz = (noise or calibration.imu).rate_hz
     path, duration_s = _path(flight, duration_s, calibration)
     frames_s = np.arange(int(duration_s * frame_rate_hz) + 1) / frame_rate_hz
@@ -160,7 +160,7 @@ def simulated_stream(
     sequence with the same seed.
     """
     calibration = calibration or packaged_calibration("euroc", cameras=["cam0"])
-    imu_rng, track_rng = _generators(seed)
+    imu_rng, track_rng = map(np.random.default_rng, np.random.SeedSequence(seed).spawn(2))
     simulator = TrackSimulator(calibration, options or TrackOptions(), track_rng)
     rate_hz = (noise or calibration.imu).rate_hz
     path, duration_s = _path(flight, duration_s, calibration)
@@ -303,12 +303,6 @@ def _tracks(scenario: Scenario, calibration: Calibration, simulator: TrackSimula
     poses = [scenario.body_poses(calibration, c, frames_ns) for c in range(len(calibration.cameras))]
     R_WB, p_WB = (np.stack(part, axis=1) for part in zip(*poses, strict=True))
     return map(simulator.observe, frames_ns.tolist(), R_WB, p_WB)
-
-
-def _generators(seed: int) -> tuple[np.random.Generator, np.random.Generator]:
-    """Of the IMU's noise and of landmarks and pixels."""
-    imu, tracks = np.random.SeedSequence(seed).spawn(2)
-    return np.random.default_rng(imu), np.random.default_rng(tracks)
 
 
 def _path(flight: str | Flight, duration_s: float | None, calibration: Calibration) -> tuple[Flight, float]:

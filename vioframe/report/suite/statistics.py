@@ -15,9 +15,7 @@ import numpy as np
 import pandas as pd
 
 from vioframe.evaluation import TrajectoryErrors
-from vioframe.evaluation.alignment import align_sim3
 from vioframe.evaluation.consistency import AverageNees, average_nees
-from vioframe.evaluation.metrics import position_error_W
 from vioframe.runs.evaluated import Evaluated, evaluate_path, with_loop_closure
 from vioframe.runs.results import CELL, CLEAR, NEES_FILE, TASK_COLUMNS, Data, Results
 from vioframe.types import NS_PER_S
@@ -333,15 +331,6 @@ def duels(flights: pd.DataFrame, baseline: str) -> list[Duel]:
         *(Duel._make((*key, own)) for key, own in groups(pairs, ("data", "condition", "level", *CONTENDER))),
         *(Duel._make((data, None, None, *contender, own)) for (data, *contender), own in hard),
     ]
-
-
-def ate_sim3_m(errors: TrajectoryErrors | None) -> float:
-    """RMSE of the position after alignment by Sim(3), as many published figures have it; NaN where it is open."""
-    if errors is None or errors.scale is None:
-        return float("nan")
-    # Whatever the estimate was aligned by before, the best of all similarities leaves the same.
-    scaled = align_sim3(errors.estimate, errors.truth).apply(errors.estimate)
-    return float(np.sqrt(np.mean(np.sum(position_error_W(scaled, errors.truth) ** 2, axis=1))))
 
 
 def stage_means(flights: pd.DataFrame) -> pd.DataFrame:

@@ -19,7 +19,6 @@ from vioframe.report.suite.statistics import (
     CONTENDER,
     SUCCESS_PERCENT,
     Study,
-    ate_sim3_m,
     averages,
     condition_text,
     count_caption,
@@ -149,7 +148,8 @@ def _published(study: Study) -> Table | None:
 
 def _over_seeds(study: Study, own: pd.DataFrame, alignment: str) -> Entry:
     if alignment == "sim3":
-        values = pd.Series([ate_sim3_m(study.errors(flight)) for flight in records(own)], dtype=float)
+        errors = [study.errors(flight) for flight in records(own)]
+        values = pd.Series([each.ate_sim3_m if each else None for each in errors], dtype=float)
     else:
         values = own["ate_m" if alignment == "posyaw" else "ate_se3_m"]
     if not values.count():
