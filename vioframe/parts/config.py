@@ -23,10 +23,11 @@ from vioframe.errors import ConfigError
 from vioframe.estimation.options import EstimationOptions
 from vioframe.frontend import FrontendOptions
 from vioframe.parts.options import Option, did_you_mean, options_of, validate_options
-from vioframe.parts.registry import BACKEND, DETECTOR, LOOP_CLOSER, Kind, Registry
+from vioframe.parts.registry import BACKEND, DETECTOR, LOOP_CLOSER, Kind, Part, Registry
 
 SectionT = TypeVar("SectionT", bound="Section")
 
+PART_SECTIONS = {"detector": DETECTOR, "backend": BACKEND, "loop_closure": LOOP_CLOSER}
 # What is not of one part, but of all that are put in its place.
 OPTION_SECTIONS = {"frontend": FrontendOptions, "estimation": EstimationOptions}
 
@@ -144,11 +145,16 @@ def parse_assignments(
 ) -> Iterator[tuple[str, str, Any]]:
     """Section, option and value of each ``key=value``, for the ``options`` by section; see :func:`override`."""
     for assignment in assignments:
-        key, equals, text = assignment.partition("=")
-        if not key or not equals:
-            raise ConfigError(f"-o takes key=value, got {assignment!r}")
-        section, option = _find_option(key.strip(), options)
-        yield section, option.name, _parse_value(option, text.strip())
+        key, text = _split(assignment, "-o takes key=value")
+        section, option = _find_option(key, options)
+        yield section, option.name, _parse_value(option, text)
+
+
+def _split(assignment: str, rule: str) -> tuple[str, str]:
+    key, equals, text = (word.strip() for word in assignment.partition("="))
+    if not key or not equals:
+        raise ConfigError(f"{rule}, got {assignment!r}")
+    return key, text
 
 
 def parse_part(spec: str, kind: Kind, registry: Registry) -> PartConfig:
@@ -161,42 +167,23 @@ def parse_part(spec: str, kind: Kind, registry: Registry) -> PartConfig:
     options: dict[str, Any] = {}
     # Commas within brackets belong to a value.
     for assignment in re.split(r",(?![^\[]*\])", own) if own else []:
-        key, equals, text = (word.strip() for word in assignment.partition("="))
-        if not key or not equals:
-            raise ConfigError(f"{spec!r}: options are given as {name}:KEY=VALUE,..., got {assignment!r}")
+        key, text = _split(assignment, f"{spec!r}: options are given as {name}:KEY=VALUE,...")
         options[key] = _parse_value(known[key], text) if key in known else text
     return PartConfig(name=name, options=options)
 
 
 def complete(config: Config, registry: Registry) -> Config:
     """``config`` with every option of every part checked, coerced and its default filled in."""
-    parts: dict[str, Any] = {
-        "detector": PartConfig(
-            name=config.detector.name,
-            options=registry.find(DETECTOR, config.detector.name).validate(config.detector.options),
-        ),
-        "backend": PartConfig(
-            name=config.backend.name,
-            options=registry.find(BACKEND, config.backend.name).validate(config.backend.options),
-        ),
+    changes: dict[str, Any] = {
         "frontend": asdict(config.frontend_options),
         "estimation": asdict(config.estimation_options),
+        "ground_truth": config.ground_truth and config.ground_truth.absolute(),
     }
-    if config.loop_closure is not None:
-        parts["loop_closure"] = PartConfig(
-            name=config.loop_closure.name,
-            options=registry.find(LOOP_CLOSER, config.loop_closure.name).validate(config.loop_closure.options),
-        )
-    if config.dataset.path is not None:
-        reader = registry.find_reader(config.dataset.path, config.dataset.reader)
-        parts["dataset"] = DatasetConfig(
-            path=config.dataset.path.absolute(),
-            reader=reader.name,
-            options=reader.validate(config.dataset.options),
-        )
-    if config.ground_truth is not None:
-        parts["ground_truth"] = config.ground_truth.absolute()
-    return config.model_copy(update=parts)
+    for section, part in _parts_by_section(config, registry).items():
+        named = getattr(config, section)
+        found = {"path": named.path.absolute(), "reader": part.name} if section == "dataset" else {}
+        changes[section] = named.model_copy(update={"options": part.validate(named.options), **found})
+    return config.model_copy(update=changes)
 
 
 def render(config: Config, registry: Registry) -> str:
@@ -206,7 +193,7 @@ def render(config: Config, registry: Registry) -> str:
     lines += ["dataset:", *_entry("path", dataset.path, "bag or folder to read", 1)]
     lines += _entry("reader", dataset.reader, "null: the one that accepts the path", 1)
     lines += _options("options", dataset.options, options.get("dataset", []), 1)
-    for section in ("detector", "backend", "loop_closure"):
+    for section in PART_SECTIONS:
         part = getattr(config, section)
         if part is None:
             lines += _entry(section, None, Config.model_fields[section].description or "", 0)
@@ -220,17 +207,18 @@ def render(config: Config, registry: Registry) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _options_by_section(config: Config, registry: Registry) -> dict[str, list[Option]]:
-    sections = {
-        "detector": registry.find(DETECTOR, config.detector.name).options,
-        "backend": registry.find(BACKEND, config.backend.name).options,
-        **{section: options_of(factory) for section, factory in OPTION_SECTIONS.items()},
-    }
-    if config.loop_closure is not None:
-        sections["loop_closure"] = registry.find(LOOP_CLOSER, config.loop_closure.name).options
+def _parts_by_section(config: Config, registry: Registry) -> dict[str, Part]:
+    """The parts that ``config`` names; a section that names none has none."""
+    named = {section: (kind, getattr(config, section)) for section, kind in PART_SECTIONS.items()}
+    parts = {section: registry.find(kind, part.name) for section, (kind, part) in named.items() if part is not None}
     if config.dataset.path is not None:
-        sections["dataset"] = registry.find_reader(config.dataset.path, config.dataset.reader).options
-    return sections
+        parts["dataset"] = registry.find_reader(config.dataset.path, config.dataset.reader)
+    return parts
+
+
+def _options_by_section(config: Config, registry: Registry) -> dict[str, list[Option]]:
+    of_parts = {section: part.options for section, part in _parts_by_section(config, registry).items()}
+    return of_parts | {section: options_of(factory) for section, factory in OPTION_SECTIONS.items()}
 
 
 def _find_option(key: str, sections: Mapping[str, list[Option]]) -> tuple[str, Option]:

@@ -1,23 +1,33 @@
-"""A run, or somebody's trajectory file, beside its ground truth: what tables and plots are made from."""
+"""A run, or somebody's trajectory file, beside its ground truth: what tables and plots are made from.
+
+Metrics are plug-ins; what they say of a run is part of its evaluation::
+
+    metrics = create_metrics(["ate", "band:half_width_m=0.1"], registry.load())
+    measured = measure(metrics, Comparison.of(estimate, ground_truth))
+"""
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from numbers import Real
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from vioframe.errors import RunError, VioframeError
+from vioframe.errors import PluginError, RunError, TrajectoryError, VioframeError
 from vioframe.evaluation import Comparison, TrajectoryErrors, associate, evaluate
 from vioframe.evaluation.landmarks import Landmarks, belonging
 from vioframe.evaluation.map_quality import MapQuality
 from vioframe.geometry.trajectory import Trajectory
+from vioframe.interfaces import Metric
 from vioframe.io.trajectories import load_trajectory, write_tum
+from vioframe.parts.config import parse_part
+from vioframe.parts.registry import METRIC, Part, Registry, describe
 from vioframe.runs.folder import RunFolder
-from vioframe.runs.metrics import AskedMetric, Measured, measure
 from vioframe.runs.recorder import write_ply
 from vioframe.types import NS_PER_S, Int
 
@@ -38,6 +48,28 @@ _RUN_FIGURES = (
 )
 # A line is not drawn over a time in which nothing was estimated.
 _GAP_NS = NS_PER_S
+
+
+@dataclass(frozen=True, slots=True)
+class AskedMetric:
+    """A metric ready for use; ``label`` is what it was asked for with, name and options."""
+
+    label: str
+    part: Part
+    metric: Metric
+
+
+@dataclass(frozen=True, slots=True)
+class Measured:
+    """``figures`` by metric and name; ``left_out`` says in a line why a metric has none. Both by label, as asked."""
+
+    figures: Mapping[str, Mapping[str, float]]
+    left_out: Mapping[str, str]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values for JSON."""
+        out: dict[str, Any] = {"metrics": {label: dict(figures) for label, figures in self.figures.items()}}
+        return {**out, "metrics_left_out": dict(self.left_out)} if self.left_out else out
 
 
 @dataclass(frozen=True)
@@ -172,6 +204,48 @@ def write_matched_truth(run_folder: str | Path) -> Path | None:
     path = run.path / MATCHED_TRUTH
     write_tum(associate(estimate, truth)[1], path)
     return path
+
+
+def create_metrics(specs: Sequence[str], installed: Registry) -> tuple[AskedMetric, ...]:
+    """A metric for each of ``specs``, ``NAME`` or ``NAME:KEY=VALUE,...``; a repeated one counts once.
+
+    Raises :class:`PluginError` or :class:`ConfigError` where one is unknown, lacks what it needs or has a wrong option.
+    """
+    asked = []
+    for spec in dict.fromkeys(specs):
+        part = parse_part(spec, METRIC, installed)
+        asked.append(
+            AskedMetric(spec, installed.find(METRIC, part.name), installed.create_metric(part.name, part.options))
+        )
+    return tuple(asked)
+
+
+def measure(metrics: Sequence[AskedMetric], comparison: Comparison) -> Measured:
+    """What each of ``metrics`` says; one that cannot tell leaves the others alone.
+
+    Raises :class:`PluginError` naming the plug-in where one fails or returns something else than finite figures.
+    """
+    figures: dict[str, Mapping[str, float]] = {}
+    left_out: dict[str, str] = {}
+    for asked in metrics:
+        try:
+            figures[asked.label] = _checked(asked.part, asked.metric.measure(comparison))
+        except TrajectoryError as error:
+            left_out[asked.label] = " ".join(str(error).split())
+        except VioframeError:
+            raise
+        except Exception as error:
+            raise PluginError(f"{asked.part} failed: {describe(error)}; leave it out or repair it") from error
+    return Measured(figures, left_out)
+
+
+def _checked(part: Part, figures: Any) -> dict[str, float]:
+    if not isinstance(figures, Mapping):
+        raise PluginError(f"{part} returned a {type(figures).__name__}, not figures by name")
+    for name, value in figures.items():
+        if not isinstance(name, str) or not isinstance(value, Real) or not math.isfinite(value):
+            raise PluginError(f"{part} returned {name!r}: {value!r}; a figure is a finite number by name")
+    return {name: float(value) for name, value in figures.items()}
 
 
 def measure_runs(runs: Sequence[Evaluated], metrics: Sequence[AskedMetric]) -> list[Evaluated]:
