@@ -15,8 +15,7 @@ from vioframe.bench.detectors.entrants import Entrant, detect
 from vioframe.bench.detectors.images import Pair, Views
 from vioframe.bench.detectors.metrics import CORNERS_WITHIN_PX, score_pair
 from vioframe.bench.detectors.tables import BASELINE, CASE, CONFIDENCE
-from vioframe.bench.processes import map_in_processes, single_threaded
-from vioframe.parts import registry
+from vioframe.bench.processes import installed, map_in_processes, single_threaded
 from vioframe.types import Image
 
 RESOLUTION = (320, 240)
@@ -57,8 +56,7 @@ def score_detectors(
 def _score(
     entrants: Sequence[Entrant], degradations: Sequence[Degradation], seed: int, pairs: Sequence[tuple[int, Pair]]
 ) -> list[dict[str, Any]]:
-    installed = registry.load()
-    ready = [(entrant, installed.create_detector(entrant.name, entrant.options)) for entrant in entrants]
+    ready = [(entrant, installed().create_detector(entrant.name, entrant.options)) for entrant in entrants]
     rows = []
     with single_threaded():
         for number, pair in pairs:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from time import perf_counter
 from typing import Any, Protocol, runtime_checkable
 
@@ -11,8 +12,9 @@ import numpy as np
 import pandas as pd
 
 from vioframe.bench.detectors.entrants import Entrant, detect
+from vioframe.bench.detectors.images import evenly, find_images, fit, frames_of, procedural_images, read_grey
 from vioframe.bench.processes import usable_cores
-from vioframe.interfaces import Detector
+from vioframe.interfaces import Dataset, Detector
 from vioframe.runs import machine
 from vioframe.types import Image
 
@@ -29,6 +31,18 @@ class Placed(Protocol):
 
     @property
     def precision(self) -> str: ...
+
+
+def pictures(
+    count: int, *, folder: Path | None = None, recording: Dataset | None = None, seed: int = 0
+) -> tuple[list[Image], str]:
+    """At most ``count`` images, evenly from a ``folder`` or a ``recording`` or else drawn, and what they are."""
+    if folder is not None:
+        return [fit(read_grey(path), RESOLUTION) for path in evenly(find_images(folder), count)], folder.name
+    if recording is not None:
+        taken = [frames.images[0] for _, frames in frames_of(recording, count)]
+        return [fit(image, RESOLUTION) for image in taken if image is not None], f"frames of {recording.name}"
+    return procedural_images(count, RESOLUTION, seed), "drawn surfaces"
 
 
 def time_detectors(

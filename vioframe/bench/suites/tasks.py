@@ -12,8 +12,11 @@ from time import perf_counter
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
 from vioframe import pipeline
+from vioframe.bench.detectors.entrants import Entrant, everyone, line_up, parse_entrants
+from vioframe.bench.detectors.speed import pictures, speed_settings, time_detectors
 from vioframe.bench.montecarlo import Setup, fly
 from vioframe.bench.processes import installed, single_threaded
 from vioframe.bench.suites import fingerprints
@@ -195,24 +198,14 @@ def fly_trial(task: TrialTask) -> Trial:
 
 def speed(task: SpeedTask) -> list[Figures]:
     """Frames a second, a row a detector; those that lack something are absent, with the reason as their error."""
-    from vioframe.bench.detectors.entrants import Entrant, everyone, line_up, parse_entrants
-    from vioframe.bench.detectors.images import fit, frames_of, procedural_images
-    from vioframe.bench.detectors.speed import RESOLUTION, speed_settings, time_detectors
-
     entrants = [Entrant(each.called, each.name, each.options) for each in task.detectors]
     if not entrants:
         entrants = parse_entrants(everyone(installed(), "speed"), (), installed())
     lined_up = line_up(entrants, installed())
-    if task.frames_of is None:
-        images, source = procedural_images(task.images, RESOLUTION, 0), "drawn surfaces"
-    else:
-        taken = frames_of(installed().open_dataset(task.frames_of), task.images)
-        images = [fit(image, RESOLUTION) for _, frames in taken if (image := frames.images[0]) is not None]
-        source = f"frames of {task.frames_of.stem}"
-    timed = time_detectors(lined_up.ready, images, task.rounds)
+    recording = None if task.frames_of is None else installed().open_dataset(task.frames_of)
+    images, source = pictures(task.images, recording=recording)
     settings = speed_settings(source, len(images), task.rounds)
     settings["width"], settings["height"] = settings.pop("resolution")
-    found: list[Any] = timed.astype(object).to_dict("records")
-    rows: list[Figures] = [{**row, **settings} for row in found]
+    timed: list[Any] = time_detectors(lined_up.ready, images, task.rounds).astype(object).to_dict("records")
     absent = [{"detector": name, "status": "absent", "error": why} for name, why in lined_up.absent.items()]
-    return rows + absent
+    return [*({**row, **settings} for row in timed), *absent]
