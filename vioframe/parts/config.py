@@ -39,10 +39,10 @@ class Section(BaseModel):
 
 
 class DatasetConfig(Section):
-    """What to read. ``reader`` None means: the one that accepts the path."""
+    """What to read."""
 
-    path: Path | None = None
-    reader: str | None = None
+    path: Path | None = Field(default=None, description="bag or folder to read")
+    reader: str | None = Field(default=None, description="null: the one that accepts the path")
     options: dict[str, Any] = {}
 
 
@@ -188,23 +188,27 @@ def complete(config: Config, registry: Registry) -> Config:
 
 def render(config: Config, registry: Registry) -> str:
     """``config`` as YAML, each option with its help as a comment; :func:`read` returns the same configuration."""
-    options = _options_by_section(config, registry)
-    dataset, lines = config.dataset, ["# A vioframe configuration: use it with `vioframe run --config FILE`."]
-    lines += ["dataset:", *_entry("path", dataset.path, "bag or folder to read", 1)]
-    lines += _entry("reader", dataset.reader, "null: the one that accepts the path", 1)
-    lines += _options("options", dataset.options, options.get("dataset", []), 1)
-    for section in PART_SECTIONS:
-        part = getattr(config, section)
-        if part is None:
-            lines += _entry(section, None, Config.model_fields[section].description or "", 0)
-            continue
-        lines += [f"{section}:", *_entry("name", part.name, "", 1)]
-        lines += _options("options", part.options, options[section], 1)
-    for section in OPTION_SECTIONS:
-        lines += _options(section, getattr(config, section), options[section], 0)
-    for name in ("wait_ms", "ground_truth", "start_s", "duration_s"):
-        lines += _entry(name, getattr(config, name), Config.model_fields[name].description or "", 0)
-    return "\n".join(lines) + "\n"
+    docs = {name: field.description or "" for name, field in Config.model_fields.items()}
+    docs |= {f"dataset.{name}": field.description or "" for name, field in DatasetConfig.model_fields.items()}
+    for section, options in _options_by_section(config, registry).items():
+        where = section if section in OPTION_SECTIONS else f"{section}.options"
+        docs |= {f"{where}.{option.name}": option.doc for option in options}
+    lines = ["# A vioframe configuration: use it with `vioframe run --config FILE`."]
+    return "\n".join([*lines, *_commented(config.model_dump(), docs)]) + "\n"
+
+
+def _commented(tree: Mapping[str, Any], docs: Mapping[str, str], within: str = "") -> Iterator[str]:
+    """Lines of YAML, each value below its help in ``docs``, which go by keys such as ``backend.options.max_clones``."""
+    indent = "  " * within.count(".")
+    for name, value in tree.items():
+        key = f"{within}{name}"
+        if isinstance(value, dict) and value:
+            yield f"{indent}{name}:"
+            yield from _commented(value, docs, f"{key}.")
+        else:
+            comment = f"{indent}# "
+            yield from textwrap.wrap(docs.get(key, ""), 110, initial_indent=comment, subsequent_indent=comment)
+            yield f"{indent}{name}: {_scalar(value)}"
 
 
 def _parts_by_section(config: Config, registry: Registry) -> dict[str, Part]:
@@ -266,22 +270,6 @@ def _keys_beside(model: Any, location: tuple[int | str, ...]) -> list[str]:
             found = model.model_fields[key].annotation
             model = next((each for each in (found, *get_args(found)) if hasattr(each, "model_fields")), model)
     return list(model.model_fields)
-
-
-def _options(title: str, values: Mapping[str, Any], options: list[Option], depth: int) -> list[str]:
-    if not values:
-        return [f"{'  ' * depth}{title}: {{}}"]
-    docs = {option.name: option.doc for option in options}
-    lines = [f"{'  ' * depth}{title}:"]
-    for name, value in values.items():
-        lines += _entry(name, value, docs.get(name, ""), depth + 1)
-    return lines
-
-
-def _entry(name: str, value: Any, comment: str, depth: int) -> list[str]:
-    indent = "  " * depth
-    comment_lines = textwrap.wrap(comment, 110, initial_indent=f"{indent}# ", subsequent_indent=f"{indent}# ")
-    return [*comment_lines, f"{indent}{name}: {_scalar(value)}"]
 
 
 def _scalar(value: Any) -> str:

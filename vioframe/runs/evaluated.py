@@ -213,10 +213,9 @@ def create_metrics(specs: Sequence[str], installed: Registry) -> tuple[AskedMetr
     """
     asked = []
     for spec in dict.fromkeys(specs):
-        part = parse_part(spec, METRIC, installed)
-        asked.append(
-            AskedMetric(spec, installed.find(METRIC, part.name), installed.create_metric(part.name, part.options))
-        )
+        named = parse_part(spec, METRIC, installed)
+        part = installed.find(METRIC, named.name)
+        asked.append(AskedMetric(spec, part, part.create(options=named.options)))
     return tuple(asked)
 
 

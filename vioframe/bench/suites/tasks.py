@@ -23,13 +23,13 @@ from vioframe.bench.suites import fingerprints
 from vioframe.bench.suites.store import Store
 from vioframe.bench.suites.suite import NamedPart
 from vioframe.errors import RunError, TrajectoryError
-from vioframe.evaluation import Comparison, TrajectoryErrors
+from vioframe.evaluation import TrajectoryErrors
 from vioframe.evaluation.consistency import Trial
 from vioframe.io.convert import appearing
 from vioframe.parts.config import Config, PartConfig
 from vioframe.parts.registry import describe
 from vioframe.runs import machine
-from vioframe.runs.evaluated import create_metrics, evaluate_path, measure, with_loop_closure, write_matched_truth
+from vioframe.runs.evaluated import create_metrics, evaluate_paths, measure_runs, write_matched_truth
 from vioframe.runs.folder import RunFolder
 from vioframe.runs.results import NEES_FILE, RUNS_FOLDER
 from vioframe.simulation.config import SimulationConfig
@@ -133,22 +133,18 @@ def _flight(task: FlightTask, store: Store, folder: Path) -> Figures:
     summary = pipeline.record(pipeline.prepare(config, installed()), folder)
     figures = {**_of_summary(summary), **_of_timings(RunFolder.open(folder))}
     try:
-        evaluated = evaluate_path(folder, None)
-        closed = with_loop_closure(evaluated)
+        evaluated = evaluate_paths([folder])
         write_matched_truth(folder)
     except TrajectoryError as error:
         # As where a handful of poses is all there is: the run went through, and there is nothing to measure.
         return figures | {"not_evaluated": " ".join(str(error).split())}
-    last = closed or evaluated
-    if last.estimate is None or last.ground_truth is None or last.errors is None:
+    (last,) = measure_runs(evaluated[-1:], create_metrics(task.metrics, installed()))
+    if last.errors is None or last.measured is None:
         return figures
-    figures |= {"loop_closed": closed is not None, **of_errors(last.errors)}
-    measured = measure(
-        create_metrics(task.metrics, installed()), Comparison(last.estimate, last.ground_truth, last.errors)
-    )
-    for metric, values in measured.figures.items():
+    figures |= {"loop_closed": len(evaluated) > 1, **of_errors(last.errors)}
+    for metric, values in last.measured.figures.items():
         figures |= {f"metrics.{metric}.{name}": value for name, value in values.items()}
-    return figures | ({"metrics_left_out": dict(measured.left_out)} if measured.left_out else {})
+    return figures | ({"metrics_left_out": dict(last.measured.left_out)} if last.measured.left_out else {})
 
 
 def _of_summary(summary: Mapping[str, Any]) -> Figures:
