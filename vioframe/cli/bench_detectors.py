@@ -86,10 +86,8 @@ def detectors(
     from vioframe.parts import registry
 
     installed = registry.load()
-    entrants = parse_entrants(detectors or everyone(installed, question), options, installed)
-    if quality:
-        entrants = [entrant.describing(installed) for entrant in entrants]
-    if (over := given.get("baseline")) is not None and over not in (labels := [each.label for each in entrants]):
+    entrants = parse_entrants(detectors or everyone(installed, question), options, installed, describing=quality)
+    if (over := given.get("baseline")) is not None and over not in (labels := [each.called for each in entrants]):
         raise ConfigError(f"--baseline {over} does not take part; one of {', '.join(labels)} can be led over")
     given |= {"baseline": over or tables.BASELINE, "workers": given.get("workers") or usable_cores(), "seed": seed}
     given["quiet"] = quiet
@@ -106,7 +104,7 @@ def detectors(
     if keep is not None:
         rows: list[Any] = result.astype(object).where(pd.notna(result), None).to_dict("records")
         rows += [{"detector": label, "absent": reason} for label, reason in absent.items()]
-        taking_part = {entrant.label: dict(entrant.options) for entrant, _ in lined_up().ready}
+        taking_part = {entrant.called: entrant.options for entrant, _ in lined_up().ready}
         record(keep, rows, {"question": question, "seed": seed, **settings, "detectors": taking_part})
         click.echo(f"written to {keep}")
 

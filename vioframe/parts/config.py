@@ -14,7 +14,7 @@ from io import StringIO
 from pathlib import Path
 from typing import Any, TypeVar, get_args
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 from pydantic_core import to_jsonable_python
 from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
@@ -46,11 +46,36 @@ class DatasetConfig(Section):
     options: dict[str, Any] = {}
 
 
-class PartConfig(Section):
-    """A detector, back-end or loop closer by name, and its options."""
+class Named(Section):
+    """Something with a name; a bare name is enough."""
 
     name: str
+
+    @model_validator(mode="before")
+    @classmethod
+    def _from_name(cls, value: Any) -> Any:
+        return {"name": value} if isinstance(value, str) else value
+
+    @property
+    def called(self) -> str:
+        """What tables and plots call it."""
+        return self.name
+
+
+class PartConfig(Named):
+    """A part by name, and its options."""
+
     options: dict[str, Any] = {}
+
+
+class LabelledPart(PartConfig):
+    """A part that is compared with others, maybe with itself under other options, to be called ``label``."""
+
+    label: str = ""
+
+    @property
+    def called(self) -> str:
+        return self.label or self.name
 
 
 class Config(Section):

@@ -12,7 +12,6 @@ import numpy as np
 import pandas as pd
 
 from vioframe.bench.detectors.degradations import Circumstances, Degradation
-from vioframe.bench.detectors.entrants import Entrant
 from vioframe.bench.detectors.tables import BASELINE, CONFIDENCE
 from vioframe.bench.processes import installed, map_in_processes, single_threaded
 from vioframe.errors import ConfigError, DatasetError
@@ -24,6 +23,7 @@ from vioframe.incidents import Incidents
 from vioframe.interfaces import Dataset
 from vioframe.io.synchronise import synchronise
 from vioframe.io.trajectories import load_trajectory
+from vioframe.parts.config import LabelledPart
 from vioframe.types import NS_PER_S, Float, FrameSet, FrameTracks, ImuSegment, Int
 
 SURVIVAL_FRAMES = (5, 10, 20)
@@ -45,7 +45,7 @@ class Stretch:
 
 
 def fly_detectors(
-    entrants: Sequence[Entrant],
+    entrants: Sequence[LabelledPart],
     stretch: Stretch,
     degradations: Sequence[Degradation],
     *,
@@ -76,13 +76,15 @@ def check(stretch: Stretch) -> str:
     return dataset.name
 
 
-def _fly(stretch: Stretch, entrants: Sequence[Entrant], seed: int, degradation: Degradation) -> list[dict[str, Any]]:
+def _fly(
+    stretch: Stretch, entrants: Sequence[LabelledPart], seed: int, degradation: Degradation
+) -> list[dict[str, Any]]:
     dataset = installed().open_dataset(stretch.path)
-    incidents = {entrant.label: Incidents() for entrant in entrants}
+    incidents = {entrant.called: Incidents() for entrant in entrants}
     frontends = {}
     for each in entrants:
         detector = installed().create_detector(each.name, each.options)
-        frontends[each.label] = Frontend(detector, dataset.calibration, FrontendOptions(), incidents[each.label])
+        frontends[each.called] = Frontend(detector, dataset.calibration, FrontendOptions(), incidents[each.called])
     steps: dict[str, list[FrameTracks]] = {label: [] for label in frontends}
     with single_threaded():
         for imu, frames in degraded(dataset, stretch, degradation, seed):

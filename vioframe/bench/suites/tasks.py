@@ -15,18 +15,17 @@ import numpy as np
 import pandas as pd
 
 from vioframe import pipeline
-from vioframe.bench.detectors.entrants import Entrant, everyone, line_up, parse_entrants
+from vioframe.bench.detectors.entrants import everyone, line_up, parse_entrants
 from vioframe.bench.detectors.speed import pictures, speed_settings, time_detectors
 from vioframe.bench.montecarlo import Setup, fly
 from vioframe.bench.processes import installed, single_threaded
 from vioframe.bench.suites import fingerprints
 from vioframe.bench.suites.store import Store
-from vioframe.bench.suites.suite import NamedPart
 from vioframe.errors import RunError, TrajectoryError
 from vioframe.evaluation import TrajectoryErrors
 from vioframe.evaluation.consistency import Trial
 from vioframe.io.convert import appearing
-from vioframe.parts.config import Config, PartConfig
+from vioframe.parts.config import Config, LabelledPart, PartConfig
 from vioframe.parts.registry import describe
 from vioframe.runs import machine
 from vioframe.runs.evaluated import create_metrics, evaluate_paths, measure_runs, write_matched_truth
@@ -83,7 +82,7 @@ class TrialTask(Task):
 class SpeedTask(Task):
     """All detectors timed in turns, on so many ``images`` of the data set ``frames_of``, or on drawn surfaces."""
 
-    detectors: tuple[NamedPart, ...]
+    detectors: tuple[LabelledPart, ...]
     rounds: int
     images: int
     frames_of: Path | None
@@ -194,9 +193,7 @@ def fly_trial(task: TrialTask) -> Trial:
 
 def speed(task: SpeedTask) -> list[Figures]:
     """Frames a second, a row a detector; those that lack something are absent, with the reason as their error."""
-    entrants = [Entrant(each.called, each.name, each.options) for each in task.detectors]
-    if not entrants:
-        entrants = parse_entrants(everyone(installed(), "speed"), (), installed())
+    entrants = task.detectors or parse_entrants(everyone(installed(), "speed"), (), installed())
     lined_up = line_up(entrants, installed())
     recording = None if task.frames_of is None else installed().open_dataset(task.frames_of)
     images, source = pictures(task.images, recording=recording)
