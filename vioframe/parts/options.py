@@ -13,6 +13,7 @@ import textwrap
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from difflib import get_close_matches
+from functools import wraps
 from itertools import pairwise
 from typing import Annotated, Any, TypeVar, get_args, get_origin
 
@@ -105,6 +106,7 @@ def plugin_factory(build: Callable[..., PartT], options_type: type) -> Callable[
     positional = [p for p in inspect.signature(build).parameters.values() if p.kind is not p.KEYWORD_ONLY]
     fields = inspect.signature(options_type).parameters.values()
 
+    @wraps(build)
     def factory(*given: Any, **options: Any) -> PartT:
         return build(*given, options_type(**options))
 
@@ -112,9 +114,6 @@ def plugin_factory(build: Callable[..., PartT], options_type: type) -> Callable[
         __signature__=inspect.Signature([*positional[:-1], *(p.replace(kind=p.KEYWORD_ONLY) for p in fields)]),
         options_type=options_type,
     )
-    factory.__doc__ = inspect.getdoc(build)
-    factory.__name__ = factory.__qualname__ = build.__name__
-    factory.__module__ = build.__module__
     return factory
 
 

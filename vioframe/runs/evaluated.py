@@ -9,8 +9,7 @@ Metrics are plug-ins; what they say of a run is part of its evaluation::
 from __future__ import annotations
 
 import math
-from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from numbers import Real
 from pathlib import Path
@@ -87,7 +86,7 @@ class Evaluated:
     folder: RunFolder | None
     estimate: Trajectory | None
     ground_truth: Trajectory | None
-    errors: TrajectoryErrors | None
+    errors: TrajectoryErrors | None = None
     map_quality: MapQuality | None = None
     measured: Measured | None = None
     segment_starts_ns: tuple[int, ...] = ()
@@ -132,63 +131,58 @@ class Evaluated:
         return {"name": self.name, **run, **errors, **quality, **measured, "stage_ms": self.stage_ms()}
 
 
-def evaluate_path(path: Path, ground_truth: Trajectory | None, alignment: str = "posyaw") -> Evaluated:
-    """Evaluate a run folder or a trajectory file; ``ground_truth`` comes before the one that a run folder holds."""
-    if path.is_dir():
-        folder = RunFolder.open(path)
-        name, estimate = folder.name, folder.trajectory()
-        ground_truth = ground_truth or folder.ground_truth()
-    else:
-        folder, name, estimate = None, path.name.split(".")[0], load_trajectory(path)
-    evaluated = Evaluated(name, folder, estimate, ground_truth, _errors(estimate, ground_truth, alignment))
-    if folder is None:
-        return evaluated
-    return replace(evaluated, segment_starts_ns=folder.segment_starts_ns(), kept_in=folder.path / "evaluation.json")
-
-
-def with_loop_closure(run: Evaluated, alignment: str = "posyaw") -> Evaluated | None:
-    """What loop closure made of ``run``, evaluated against the same ground truth.
-
-    None where it had none, and where no loop was accepted: it is the same trajectory then.
-    """
-    corrected = run.folder.loop_closed() if run.folder else None
-    if corrected is None or run.folder is None or not run.summary.get("loop_closure", {}).get("loops", 1):
-        return None
-    return replace(
-        run,
-        name=f"{run.name} with loop closure",
-        folder=None,
-        estimate=corrected,
-        errors=_errors(corrected, run.ground_truth, alignment),
-        kept_in=run.folder.path / "evaluation_loop.json",
-        loop_closed=True,
-    )
-
-
-def _errors(estimate: Trajectory | None, truth: Trajectory | None, alignment: str) -> TrajectoryErrors | None:
-    return None if estimate is None or truth is None else evaluate(estimate, truth, alignment=alignment)
-
-
 def evaluate_paths(
     paths: Sequence[Path], ground_truth: Path | None = None, alignment: str = "posyaw"
 ) -> list[Evaluated]:
-    """Evaluate each of ``paths`` against ``ground_truth`` or its own; an error notes the path it came from.
+    """Evaluate run folders and trajectory files against ``ground_truth`` or their own; errors note whose they are.
 
-    A run with loop closure is followed by what that made of it. Runs that would share a name are called by their paths.
+    A run with loop closure is followed by what that made of it, unless no loop was accepted: it is the same trajectory
+    then. Runs that would share a name are called by their paths.
     """
     truth = None if ground_truth is None else load_trajectory(ground_truth)
-    evaluated = []
-    for path in paths:
+    names = [path.resolve().name if path.is_dir() else path.name.split(".")[0] for path in paths]
+    evaluated: list[Evaluated] = []
+    for path, name in zip(paths, names, strict=True):
         try:
-            evaluated.append(evaluate_path(path, truth, alignment))
+            evaluated += _evaluate(path, name if names.count(name) == 1 else str(path), truth, alignment)
         except VioframeError as error:
             error.add_note(f"while evaluating {path}")
             raise
-    times = Counter(run.name for run in evaluated)
-    named = [
-        replace(run, name=str(path)) if times[run.name] > 1 else run for path, run in zip(paths, evaluated, strict=True)
-    ]
-    return [each for run in named for each in (run, with_loop_closure(run, alignment)) if each is not None]
+    return evaluated
+
+
+def _evaluate(path: Path, name: str, truth: Trajectory | None, alignment: str) -> Iterator[Evaluated]:
+    """One run or trajectory file, and what loop closure made of it, if any."""
+    if not path.is_dir():
+        yield _compared(Evaluated(name, None, load_trajectory(path), truth), alignment)
+        return
+    folder = RunFolder.open(path)
+    run = Evaluated(
+        name,
+        folder,
+        folder.trajectory(),
+        truth or folder.ground_truth(),
+        segment_starts_ns=folder.segment_starts_ns(),
+        kept_in=path / "evaluation.json",
+    )
+    yield _compared(run, alignment)
+    corrected = folder.loop_closed()
+    if corrected is not None and run.summary.get("loop_closure", {}).get("loops", 1):
+        closed = replace(
+            run,
+            name=f"{name} with loop closure",
+            folder=None,
+            estimate=corrected,
+            kept_in=path / "evaluation_loop.json",
+            loop_closed=True,
+        )
+        yield _compared(closed, alignment)
+
+
+def _compared(run: Evaluated, alignment: str) -> Evaluated:
+    if run.estimate is None or run.ground_truth is None:
+        return run
+    return replace(run, errors=evaluate(run.estimate, run.ground_truth, alignment=alignment))
 
 
 def write_matched_truth(run_folder: str | Path) -> Path | None:

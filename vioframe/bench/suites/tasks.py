@@ -12,7 +12,6 @@ from time import perf_counter
 from typing import Any
 
 import numpy as np
-import pandas as pd
 
 from vioframe import pipeline
 from vioframe.bench.detectors.entrants import everyone, line_up, parse_entrants
@@ -140,7 +139,7 @@ def _flight(task: FlightTask, store: Store, folder: Path) -> Figures:
     (last,) = measure_runs(evaluated[-1:], create_metrics(task.metrics, installed()))
     if last.errors is None or last.measured is None:
         return figures
-    figures |= {"loop_closed": len(evaluated) > 1, **of_errors(last.errors)}
+    figures |= {"loop_closed": last.loop_closed, **of_errors(last.errors)}
     for metric, values in last.measured.figures.items():
         figures |= {f"metrics.{metric}.{name}": value for name, value in values.items()}
     return figures | ({"metrics_left_out": dict(last.measured.left_out)} if last.measured.left_out else {})
