@@ -18,7 +18,7 @@ from vioframe.bench import Row
 from vioframe.bench.suites.plan import plan
 from vioframe.bench.suites.store import Store
 from vioframe.bench.suites.suite import Suite
-from vioframe.bench.suites.sweep import agenda, sweep
+from vioframe.bench.suites.sweep import Sweep
 from vioframe.bench.suites.tasks import simulate
 from vioframe.parts import registry
 from vioframe.parts.config import validate
@@ -41,24 +41,26 @@ def main(data: Path, backend: str, assignments: tuple[str, ...], keep: bool, fli
         "sequences": [{"name": "figure_eight", "duration_s": 10.0}],
         "seeds": flights // 2,
     }
-    planned = plan(validate(Suite, tree, "throughput"), (), registry.load())
+    suite = validate(Suite, tree, "throughput")
+    tasks = plan(suite, (), registry.load())
 
     def rows() -> Iterator[Row]:
         with TemporaryDirectory() as temporary:
             recordings = Path(temporary) / "recordings"
             store = Store.at(Path(temporary) / "none", recordings)
-            store.begin(planned, overwrite=False)
-            for recording in agenda(planned, store).recordings.values():
+            store.begin(suite, overwrite=False)
+            for recording in Sweep(tasks, store).recordings.values():
                 simulate(recording, store, 2)
             seconds = {1: 0.0, 2: 0.0}
             for turn in range(rounds):
                 for workers in seconds:
                     store = Store.at(Path(temporary) / f"{workers}_{turn}", recordings)
-                    store.begin(planned, overwrite=False)
+                    store.begin(suite, overwrite=False)
                     begin_s = perf_counter()
-                    outcome = sweep(agenda(planned, store), store, workers=workers)
+                    sweep = Sweep(tasks, store)
+                    sweep.run(workers=workers)
                     seconds[workers] += perf_counter() - begin_s
-                    assert outcome.done == len(planned.tasks), outcome
+                    assert sweep.done == len(tasks), sweep.failed
             for workers, taken in seconds.items():
                 yield {
                     "workers": workers,

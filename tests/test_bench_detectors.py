@@ -9,7 +9,7 @@ import pytest
 from image_helpers import textured
 
 from vioframe.bench.detectors.degradations import KINDS, Circumstances, Degradation, choose, line_kernel
-from vioframe.bench.detectors.flight import _with_leads, coverage, lives
+from vioframe.bench.detectors.flight import _with_leads, coverage, lives, survival
 from vioframe.bench.detectors.metrics import (
     PairScore,
     corner_error_px,
@@ -271,20 +271,26 @@ def test_survival_counted_by_hand():
 
     After one frame, of 0 to 3 all but 2 live; after two, of the same, 0 and 3; after three, of 0 to 2, only 0.
     """
-    life = lives(tracks([0, 1, 2], [0, 1, 3], [0, 3], [0, 3, 4]))
-    np.testing.assert_array_equal(life.known, [5, 4, 4, 3])
-    np.testing.assert_array_equal(life.alive, [5, 3, 2, 1])
-    assert [life.share(n) for n in range(5)] == [1.0, 0.75, 0.5, pytest.approx(1 / 3), None]
-    assert life.median == 3
+    alive, known = lives(tracks([0, 1, 2], [0, 1, 3], [0, 3], [0, 3, 4]))
+    np.testing.assert_array_equal(known, [5, 4, 4, 3])
+    np.testing.assert_array_equal(alive, [5, 3, 2, 1])
+    assert survival(alive, known)["median_life"] == 3
+
+
+def test_the_share_that_survives_is_of_those_that_could_be_seen_for_so_long():
+    alive, known = np.array([8, 8, 8, 8, 7, 6, 5]), np.array([9, 9, 9, 9, 8, 8, 8])
+    figures = survival(alive, known)
+    assert (figures["survival_5"], figures["tracks_5"]) == (0.75, 8)
+    assert (figures["survival_10"], figures["tracks_10"]) == (None, 0)
 
 
 def test_tracks_that_never_end_have_no_median():
-    assert lives(tracks([0, 1], [0, 1], [0, 1])).median is None
+    assert survival(*lives(tracks([0, 1], [0, 1], [0, 1])))["median_life"] is None
 
 
 def test_frames_without_tracks_know_nothing():
-    life = lives(tracks([], [], []))
-    assert (life.share(0), life.share(1), life.median) == (None, None, None)
+    figures = survival(*lives(tracks(*[[]] * 6)))
+    assert (figures["survival_5"], figures["tracks_5"], figures["median_life"]) == (None, 0, None)
 
 
 def test_coverage_is_the_mean_share_of_cells_with_a_point():

@@ -190,7 +190,7 @@ def test_options_go_to_whom_they_are_meant_for(installed):
 
 
 def test_descriptors_are_asked_of_those_that_have_them(installed):
-    orb, fast = (e.describing(installed) for e in parse_entrants(["orb", "fast"], (), installed))
+    orb, fast = parse_entrants(["orb", "fast"], (), installed, describing=True)
     assert (dict(orb.options), dict(fast.options)) == ({"descriptors": True}, {})
 
 

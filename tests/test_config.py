@@ -32,6 +32,13 @@ def test_the_complete_configuration_survives_yaml(installed, flight, tmp_path):
     assert config.render(after, installed) == text
 
 
+def test_the_name_of_a_part_is_enough(tmp_path):
+    (tmp_path / "c.yaml").write_text("detector: orb\nloop_closure: pose_graph\n")
+    read = config.read(tmp_path / "c.yaml")
+    assert (read.detector, read.backend) == (config.PartConfig(name="orb"), Config().backend)
+    assert read.loop_closure == config.PartConfig(name="pose_graph")
+
+
 def test_a_complete_configuration_holds_every_option_of_every_part(installed, flight):
     done = config.complete(with_data(flight), installed)
     assert set(done.backend.options) == {o.name for o in installed.find(registry.BACKEND, "msckf").options}

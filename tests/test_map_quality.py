@@ -16,7 +16,7 @@ from vioframe.geometry import so3
 from vioframe.geometry.meshes import distances, read_mesh
 from vioframe.io.trajectories import write_tum
 from vioframe.report.map_quality import measure_maps, simulated_world
-from vioframe.runs.evaluated import evaluate_path
+from vioframe.runs.evaluated import evaluate_paths
 from vioframe.runs.folder import RunFolder
 from vioframe.runs.recorder import write_ply
 
@@ -67,7 +67,7 @@ def test_the_figures_are_those_of_the_distances():
 @pytest.mark.parametrize("yaw", [0.0, 2.0])
 def test_landmarks_are_moved_with_the_alignment_of_the_path(tmp_path, yaw):
     run = recorded(tmp_path / "run", yaw=yaw)
-    (measured,), notes = measure_maps([evaluate_path(run, None)], write_ply_mesh(tmp_path / "hall.ply", HALL))
+    (measured,), notes = measure_maps(evaluate_paths([run]), write_ply_mesh(tmp_path / "hall.ply", HALL))
     assert notes == []
     # What is left is the rounding of the files and of single precision.
     assert measured.map_quality.rmse_m == pytest.approx(np.sqrt(np.mean(FAR_M**2)), abs=1e-5)
@@ -79,7 +79,7 @@ def test_a_map_that_is_too_large_is_as_far_off_as_it_is(tmp_path):
     surface = np.random.default_rng(0).uniform(-6.0, 6.0, (200, 2))
     floor = np.column_stack([surface, np.full(200, -3.0)])
     run = recorded(tmp_path / "run", p_WF=1.01 * floor)
-    (measured,), _ = measure_maps([evaluate_path(run, None)], write_ply_mesh(tmp_path / "hall.ply", HALL))
+    (measured,), _ = measure_maps(evaluate_paths([run]), write_ply_mesh(tmp_path / "hall.ply", HALL))
     assert measured.map_quality.median_m == pytest.approx(0.03, abs=1e-5)
 
 

@@ -24,7 +24,7 @@ from vioframe.geometry.trajectory import Trajectory
 from vioframe.io.trajectories import load_trajectory, write_tum
 from vioframe.parts import registry
 from vioframe.parts.config import PartConfig, parse_part
-from vioframe.runs.metrics import create_metrics, measure
+from vioframe.runs.evaluated import create_metrics, measure
 from vioframe.simulation import simulated_sequence
 from vioframe.testing import check_metric
 
@@ -325,7 +325,7 @@ def test_evo_leaves_home_logging_and_matplotlib_alone(tmp_path):
     code = """
         import logging, sys
         from vioframe.parts import registry
-        from vioframe.runs.metrics import create_metrics, measure
+        from vioframe.runs.evaluated import create_metrics, measure
         from vioframe.evaluation import Comparison
         from trajectory_helpers import flight
         installed = registry.load()

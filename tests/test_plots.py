@@ -13,7 +13,7 @@ from vioframe.io.trajectories import write_tum
 from vioframe.report.drawing import drawings, write_figures
 from vioframe.report.figures import figures_of_runs
 from vioframe.report.style import RC, colour
-from vioframe.runs.evaluated import Evaluated, evaluate_path, evaluate_paths
+from vioframe.runs.evaluated import Evaluated, evaluate_paths
 
 PATHS = {"trajectories_3d", "top_view", "side_view"}
 ERRORS = {"translation_error_per_axis", "rotation_error", "comparison", "relative_error"}
@@ -71,9 +71,8 @@ def test_equal_runs_give_equal_figures(runs, tmp_path):
 
 
 def test_a_bare_file_is_drawn_as_far_as_it_goes(folder):
-    truth = evaluate_path(folder / "a", None).ground_truth
-    assert names([evaluate_path(folder / "b.tum", truth)]) == PATHS | ERRORS
-    assert names([evaluate_path(folder / "b.tum", None)]) == PATHS
+    assert names(evaluate_paths([folder / "b.tum"], folder / "a" / "ground_truth.tum")) == PATHS | ERRORS
+    assert names(evaluate_paths([folder / "b.tum"])) == PATHS
 
 
 def test_a_run_without_a_pose_does_not_spoil_the_others(tmp_path, folder):

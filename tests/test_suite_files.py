@@ -204,20 +204,20 @@ class TestPlan:
     def test_a_task_for_each_place_in_the_grid(self, tmp_path):
         text = TOY.replace("[TOY]", "[hover]").replace("[fast]", "[fast, orb]")
         suite = read(tmp_path, text + "conditions: {fog: [0.5, 1.0]}\nseeds: 2\nseeds_vary: recording\n")
-        tasks = plan(suite, (), INSTALLED).tasks
+        tasks = plan(suite, (), INSTALLED)
         assert len({task.name for task in tasks}) == len(tasks) == 2 * 3 * 2
         recordings = {task.recording.name for task in tasks}
         assert len(recordings) == 3 * 2
         assert {task.config.start_s for task in tasks} == {0.0}
 
     def test_seeds_that_vary_the_start_share_a_recording(self, tmp_path):
-        tasks = plan(read(tmp_path, TOY.replace("TOY", "hover") + "seeds: 3\n"), (), INSTALLED).tasks
+        tasks = plan(read(tmp_path, TOY.replace("TOY", "hover") + "seeds: 3\n"), (), INSTALLED)
         assert len({task.recording.name for task in tasks}) == 1
         assert [task.config.start_s for task in tasks] == [0.0, 0.5, 1.0]
 
     def test_what_a_result_depends_on_is_in_its_fingerprint(self, tmp_path):
         def fingerprint(text):
-            return plan(read(tmp_path, text.replace("TOY", "hover")), (), INSTALLED).tasks[0].about
+            return plan(read(tmp_path, text.replace("TOY", "hover")), (), INSTALLED)[0].about
 
         first = fingerprint(TOY)
         assert [fingerprint(TOY)[key] for key in FINGERPRINT] == [first[key] for key in FINGERPRINT]
@@ -238,16 +238,16 @@ class TestPlan:
 
     def test_a_flight_may_start_later_and_a_stand_in_does_not(self, tmp_path):
         later = TOY.replace("[TOY]", "[{name: hover, start_s: 5, duration_s: 3}, {name: V1_02_medium, start_s: 5}]")
-        hover, stand_in = plan(read(tmp_path, later), (), INSTALLED).tasks
+        hover, stand_in = plan(read(tmp_path, later), (), INSTALLED)
         assert (hover.config.start_s, hover.recording.config.duration_s) == (5.0, 8.0)
         assert stand_in.config.start_s == 0.0
 
     def test_detectors_can_be_timed_on_recorded_frames(self, tmp_path, toy):
         text = "title: t\nkind: detector_speed\nsequences: [TOY]\n"
-        (task,) = plan(read(tmp_path, text), [toy], INSTALLED).tasks
-        assert (task.about["data"], task.recording) == (Data.REAL, toy / "TOY")
-        (drawn,) = plan(read(tmp_path, text), (), INSTALLED).tasks
-        assert (drawn.about["data"], drawn.recording) == (None, None)
+        (task,) = plan(read(tmp_path, text), [toy], INSTALLED)
+        assert (task.about["data"], task.frames_of) == (Data.REAL, toy / "TOY")
+        (drawn,) = plan(read(tmp_path, text), (), INSTALLED)
+        assert (drawn.about["data"], drawn.frames_of) == (None, None)
         assert drawn.about["inputs"] != task.about["inputs"]
 
     def test_what_is_missing_is_said_before_anything_is_flown(self, tmp_path):

@@ -14,7 +14,7 @@ from suite_recordings import install_parts, record_toy
 from vioframe.bench.suites import suite as suites
 from vioframe.bench.suites.plan import plan
 from vioframe.bench.suites.store import Store
-from vioframe.bench.suites.sweep import Event, Tally, agenda, sweep
+from vioframe.bench.suites.sweep import Sweep
 from vioframe.errors import RunError
 from vioframe.parts import registry
 from vioframe.report.suite.statistics import Study
@@ -51,16 +51,25 @@ def parts(tmp_path, monkeypatch):
     monkeypatch.setenv("OMP_NUM_THREADS", "1")
 
 
-def run(folder: Path, text: str, data: Path | None, *, out: str = "results", **how) -> tuple[Tally, list[Event], Path]:
+def run(folder: Path, text: str, data: Path | None, *, out: str = "results", **how) -> tuple[Sweep, list[str], Path]:
     file = folder / "toy.yaml"
     file.write_text(text)
-    planned = plan(suites.read(file), [] if data is None else [data], registry.load())
+    suite = suites.read(file)
     store = Store.at(folder / out)
-    store.begin(planned, overwrite=how.pop("overwrite", False))
-    events: list[Event] = []
+    store.begin(suite, overwrite=how.pop("overwrite", False))
+    progress: list[str] = []
     with store.alone():
-        outcome = sweep(agenda(planned, store), store, on_event=events.append, **{"workers": 2, **how})
-    return outcome, events, store.path
+        sweep = Sweep(plan(suite, [] if data is None else [data], registry.load()), store)
+        cost_s = sweep.cost_s
+        costs: list[float] = []
+
+        def on_progress(label: str, cost_s: float) -> None:
+            progress.append(label)
+            costs.append(cost_s)
+
+        sweep.run(on_progress=on_progress, **{"workers": 2, **how})
+    assert sum(costs) == pytest.approx(cost_s)
+    return sweep, progress, store.path
 
 
 def found(path: Path) -> list[Row]:
@@ -82,9 +91,9 @@ def unreliable(folder: Path, how: str, times: int) -> str:
 @pytest.mark.usefixtures("parts")
 class TestSweep:
     def test_every_task_leaves_what_the_report_needs(self, tmp_path, toy):
-        outcome, events, path = run(tmp_path, GRID, toy)
+        outcome, progress, path = run(tmp_path, GRID, toy)
         assert (outcome.done, outcome.reused, outcome.failed) == (4, 0, {})
-        assert len(events) == 4
+        assert len(progress) == 4
         results = load_results(path)
         assert results.suite["title"] == "toy"
         study = Study(results)
@@ -106,8 +115,8 @@ class TestSweep:
     def test_what_is_done_is_not_done_again_unless_something_changed(self, tmp_path, toy):
         _, _, path = run(tmp_path, GRID, toy)
         table = (path / "results.jsonl").read_bytes()
-        outcome, events, _ = run(tmp_path, GRID, toy)
-        assert (outcome.done, outcome.reused, events) == (0, 4, [])
+        outcome, progress, _ = run(tmp_path, GRID, toy)
+        assert (outcome.done, outcome.reused, progress) == (0, 4, [])
         assert (path / "results.jsonl").read_bytes() == table
         # A result that does not say what it was made of is not trusted.
         rows = read_rows(path)
@@ -138,10 +147,10 @@ class TestSweep:
         assert sorted(row["attempts"] for row in found(path)) == [1, 1, 1, 2]
 
     def test_a_task_that_fails_twice_is_reported_and_the_others_go_on(self, tmp_path, toy):
-        outcome, events, path = run(tmp_path, unreliable(tmp_path, "fail", 9), toy)
+        outcome, progress, path = run(tmp_path, unreliable(tmp_path, "fail", 9), toy)
         assert outcome.done == 2
         assert len(outcome.failed) == 2
-        assert sum(bool(event.error) for event in events) == 2
+        assert len(progress) == 4
         for row in found(path):
             failed = row["status"] == "failed"
             assert failed == (row["backend"] == "unreliable")
@@ -184,9 +193,9 @@ class TestSweep:
 @pytest.mark.usefixtures("parts")
 def test_a_simulated_recording_is_made_once_and_goes_when_it_is_no_longer_needed(tmp_path):
     text = GRID.replace("TOY", "{name: hover, duration_s: 0.5}") + "conditions: {noise: [0.5]}\n"
-    outcome, events, path = run(tmp_path, text, tmp_path)
+    outcome, progress, path = run(tmp_path, text, tmp_path)
     assert (outcome.done, outcome.failed) == (8, {})
-    assert sum(not event.is_task for event in events) == 2
+    assert sum(label.endswith(" simulated") for label in progress) == 2
     assert not (path / "recordings").exists()
     assert {row["data"] for row in found(path)} == {Data.SIMULATED}
 
@@ -199,15 +208,14 @@ def test_a_recording_that_cannot_be_made_fails_its_flights_alone(tmp_path, toy):
     text = GRID.replace("[TOY]", "[TOY, hover]")
     file = tmp_path / "toy.yaml"
     file.write_text(text)
-    installed = registry.load()
-    planned = plan(suites.read(file), [toy], installed)
+    suite = suites.read(file)
     store = Store.at(tmp_path / "results")
-    store.begin(planned, overwrite=False)
-    left = agenda(planned, store)
-    for recording in left.recordings.values():
+    store.begin(suite, overwrite=False)
+    outcome = Sweep(plan(suite, [toy], registry.load()), store)
+    for recording in outcome.recordings.values():
         world = recording.config.world.model_copy(update={"name": "mesh", "options": {"file": mesh}})
         object.__setattr__(recording, "config", recording.config.model_copy(update={"world": world}))
-    outcome = sweep(left, store, workers=1)
+    outcome.run(workers=1)
     assert outcome.done == 4
     assert len(outcome.failed) == 4
     assert all("could not be simulated" in error for error in outcome.failed.values())

@@ -53,12 +53,10 @@ def map_in_processes(
     # Spawned, not forked: a fork copies the locks of threads (BLAS, the progress bar) that do not exist in the copy.
     pool = ProcessPoolExecutor(min(workers, len(jobs)), get_context("spawn"), initializer=_leave_talking_to_parent)
     try:
-        futures = {pool.submit(function, job): i for i, job in enumerate(jobs)}
-        by_index = {}
+        futures = [pool.submit(function, job) for job in jobs]
         for future in as_completed(futures):
-            by_index[futures[future]] = future.result()
-            on_result(by_index[futures[future]])
-        return [by_index[i] for i in range(len(jobs))]
+            on_result(future.result())
+        return [future.result() for future in futures]
     except BrokenProcessPool as error:
         raise RunError("a worker process died, killed or short of memory; try again with fewer --workers") from error
     except BaseException:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,7 +13,6 @@ from vioframe.errors import ConfigError
 
 if TYPE_CHECKING:
     from vioframe.bench.suites.suite import Suite
-    from vioframe.bench.suites.sweep import Event
 
 _COMMANDS = {
     "detectors": "Detectors by speed, by quality, or by the tracks made of them.",
@@ -93,40 +91,38 @@ def _suite_command(name: str, summary: str) -> click.Command:
         from vioframe.bench.suites import suite as suites
         from vioframe.bench.suites.plan import plan
         from vioframe.bench.suites.store import Store
-        from vioframe.bench.suites.sweep import agenda, sweep
+        from vioframe.bench.suites.sweep import Sweep
         from vioframe.parts import registry
 
         whole = suites.read(suites.find(name))
         given = {"data": data, "scheduler": scheduler, "workers": workers, "recordings": recordings}
         _check_used(whole, **given, seeds=narrowing["seeds"])
         suite = suites.narrowed(whole, **narrowing)
-        planned = plan(suite, data, registry.load())
+        tasks = plan(suite, data, registry.load())
         store = Store.at(out or Path("results") / suite.name, recordings)
-        store.begin(planned, overwrite=overwrite)
+        store.begin(suite, overwrite=overwrite)
         with store.alone():
-            left = agenda(planned, store)
-            if left.stale:
-                print_notes([f"{left.stale} results are of other code or data, and are made again"])
-            tasks, reused = len(left.tasks), f", {left.reused} done before" if left.reused else ""
-            with Bar(left.cost_s, f"{tasks} tasks{reused}", quiet=quiet or not tasks, percent=True) as bar:
-                so_far: Counter[str] = Counter()
+            sweep = Sweep(tasks, store)
+            if sweep.stale:
+                print_notes([f"{sweep.stale} results are of other code or data, and are made again"])
+            count, reused = len(sweep.left), f", {sweep.reused} done before" if sweep.reused else ""
+            with Bar(sweep.cost_s, f"{count} tasks{reused}", quiet=quiet or not count, percent=True) as bar:
 
-                def on_event(event: Event) -> None:
-                    so_far.update(done=event.is_task, failed=event.is_task and bool(event.error))
-                    failed = f", {so_far['failed']} failed" if so_far["failed"] else ""
-                    bar(f"{so_far['done']} of {tasks} tasks{failed}, last: {event.label}", advance=event.cost_s)
+                def on_progress(label: str, cost_s: float) -> None:
+                    failed = f", {len(sweep.failed)} failed" if sweep.failed else ""
+                    ended = sweep.done + len(sweep.failed)
+                    bar(f"{ended} of {count} tasks{failed}, last: {label}", advance=cost_s)
 
-                tally = sweep(left, store, workers=workers or suite.workers, scheduler=scheduler, on_event=on_event)
-        before = f", {tally.reused} done before" if tally.reused else ""
-        failures = f", {len(tally.failed)} failed" if tally.failed else ""
-        click.echo(f"{tally.done} tasks done{before}{failures}; results in {store.path}")
-        for key, error in tally.failed.items():
+                sweep.run(workers=workers or suite.workers, scheduler=scheduler, on_progress=on_progress)
+        failures = f", {len(sweep.failed)} failed" if sweep.failed else ""
+        click.echo(f"{sweep.done} tasks done{reused}{failures}; results in {store.path}")
+        for key, error in sweep.failed.items():
             click.echo(f"failed: {key}: {error}", err=True)
         if not no_report:
             from vioframe.cli.show import write_and_say
 
             write_and_say(store.path)
-        if tally.failed:
+        if sweep.failed:
             click.get_current_context().exit(EXIT_FAILED)
 
     return command

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from vioframe.cli.common import FILE, Bar, print_notes, quiet_option, workers_option
-from vioframe.errors import ConfigError, DatasetError, PluginError
+from vioframe.errors import ConfigError, DatasetError
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -77,10 +77,8 @@ def detectors(
         raise ConfigError("--quality and --frontend are two questions; ask one at a time")
     question = "quality" if quality else "frontend" if frontend else "speed"
     given = _given(question, specific)
-    try:
-        import pandas as pd
-    except ModuleNotFoundError as error:
-        raise PluginError("comparing detectors needs pandas: pip install 'vioframe[bench]'") from error
+    import pandas as pd
+
     from vioframe.bench.detectors import tables
     from vioframe.bench.detectors.entrants import everyone, line_up, parse_entrants
     from vioframe.bench.processes import usable_cores
@@ -88,10 +86,8 @@ def detectors(
     from vioframe.parts import registry
 
     installed = registry.load()
-    entrants = parse_entrants(detectors or everyone(installed, question), options, installed)
-    if quality:
-        entrants = [entrant.describing(installed) for entrant in entrants]
-    if (over := given.get("baseline")) is not None and over not in (labels := [each.label for each in entrants]):
+    entrants = parse_entrants(detectors or everyone(installed, question), options, installed, describing=quality)
+    if (over := given.get("baseline")) is not None and over not in (labels := [each.called for each in entrants]):
         raise ConfigError(f"--baseline {over} does not take part; one of {', '.join(labels)} can be led over")
     given |= {"baseline": over or tables.BASELINE, "workers": given.get("workers") or usable_cores(), "seed": seed}
     given["quiet"] = quiet
@@ -108,7 +104,7 @@ def detectors(
     if keep is not None:
         rows: list[Any] = result.astype(object).where(pd.notna(result), None).to_dict("records")
         rows += [{"detector": label, "absent": reason} for label, reason in absent.items()]
-        taking_part = {entrant.label: dict(entrant.options) for entrant, _ in lined_up().ready}
+        taking_part = {entrant.called: entrant.options for entrant, _ in lined_up().ready}
         record(keep, rows, {"question": question, "seed": seed, **settings, "detectors": taking_part})
         click.echo(f"written to {keep}")
 
@@ -126,14 +122,9 @@ def _given(question: str, specific: dict[str, Any]) -> dict[str, Any]:
 
 def _speed(given: dict[str, Any], lined_up: Callable[[], LineUp]) -> _Answer:
     from vioframe.bench.detectors import speed
-    from vioframe.bench.detectors.images import evenly, find_images, fit, procedural_images, read_grey
 
-    images, limit, rounds = given["images"], given["limit"] or _SPEED_IMAGES, given["rounds"] or _SPEED_ROUNDS
-    if images is None:
-        pictures, source = procedural_images(limit, speed.RESOLUTION, given["seed"]), "drawn surfaces"
-    else:
-        pictures = [fit(read_grey(path), speed.RESOLUTION) for path in evenly(find_images(images), limit)]
-        source = images.name
+    rounds = given["rounds"] or _SPEED_ROUNDS
+    pictures, source = speed.pictures(given["limit"] or _SPEED_IMAGES, folder=given["images"], seed=given["seed"])
     ready = lined_up().ready
     with Bar(rounds + 1, "rounds", quiet=given["quiet"]) as bar:
         result = speed.time_detectors(ready, pictures, rounds, on_round=lambda count: bar(advance=count))

@@ -67,9 +67,9 @@ def montecarlo(
     """
     from vioframe.bench.processes import map_in_processes, usable_cores
     from vioframe.bench.results import record
-    from vioframe.bench.suites.plan import TrialTask, plan
+    from vioframe.bench.suites.plan import plan
     from vioframe.bench.suites.suite import Suite
-    from vioframe.bench.suites.tasks import fly_trial
+    from vioframe.bench.suites.tasks import TrialTask, fly_trial
     from vioframe.evaluation.consistency import notes, over_trials
     from vioframe.parts import registry
     from vioframe.parts.config import parse_part, validate
@@ -94,7 +94,7 @@ def montecarlo(
     tasks = []
     for flight in dict.fromkeys(flights):
         tree = {"name": flight, "title": flight, **grid, "setup": {"flight": flight, **sensors}}
-        planned = plan(validate(Suite, tree, "command line"), (), installed).tasks
+        planned = plan(validate(Suite, tree, "command line"), (), installed)
         tasks += [task for task in planned if isinstance(task, TrialTask)]
     with Bar(len(tasks), "first trials under way", quiet=quiet) as bar:
         failed = 0

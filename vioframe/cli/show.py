@@ -59,8 +59,7 @@ def evaluate(
     from vioframe.parts import registry
     from vioframe.report.map_quality import measure_maps
     from vioframe.report.tables import figures, notes, to_csv, to_json, to_markdown, to_rich
-    from vioframe.runs.evaluated import evaluate_paths, measure_runs
-    from vioframe.runs.metrics import create_metrics
+    from vioframe.runs.evaluated import create_metrics, evaluate_paths, measure_runs
     from vioframe.runs.recorder import write_json
 
     asked = create_metrics(metrics, registry.load()) if metrics else ()

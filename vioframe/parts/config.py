@@ -14,7 +14,7 @@ from io import StringIO
 from pathlib import Path
 from typing import Any, TypeVar, get_args
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 from pydantic_core import to_jsonable_python
 from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
@@ -23,10 +23,11 @@ from vioframe.errors import ConfigError
 from vioframe.estimation.options import EstimationOptions
 from vioframe.frontend import FrontendOptions
 from vioframe.parts.options import Option, did_you_mean, options_of, validate_options
-from vioframe.parts.registry import BACKEND, DETECTOR, LOOP_CLOSER, Kind, Registry
+from vioframe.parts.registry import BACKEND, DETECTOR, LOOP_CLOSER, Kind, Part, Registry
 
 SectionT = TypeVar("SectionT", bound="Section")
 
+PART_SECTIONS = {"detector": DETECTOR, "backend": BACKEND, "loop_closure": LOOP_CLOSER}
 # What is not of one part, but of all that are put in its place.
 OPTION_SECTIONS = {"frontend": FrontendOptions, "estimation": EstimationOptions}
 
@@ -38,18 +39,43 @@ class Section(BaseModel):
 
 
 class DatasetConfig(Section):
-    """What to read. ``reader`` None means: the one that accepts the path."""
+    """What to read."""
 
-    path: Path | None = None
-    reader: str | None = None
+    path: Path | None = Field(default=None, description="bag or folder to read")
+    reader: str | None = Field(default=None, description="null: the one that accepts the path")
     options: dict[str, Any] = {}
 
 
-class PartConfig(Section):
-    """A detector, back-end or loop closer by name, and its options."""
+class Named(Section):
+    """Something with a name; a bare name is enough."""
 
     name: str
+
+    @model_validator(mode="before")
+    @classmethod
+    def _from_name(cls, value: Any) -> Any:
+        return {"name": value} if isinstance(value, str) else value
+
+    @property
+    def called(self) -> str:
+        """What tables and plots call it."""
+        return self.name
+
+
+class PartConfig(Named):
+    """A part by name, and its options."""
+
     options: dict[str, Any] = {}
+
+
+class LabelledPart(PartConfig):
+    """A part that is compared with others, maybe with itself under other options, to be called ``label``."""
+
+    label: str = ""
+
+    @property
+    def called(self) -> str:
+        return self.label or self.name
 
 
 class Config(Section):
@@ -144,11 +170,16 @@ def parse_assignments(
 ) -> Iterator[tuple[str, str, Any]]:
     """Section, option and value of each ``key=value``, for the ``options`` by section; see :func:`override`."""
     for assignment in assignments:
-        key, equals, text = assignment.partition("=")
-        if not key or not equals:
-            raise ConfigError(f"-o takes key=value, got {assignment!r}")
-        section, option = _find_option(key.strip(), options)
-        yield section, option.name, _parse_value(option, text.strip())
+        key, text = _split(assignment, "-o takes key=value")
+        section, option = _find_option(key, options)
+        yield section, option.name, _parse_value(option, text)
+
+
+def _split(assignment: str, rule: str) -> tuple[str, str]:
+    key, equals, text = (word.strip() for word in assignment.partition("="))
+    if not key or not equals:
+        raise ConfigError(f"{rule}, got {assignment!r}")
+    return key, text
 
 
 def parse_part(spec: str, kind: Kind, registry: Registry) -> PartConfig:
@@ -161,76 +192,62 @@ def parse_part(spec: str, kind: Kind, registry: Registry) -> PartConfig:
     options: dict[str, Any] = {}
     # Commas within brackets belong to a value.
     for assignment in re.split(r",(?![^\[]*\])", own) if own else []:
-        key, equals, text = (word.strip() for word in assignment.partition("="))
-        if not key or not equals:
-            raise ConfigError(f"{spec!r}: options are given as {name}:KEY=VALUE,..., got {assignment!r}")
+        key, text = _split(assignment, f"{spec!r}: options are given as {name}:KEY=VALUE,...")
         options[key] = _parse_value(known[key], text) if key in known else text
     return PartConfig(name=name, options=options)
 
 
 def complete(config: Config, registry: Registry) -> Config:
     """``config`` with every option of every part checked, coerced and its default filled in."""
-    parts: dict[str, Any] = {
-        "detector": PartConfig(
-            name=config.detector.name,
-            options=registry.find(DETECTOR, config.detector.name).validate(config.detector.options),
-        ),
-        "backend": PartConfig(
-            name=config.backend.name,
-            options=registry.find(BACKEND, config.backend.name).validate(config.backend.options),
-        ),
+    changes: dict[str, Any] = {
         "frontend": asdict(config.frontend_options),
         "estimation": asdict(config.estimation_options),
+        "ground_truth": config.ground_truth and config.ground_truth.absolute(),
     }
-    if config.loop_closure is not None:
-        parts["loop_closure"] = PartConfig(
-            name=config.loop_closure.name,
-            options=registry.find(LOOP_CLOSER, config.loop_closure.name).validate(config.loop_closure.options),
-        )
-    if config.dataset.path is not None:
-        reader = registry.find_reader(config.dataset.path, config.dataset.reader)
-        parts["dataset"] = DatasetConfig(
-            path=config.dataset.path.absolute(),
-            reader=reader.name,
-            options=reader.validate(config.dataset.options),
-        )
-    if config.ground_truth is not None:
-        parts["ground_truth"] = config.ground_truth.absolute()
-    return config.model_copy(update=parts)
+    for section, part in _parts_by_section(config, registry).items():
+        named = getattr(config, section)
+        found = {"path": named.path.absolute(), "reader": part.name} if section == "dataset" else {}
+        changes[section] = named.model_copy(update={"options": part.validate(named.options), **found})
+    return config.model_copy(update=changes)
 
 
 def render(config: Config, registry: Registry) -> str:
     """``config`` as YAML, each option with its help as a comment; :func:`read` returns the same configuration."""
-    options = _options_by_section(config, registry)
-    dataset, lines = config.dataset, ["# A vioframe configuration: use it with `vioframe run --config FILE`."]
-    lines += ["dataset:", *_entry("path", dataset.path, "bag or folder to read", 1)]
-    lines += _entry("reader", dataset.reader, "null: the one that accepts the path", 1)
-    lines += _options("options", dataset.options, options.get("dataset", []), 1)
-    for section in ("detector", "backend", "loop_closure"):
-        part = getattr(config, section)
-        if part is None:
-            lines += _entry(section, None, Config.model_fields[section].description or "", 0)
-            continue
-        lines += [f"{section}:", *_entry("name", part.name, "", 1)]
-        lines += _options("options", part.options, options[section], 1)
-    for section in OPTION_SECTIONS:
-        lines += _options(section, getattr(config, section), options[section], 0)
-    for name in ("wait_ms", "ground_truth", "start_s", "duration_s"):
-        lines += _entry(name, getattr(config, name), Config.model_fields[name].description or "", 0)
-    return "\n".join(lines) + "\n"
+    docs = {name: field.description or "" for name, field in Config.model_fields.items()}
+    docs |= {f"dataset.{name}": field.description or "" for name, field in DatasetConfig.model_fields.items()}
+    for section, options in _options_by_section(config, registry).items():
+        where = section if section in OPTION_SECTIONS else f"{section}.options"
+        docs |= {f"{where}.{option.name}": option.doc for option in options}
+    lines = ["# A vioframe configuration: use it with `vioframe run --config FILE`."]
+    return "\n".join([*lines, *_commented(config.model_dump(), docs)]) + "\n"
+
+
+def _commented(tree: Mapping[str, Any], docs: Mapping[str, str], within: str = "") -> Iterator[str]:
+    """Lines of YAML, each value below its help in ``docs``, which go by keys such as ``backend.options.max_clones``."""
+    indent = "  " * within.count(".")
+    for name, value in tree.items():
+        key = f"{within}{name}"
+        if isinstance(value, dict) and value:
+            yield f"{indent}{name}:"
+            yield from _commented(value, docs, f"{key}.")
+        else:
+            comment = f"{indent}# "
+            yield from textwrap.wrap(docs.get(key, ""), 110, initial_indent=comment, subsequent_indent=comment)
+            yield f"{indent}{name}: {_scalar(value)}"
+
+
+def _parts_by_section(config: Config, registry: Registry) -> dict[str, Part]:
+    """The parts that ``config`` names; a section that names none has none."""
+    named = {section: (kind, getattr(config, section)) for section, kind in PART_SECTIONS.items()}
+    parts = {section: registry.find(kind, part.name) for section, (kind, part) in named.items() if part is not None}
+    if config.dataset.path is not None:
+        parts["dataset"] = registry.find_reader(config.dataset.path, config.dataset.reader)
+    return parts
 
 
 def _options_by_section(config: Config, registry: Registry) -> dict[str, list[Option]]:
-    sections = {
-        "detector": registry.find(DETECTOR, config.detector.name).options,
-        "backend": registry.find(BACKEND, config.backend.name).options,
-        **{section: options_of(factory) for section, factory in OPTION_SECTIONS.items()},
-    }
-    if config.loop_closure is not None:
-        sections["loop_closure"] = registry.find(LOOP_CLOSER, config.loop_closure.name).options
-    if config.dataset.path is not None:
-        sections["dataset"] = registry.find_reader(config.dataset.path, config.dataset.reader).options
-    return sections
+    of_parts = {section: part.options for section, part in _parts_by_section(config, registry).items()}
+    return of_parts | {section: options_of(factory) for section, factory in OPTION_SECTIONS.items()}
 
 
 def _find_option(key: str, sections: Mapping[str, list[Option]]) -> tuple[str, Option]:
@@ -278,22 +295,6 @@ def _keys_beside(model: Any, location: tuple[int | str, ...]) -> list[str]:
             found = model.model_fields[key].annotation
             model = next((each for each in (found, *get_args(found)) if hasattr(each, "model_fields")), model)
     return list(model.model_fields)
-
-
-def _options(title: str, values: Mapping[str, Any], options: list[Option], depth: int) -> list[str]:
-    if not values:
-        return [f"{'  ' * depth}{title}: {{}}"]
-    docs = {option.name: option.doc for option in options}
-    lines = [f"{'  ' * depth}{title}:"]
-    for name, value in values.items():
-        lines += _entry(name, value, docs.get(name, ""), depth + 1)
-    return lines
-
-
-def _entry(name: str, value: Any, comment: str, depth: int) -> list[str]:
-    indent = "  " * depth
-    comment_lines = textwrap.wrap(comment, 110, initial_indent=f"{indent}# ", subsequent_indent=f"{indent}# ")
-    return [*comment_lines, f"{indent}{name}: {_scalar(value)}"]
 
 
 def _scalar(value: Any) -> str:

@@ -13,6 +13,7 @@ import textwrap
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from difflib import get_close_matches
+from functools import wraps
 from itertools import pairwise
 from typing import Annotated, Any, TypeVar, get_args, get_origin
 
@@ -105,6 +106,7 @@ def plugin_factory(build: Callable[..., PartT], options_type: type) -> Callable[
     positional = [p for p in inspect.signature(build).parameters.values() if p.kind is not p.KEYWORD_ONLY]
     fields = inspect.signature(options_type).parameters.values()
 
+    @wraps(build)
     def factory(*given: Any, **options: Any) -> PartT:
         return build(*given, options_type(**options))
 
@@ -112,9 +114,6 @@ def plugin_factory(build: Callable[..., PartT], options_type: type) -> Callable[
         __signature__=inspect.Signature([*positional[:-1], *(p.replace(kind=p.KEYWORD_ONLY) for p in fields)]),
         options_type=options_type,
     )
-    factory.__doc__ = inspect.getdoc(build)
-    factory.__name__ = factory.__qualname__ = build.__name__
-    factory.__module__ = build.__module__
     return factory
 
 
@@ -165,12 +164,7 @@ def _attribute_docs(owner: Any) -> dict[str, str]:
             continue  # no source, as in an interactive session: no help
         body = definition.body if isinstance(definition, ast.ClassDef) else []
         for field, after in pairwise(body):
-            if (
-                isinstance(field, ast.AnnAssign)
-                and isinstance(field.target, ast.Name)
-                and isinstance(after, ast.Expr)
-                and isinstance(after.value, ast.Constant)
-                and isinstance(after.value.value, str)
-            ):
-                docs[field.target.id] = " ".join(after.value.value.split())
+            match field, after:
+                case ast.AnnAssign(target=ast.Name(id=name)), ast.Expr(value=ast.Constant(value=str(text))):
+                    docs[name] = " ".join(text.split())
     return docs

@@ -156,9 +156,6 @@ class Registry:
     ) -> World:
         return cast(World, self.find(WORLD, name).create(p_WB, rng, options=options or {}))
 
-    def create_metric(self, name: str, options: Mapping[str, Any] | None = None) -> Metric:
-        return cast(Metric, self.find(METRIC, name).create(options=options or {}))
-
     def open_dataset(
         self, path: str | Path, reader: str | None = None, options: Mapping[str, Any] | None = None
     ) -> Dataset:

@@ -1,22 +1,31 @@
-"""A run, or somebody's trajectory file, beside its ground truth: what tables and plots are made from."""
+"""A run, or somebody's trajectory file, beside its ground truth: what tables and plots are made from.
+
+Metrics are plug-ins; what they say of a run is part of its evaluation::
+
+    metrics = create_metrics(["ate", "band:half_width_m=0.1"], registry.load())
+    measured = measure(metrics, Comparison.of(estimate, ground_truth))
+"""
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from numbers import Real
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from vioframe.errors import RunError, VioframeError
+from vioframe.errors import PluginError, RunError, TrajectoryError, VioframeError
 from vioframe.evaluation import Comparison, TrajectoryErrors, associate, evaluate
 from vioframe.evaluation.landmarks import Landmarks, MapQuality, belonging
 from vioframe.geometry.trajectory import Trajectory
+from vioframe.interfaces import Metric
 from vioframe.io.trajectories import load_trajectory, write_tum
+from vioframe.parts.config import parse_part
+from vioframe.parts.registry import METRIC, Part, Registry, describe
 from vioframe.runs.folder import RunFolder
-from vioframe.runs.metrics import AskedMetric, Measured, measure
 from vioframe.runs.recorder import write_ply
 from vioframe.types import NS_PER_S, Int
 
@@ -39,6 +48,28 @@ _RUN_FIGURES = (
 _GAP_NS = NS_PER_S
 
 
+@dataclass(frozen=True, slots=True)
+class AskedMetric:
+    """A metric ready for use; ``label`` is what it was asked for with, name and options."""
+
+    label: str
+    part: Part
+    metric: Metric
+
+
+@dataclass(frozen=True, slots=True)
+class Measured:
+    """``figures`` by metric and name; ``left_out`` says in a line why a metric has none. Both by label, as asked."""
+
+    figures: Mapping[str, Mapping[str, float]]
+    left_out: Mapping[str, str]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values for JSON."""
+        out: dict[str, Any] = {"metrics": {label: dict(figures) for label, figures in self.figures.items()}}
+        return {**out, "metrics_left_out": dict(self.left_out)} if self.left_out else out
+
+
 @dataclass(frozen=True)
 class Evaluated:
     """``folder`` is None for a bare trajectory file; ``errors`` where there is no pose or no ground truth.
@@ -54,7 +85,7 @@ class Evaluated:
     folder: RunFolder | None
     estimate: Trajectory | None
     ground_truth: Trajectory | None
-    errors: TrajectoryErrors | None
+    errors: TrajectoryErrors | None = None
     map_quality: MapQuality | None = None
     measured: Measured | None = None
     segment_starts_ns: tuple[int, ...] = ()
@@ -99,63 +130,58 @@ class Evaluated:
         return {"name": self.name, **run, **errors, **quality, **measured, "stage_ms": self.stage_ms()}
 
 
-def evaluate_path(path: Path, ground_truth: Trajectory | None, alignment: str = "posyaw") -> Evaluated:
-    """Evaluate a run folder or a trajectory file; ``ground_truth`` comes before the one that a run folder holds."""
-    if path.is_dir():
-        folder = RunFolder.open(path)
-        name, estimate = folder.name, folder.trajectory()
-        ground_truth = ground_truth or folder.ground_truth()
-    else:
-        folder, name, estimate = None, path.name.split(".")[0], load_trajectory(path)
-    evaluated = Evaluated(name, folder, estimate, ground_truth, _errors(estimate, ground_truth, alignment))
-    if folder is None:
-        return evaluated
-    return replace(evaluated, segment_starts_ns=folder.segment_starts_ns(), kept_in=folder.path / "evaluation.json")
-
-
-def with_loop_closure(run: Evaluated, alignment: str = "posyaw") -> Evaluated | None:
-    """What loop closure made of ``run``, evaluated against the same ground truth.
-
-    None where it had none, and where no loop was accepted: it is the same trajectory then.
-    """
-    corrected = run.folder.loop_closed() if run.folder else None
-    if corrected is None or run.folder is None or not run.summary.get("loop_closure", {}).get("loops", 1):
-        return None
-    return replace(
-        run,
-        name=f"{run.name} with loop closure",
-        folder=None,
-        estimate=corrected,
-        errors=_errors(corrected, run.ground_truth, alignment),
-        kept_in=run.folder.path / "evaluation_loop.json",
-        loop_closed=True,
-    )
-
-
-def _errors(estimate: Trajectory | None, truth: Trajectory | None, alignment: str) -> TrajectoryErrors | None:
-    return None if estimate is None or truth is None else evaluate(estimate, truth, alignment=alignment)
-
-
 def evaluate_paths(
     paths: Sequence[Path], ground_truth: Path | None = None, alignment: str = "posyaw"
 ) -> list[Evaluated]:
-    """Evaluate each of ``paths`` against ``ground_truth`` or its own; an error notes the path it came from.
+    """Evaluate run folders and trajectory files against ``ground_truth`` or their own; errors note whose they are.
 
-    A run with loop closure is followed by what that made of it. Runs that would share a name are called by their paths.
+    A run with loop closure is followed by what that made of it, unless no loop was accepted: it is the same trajectory
+    then. Runs that would share a name are called by their paths.
     """
     truth = None if ground_truth is None else load_trajectory(ground_truth)
-    evaluated = []
-    for path in paths:
+    names = [path.resolve().name if path.is_dir() else path.name.split(".")[0] for path in paths]
+    evaluated: list[Evaluated] = []
+    for path, name in zip(paths, names, strict=True):
         try:
-            evaluated.append(evaluate_path(path, truth, alignment))
+            evaluated += _evaluate(path, name if names.count(name) == 1 else str(path), truth, alignment)
         except VioframeError as error:
             error.add_note(f"while evaluating {path}")
             raise
-    times = Counter(run.name for run in evaluated)
-    named = [
-        replace(run, name=str(path)) if times[run.name] > 1 else run for path, run in zip(paths, evaluated, strict=True)
-    ]
-    return [each for run in named for each in (run, with_loop_closure(run, alignment)) if each is not None]
+    return evaluated
+
+
+def _evaluate(path: Path, name: str, truth: Trajectory | None, alignment: str) -> Iterator[Evaluated]:
+    """One run or trajectory file, and what loop closure made of it, if any."""
+    if not path.is_dir():
+        yield _compared(Evaluated(name, None, load_trajectory(path), truth), alignment)
+        return
+    folder = RunFolder.open(path)
+    run = Evaluated(
+        name,
+        folder,
+        folder.trajectory(),
+        truth or folder.ground_truth(),
+        segment_starts_ns=folder.segment_starts_ns(),
+        kept_in=path / "evaluation.json",
+    )
+    yield _compared(run, alignment)
+    corrected = folder.loop_closed()
+    if corrected is not None and run.summary.get("loop_closure", {}).get("loops", 1):
+        closed = replace(
+            run,
+            name=f"{name} with loop closure",
+            folder=None,
+            estimate=corrected,
+            kept_in=path / "evaluation_loop.json",
+            loop_closed=True,
+        )
+        yield _compared(closed, alignment)
+
+
+def _compared(run: Evaluated, alignment: str) -> Evaluated:
+    if run.estimate is None or run.ground_truth is None:
+        return run
+    return replace(run, errors=evaluate(run.estimate, run.ground_truth, alignment=alignment))
 
 
 def write_matched_truth(run_folder: str | Path) -> Path | None:
@@ -171,6 +197,47 @@ def write_matched_truth(run_folder: str | Path) -> Path | None:
     path = run.path / MATCHED_TRUTH
     write_tum(associate(estimate, truth)[1], path)
     return path
+
+
+def create_metrics(specs: Sequence[str], installed: Registry) -> tuple[AskedMetric, ...]:
+    """A metric for each of ``specs``, ``NAME`` or ``NAME:KEY=VALUE,...``; a repeated one counts once.
+
+    Raises :class:`PluginError` or :class:`ConfigError` where one is unknown, lacks what it needs or has a wrong option.
+    """
+    asked = []
+    for spec in dict.fromkeys(specs):
+        named = parse_part(spec, METRIC, installed)
+        part = installed.find(METRIC, named.name)
+        asked.append(AskedMetric(spec, part, part.create(options=named.options)))
+    return tuple(asked)
+
+
+def measure(metrics: Sequence[AskedMetric], comparison: Comparison) -> Measured:
+    """What each of ``metrics`` says; one that cannot tell leaves the others alone.
+
+    Raises :class:`PluginError` naming the plug-in where one fails or returns something else than finite figures.
+    """
+    figures: dict[str, Mapping[str, float]] = {}
+    left_out: dict[str, str] = {}
+    for asked in metrics:
+        try:
+            figures[asked.label] = _checked(asked.part, asked.metric.measure(comparison))
+        except TrajectoryError as error:
+            left_out[asked.label] = " ".join(str(error).split())
+        except VioframeError:
+            raise
+        except Exception as error:
+            raise PluginError(f"{asked.part} failed: {describe(error)}; leave it out or repair it") from error
+    return Measured(figures, left_out)
+
+
+def _checked(part: Part, figures: Any) -> dict[str, float]:
+    if not isinstance(figures, Mapping):
+        raise PluginError(f"{part} returned a {type(figures).__name__}, not figures by name")
+    for name, value in figures.items():
+        if not isinstance(name, str) or not isinstance(value, Real) or not math.isfinite(value):
+            raise PluginError(f"{part} returned {name!r}: {value!r}; a figure is a finite number by name")
+    return {name: float(value) for name, value in figures.items()}
 
 
 def measure_runs(runs: Sequence[Evaluated], metrics: Sequence[AskedMetric]) -> list[Evaluated]:

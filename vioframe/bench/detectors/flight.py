@@ -12,9 +12,8 @@ import numpy as np
 import pandas as pd
 
 from vioframe.bench.detectors.degradations import Circumstances, Degradation
-from vioframe.bench.detectors.entrants import Entrant
 from vioframe.bench.detectors.tables import BASELINE, CONFIDENCE
-from vioframe.bench.processes import map_in_processes, single_threaded
+from vioframe.bench.processes import installed, map_in_processes, single_threaded
 from vioframe.errors import ConfigError, DatasetError
 from vioframe.evaluation.epipolar import epipolar_errors_px
 from vioframe.frontend import Frontend, FrontendOptions
@@ -24,7 +23,7 @@ from vioframe.incidents import Incidents
 from vioframe.interfaces import Dataset
 from vioframe.io.synchronise import synchronise
 from vioframe.io.trajectories import load_trajectory
-from vioframe.parts import registry
+from vioframe.parts.config import LabelledPart
 from vioframe.types import NS_PER_S, Float, FrameSet, FrameTracks, ImuSegment, Int
 
 SURVIVAL_FRAMES = (5, 10, 20)
@@ -46,7 +45,7 @@ class Stretch:
 
 
 def fly_detectors(
-    entrants: Sequence[Entrant],
+    entrants: Sequence[LabelledPart],
     stretch: Stretch,
     degradations: Sequence[Degradation],
     *,
@@ -72,19 +71,20 @@ def check(stretch: Stretch) -> str:
     :class:`ConfigError` for a stretch that has no length."""
     if stretch.duration_s is not None and not 0.0 < stretch.duration_s < np.inf:
         raise ConfigError(f"--duration must be above 0, not {stretch.duration_s:g}")
-    dataset = registry.load().open_dataset(stretch.path)
+    dataset = installed().open_dataset(stretch.path)
     truth_of(dataset, stretch)
     return dataset.name
 
 
-def _fly(stretch: Stretch, entrants: Sequence[Entrant], seed: int, degradation: Degradation) -> list[dict[str, Any]]:
-    installed = registry.load()
-    dataset = installed.open_dataset(stretch.path)
-    incidents = {entrant.label: Incidents() for entrant in entrants}
+def _fly(
+    stretch: Stretch, entrants: Sequence[LabelledPart], seed: int, degradation: Degradation
+) -> list[dict[str, Any]]:
+    dataset = installed().open_dataset(stretch.path)
+    incidents = {entrant.called: Incidents() for entrant in entrants}
     frontends = {}
     for each in entrants:
-        detector = installed.create_detector(each.name, each.options)
-        frontends[each.label] = Frontend(detector, dataset.calibration, FrontendOptions(), incidents[each.label])
+        detector = installed().create_detector(each.name, each.options)
+        frontends[each.called] = Frontend(detector, dataset.calibration, FrontendOptions(), incidents[each.called])
     steps: dict[str, list[FrameTracks]] = {label: [] for label in frontends}
     with single_threaded():
         for imu, frames in degraded(dataset, stretch, degradation, seed):
@@ -151,14 +151,11 @@ def degraded(
 
 def track_figures(steps: Sequence[FrameTracks], dataset: Dataset, truth: Trajectory) -> Mapping[str, Any]:
     """What the tracks of a front-end amount to; what cannot be said of so few frames is None."""
-    life = lives(steps)
     errors_px: Float = epipolar_errors_px(steps, truth, dataset.calibration, BASELINE_FRAMES)
     return {
         "frames": len(steps),
         "alive": float(np.mean([len(step.ids) for step in steps])),
-        **{f"survival_{n}": life.share(n) for n in SURVIVAL_FRAMES},
-        **{f"tracks_{n}": int(life.known[n]) if n < len(steps) else 0 for n in SURVIVAL_FRAMES},
-        "median_life": life.median,
+        **survival(*lives(steps)),
         "epipolar_inliers": float(np.mean(errors_px <= INLIER_PX)) if len(errors_px) else None,
         "epipolar_median_px": float(np.median(errors_px)) if len(errors_px) else None,
         "coverage": coverage(steps, dataset.calibration.cameras[0].model.resolution, GRID),
@@ -175,31 +172,12 @@ def truth_of(dataset: Dataset, stretch: Stretch) -> Trajectory:
     return truth
 
 
-@dataclass(frozen=True, slots=True)
-class Lives:
-    """``alive`` (N,) tracks were still there n = 0 .. N - 1 frames after they were born, of ``known`` (N,) tracks that
-    were born early enough to be seen for so long."""
+def lives(steps: Sequence[FrameTracks]) -> tuple[Int, Int]:
+    """How long the tracks of N successive frames live, one at least.
 
-    alive: Int
-    known: Int
-
-    def share(self, frames: int) -> float | None:
-        """Part of the tracks that live for so long; None where nobody can know."""
-        if frames >= len(self.known) or not self.known[frames]:
-            return None
-        return float(self.alive[frames] / self.known[frames])
-
-    @property
-    def median(self) -> int | None:
-        """Frames after which fewer than half are alive; None where that is never seen."""
-        below = np.flatnonzero(2 * self.alive < self.known)
-        return int(below[0]) if len(below) else None
-
-
-def lives(steps: Sequence[FrameTracks]) -> Lives:
-    """How long the tracks of successive frames live, one at least.
-
-    An id that is gone does not come back, as :class:`vioframe.frontend.Frontend` promises.
+    Returns (N,) tracks that were still there n = 0 .. N - 1 frames after they were born, and (N,) tracks that were born
+    early enough to be seen for so long. An id that is gone does not come back, as
+    :class:`vioframe.frontend.Frontend` promises.
     """
     count = len(steps)
     ids = np.concatenate([step.ids for step in steps])
@@ -209,7 +187,20 @@ def lives(steps: Sequence[FrameTracks]) -> Lives:
     known = np.cumsum(np.bincount(born, minlength=count))[::-1]  # n frames before the end, or earlier
     # Of those that lived n + 1 frames or longer, all were born early enough.
     alive = np.cumsum(np.bincount(lived - 1, minlength=count)[::-1])[::-1]
-    return Lives(alive, known)
+    return alive, known
+
+
+def survival(alive: Int, known: Int) -> dict[str, Any]:
+    """What :func:`lives` amount to: shares of tracks that live for so many frames, and the median life.
+
+    That is the number of frames after which fewer than half are alive. None is what is never seen.
+    """
+    figures: dict[str, Any] = {}
+    for n in SURVIVAL_FRAMES:
+        of = int(known[n]) if n < len(known) else 0
+        figures |= {f"survival_{n}": float(alive[n] / of) if of else None, f"tracks_{n}": of}
+    below = np.flatnonzero(2 * alive < known)
+    return figures | {"median_life": int(below[0]) if len(below) else None}
 
 
 def coverage(steps: Sequence[FrameTracks], resolution: tuple[int, int], grid: tuple[int, int]) -> float:

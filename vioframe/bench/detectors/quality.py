@@ -11,12 +11,12 @@ import numpy as np
 import pandas as pd
 
 from vioframe.bench.detectors.degradations import Circumstances, Degradation
-from vioframe.bench.detectors.entrants import Entrant, detect
+from vioframe.bench.detectors.entrants import detect
 from vioframe.bench.detectors.images import Pair, Views
 from vioframe.bench.detectors.metrics import CORNERS_WITHIN_PX, score_pair
 from vioframe.bench.detectors.tables import BASELINE, CASE, CONFIDENCE
-from vioframe.bench.processes import map_in_processes, single_threaded
-from vioframe.parts import registry
+from vioframe.bench.processes import installed, map_in_processes, single_threaded
+from vioframe.parts.config import LabelledPart
 from vioframe.types import Image
 
 RESOLUTION = (320, 240)
@@ -31,7 +31,7 @@ _LARGEST_JOB = 8
 
 
 def score_detectors(
-    entrants: Sequence[Entrant],
+    entrants: Sequence[LabelledPart],
     pairs: Sequence[Pair],
     degradations: Sequence[Degradation],
     *,
@@ -55,10 +55,9 @@ def score_detectors(
 
 
 def _score(
-    entrants: Sequence[Entrant], degradations: Sequence[Degradation], seed: int, pairs: Sequence[tuple[int, Pair]]
+    entrants: Sequence[LabelledPart], degradations: Sequence[Degradation], seed: int, pairs: Sequence[tuple[int, Pair]]
 ) -> list[dict[str, Any]]:
-    installed = registry.load()
-    ready = [(entrant, installed.create_detector(entrant.name, entrant.options)) for entrant in entrants]
+    ready = [(entrant, installed().create_detector(entrant.name, entrant.options)) for entrant in entrants]
     rows = []
     with single_threaded():
         for number, pair in pairs:
@@ -68,7 +67,7 @@ def _score(
                 for entrant, detector in ready:
                     first, second = (detect(entrant, detector, image, _CANDIDATES) for image in images)
                     score = score_pair(first, second, views.H_21, RESOLUTION, TOP_K)
-                    rows.append({"detector": entrant.label, **degradation.columns, "pair": number, **asdict(score)})
+                    rows.append({"detector": entrant.called, **degradation.columns, "pair": number, **asdict(score)})
     return rows
 
 

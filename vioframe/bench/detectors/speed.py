@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from time import perf_counter
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 import pandas as pd
 
-from vioframe.bench.detectors.entrants import Entrant, detect
+from vioframe.bench.detectors.entrants import detect
+from vioframe.bench.detectors.images import evenly, find_images, fit, frames_of, procedural_images, read_grey
 from vioframe.bench.processes import usable_cores
-from vioframe.interfaces import Detector
+from vioframe.interfaces import Dataset, Detector
+from vioframe.parts.config import LabelledPart
 from vioframe.runs import machine
 from vioframe.types import Image
 
@@ -31,8 +34,20 @@ class Placed(Protocol):
     def precision(self) -> str: ...
 
 
+def pictures(
+    count: int, *, folder: Path | None = None, recording: Dataset | None = None, seed: int = 0
+) -> tuple[list[Image], str]:
+    """At most ``count`` images, evenly from a ``folder`` or a ``recording`` or else drawn, and what they are."""
+    if folder is not None:
+        return [fit(read_grey(path), RESOLUTION) for path in evenly(find_images(folder), count)], folder.name
+    if recording is not None:
+        taken = [frames.images[0] for _, frames in frames_of(recording, count)]
+        return [fit(image, RESOLUTION) for image in taken if image is not None], f"frames of {recording.name}"
+    return procedural_images(count, RESOLUTION, seed), "drawn surfaces"
+
+
 def time_detectors(
-    ready: Sequence[tuple[Entrant, Detector]],
+    ready: Sequence[tuple[LabelledPart, Detector]],
     images: Sequence[Image],
     rounds: int,
     max_points: int = MAX_POINTS,
@@ -53,14 +68,14 @@ def time_detectors(
                 found = detect(entrant, detector, image, max_points)
                 taken = perf_counter() - begin
                 if number > 0:
-                    calls.append((entrant.label, 1e3 * taken, len(found.xy)))
+                    calls.append((entrant.called, 1e3 * taken, len(found.xy)))
         on_round(1)
     every = pd.DataFrame(calls, columns=["detector", "ms", "keypoints"]).groupby("detector", sort=False)
     ms = every["ms"].quantile(np.array([0.25, 0.5, 0.75])).unstack().set_axis(["ms_low", "ms", "ms_high"], axis=1)
     fps = (1e3 / ms).set_axis(["fps_high", "fps", "fps_low"], axis=1)
     on = [f"{d.device}, {d.precision}" if isinstance(d, Placed) else "cpu" for _, d in ready]
     out = pd.concat([fps, ms, every["keypoints"].median()], axis=1).assign(calls=every.size())
-    return out.loc[[entrant.label for entrant, _ in ready]].assign(on=on).rename_axis("detector").reset_index()
+    return out.loc[[entrant.called for entrant, _ in ready]].assign(on=on).rename_axis("detector").reset_index()
 
 
 def speed_settings(images: str, image_count: int, rounds: int) -> dict[str, Any]:

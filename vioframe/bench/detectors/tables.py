@@ -7,6 +7,7 @@ deviation, ``X_sd``, and its lead over another detector, ``lead_X``, with half t
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import partial
 from typing import Any
 
 import pandas as pd
@@ -77,24 +78,20 @@ def shown(question: str, heading: str, result: pd.DataFrame, baseline: str) -> l
 
 def overview(result: pd.DataFrame, columns: Columns) -> str:
     """A row a detector: the figures in ``columns``, deviations in brackets."""
-    cells = {"detector": result["detector"].tolist()}
+    table = result[["detector"]].copy()
     for figure, (title, spec) in columns.items():
-        deviations = result.get(f"{figure}_sd", pd.Series(index=result.index, dtype=float))
-        cells[title] = [
-            _cell(value, spec) + ("" if pd.isna(sd) else f" ({sd:.3f})")
-            for value, sd in zip(result[figure], deviations, strict=True)
-        ]
-    return _text(pd.DataFrame(cells))
+        table[title] = result[figure].map(partial(_cell, spec=spec))
+        if (deviation := f"{figure}_sd") in result:
+            table[title] += result[deviation].map(lambda sd: "" if pd.isna(sd) else f" ({sd:.3f})")
+    return _text(table)
 
 
 def by_degradation(result: pd.DataFrame, figure: str, spec: str) -> pd.DataFrame:
     """A row a degradation, a column a detector: ``figure``, and in brackets its lead and what that amounts to."""
-    cells = [_cell(value, spec) for value in result[figure]]
-    if f"lead_{figure}" in result:
-        leads = zip(result[f"lead_{figure}"], result[f"lead_{figure}_half_width"], strict=True)
-        cells = [f"{cell}{_lead(*lead)}" for cell, lead in zip(cells, leads, strict=True)]
-    cases = zip(result["degradation"], result["level"], strict=True)
-    labels = [Degradation(name, level).label for name, level in cases]
+    cells = result[figure].map(partial(_cell, spec=spec))
+    if (lead := f"lead_{figure}") in result:
+        cells += [_lead(*each) for each in zip(result[lead], result[f"{lead}_half_width"], strict=True)]
+    labels = [Degradation(*case).label for case in zip(result["degradation"], result["level"], strict=True)]
     table = pd.DataFrame({"degradation": labels, "detector": result["detector"], "cell": cells})
     out = table.pivot(index="degradation", columns="detector", values="cell")
     return out.reindex(index=list(dict.fromkeys(labels)), columns=list(dict.fromkeys(result["detector"]))).reset_index()

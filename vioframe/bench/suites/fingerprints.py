@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
@@ -15,7 +15,7 @@ from vioframe.parts.registry import Registry
 from vioframe.runs import machine
 
 # They read results and make none.
-_NO_PART = ("cli", "report")
+_READERS = ("cli", "report")
 _SAMPLE_BYTES = 1 << 20
 
 
@@ -27,34 +27,31 @@ def of_values(*values: Any) -> str:
 def of_code(installed: Registry) -> str:
     """Tells vioframe, all installed plug-ins, and the versions of what they are built on from others."""
     modules = {part.source.module.partition(".")[0] for table in installed.parts.values() for part in table.values()}
-    return _of_modules(tuple(sorted(modules)))
+    return _of_modules(("vioframe", *sorted(modules)))
 
 
 @cache
 def _of_modules(modules: tuple[str, ...]) -> str:
     digest = hashlib.sha256(repr(sorted(machine.versions().items())).encode())
-    for path in [*_framework(), *(path for module in modules for path in _sources_of(module))]:
+    for path in (path for module in modules for path in _sources_of(module)):
         digest.update(path.name.encode())
         digest.update(path.read_bytes())
     return digest.hexdigest()[:16]
 
 
-def _framework() -> Iterator[Path]:
-    root = Path(__file__).parents[2]
-    for path in sorted(root.rglob("*")):
-        if path.suffix in (".py", ".yaml") and path.relative_to(root).parts[0] not in _NO_PART:
-            yield path
-
-
 def _sources_of(module: str) -> list[Path]:
-    """The source of a plug-in, and the data beside it where it is a package."""
+    """The source of a module, and the data beside it where it is a package."""
     spec = find_spec(module)
     if spec is None or spec.origin is None:
         return []
-    if not spec.submodule_search_locations:
-        return [Path(spec.origin)]
-    every = (path for folder in spec.submodule_search_locations for path in Path(folder).rglob("*"))
-    return sorted(path for path in every if path.is_file() and "__pycache__" not in path.parts)
+    folders = [Path(folder) for folder in spec.submodule_search_locations or ()]
+    inside = sorted(path for folder in folders for path in folder.rglob("*") if _is_code(path, folder))
+    return inside or [Path(spec.origin)]
+
+
+def _is_code(path: Path, package: Path) -> bool:
+    within = path.relative_to(package).parts
+    return path.is_file() and within[0] not in _READERS and "__pycache__" not in within
 
 
 def of_recordings(paths: Iterable[Path], *values: Any) -> str:

@@ -3,23 +3,22 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
 from typing import Any
 
-from vioframe.bench.montecarlo import Setup
 from vioframe.bench.suites import fingerprints, sources
-from vioframe.bench.suites.suite import SEED_SHIFT_S, NamedPart, Suite
+from vioframe.bench.suites.suite import SEED_SHIFT_S, Suite
+from vioframe.bench.suites.tasks import AnyTask, FlightTask, Recording, SpeedTask, TrialTask
 from vioframe.errors import ConfigError, DatasetError
 from vioframe.estimation.lifecycle import warm_up
 from vioframe.io.calibration import packaged_calibration
 from vioframe.parts import config as configuration
 from vioframe.parts.config import Config, DatasetConfig, PartConfig
 from vioframe.parts.registry import BACKEND, DETECTOR, Registry
-from vioframe.runs.metrics import create_metrics
+from vioframe.runs.evaluated import create_metrics
 from vioframe.runs.results import CELL, CLEAR, Data
 from vioframe.simulation.config import SimulationConfig
 from vioframe.simulation.flights import flight as named_flight
@@ -28,67 +27,11 @@ from vioframe.simulation.flights import flight as named_flight
 _RENDER_S, _FLY_S, _TRIAL_S = 0.2, 0.02, 0.35
 
 
-@dataclass(frozen=True, slots=True)
-class Recording:
-    """A recording to be simulated, called ``name`` in the folder of recordings."""
+def plan(suite: Suite, folders: Sequence[Path], installed: Registry) -> tuple[AnyTask, ...]:
+    """All tasks of ``suite``.
 
-    name: str
-    config: SimulationConfig
-    cost_s: float
-
-
-@dataclass(frozen=True, slots=True)
-class Task:
-    """``about`` are the columns of its rows that are known beforehand, the fingerprint among them."""
-
-    about: Mapping[str, Any]
-    cost_s: float
-
-    @property
-    def name(self) -> str:
-        return str(self.about["task"])
-
-
-@dataclass(frozen=True, slots=True)
-class FlightTask(Task):
-    """A detector and a back-end on a data set, whose path is that of ``recording`` where there is one."""
-
-    config: Config
-    recording: Recording | None
-    metrics: tuple[str, ...]
-
-
-@dataclass(frozen=True, slots=True)
-class TrialTask(Task):
-    """A back-end on simulated tracks."""
-
-    setup: Setup
-    backend: PartConfig
-
-
-@dataclass(frozen=True, slots=True)
-class SpeedTask(Task):
-    """All detectors timed in turns, on so many ``images`` of ``recording``, or on drawn surfaces."""
-
-    detectors: tuple[NamedPart, ...]
-    rounds: int
-    images: int
-    recording: Path | None
-
-
-AnyTask = FlightTask | TrialTask | SpeedTask
-
-
-@dataclass(frozen=True, slots=True)
-class Plan:
-    """All tasks of ``suite``."""
-
-    suite: Suite
-    tasks: tuple[AnyTask, ...]
-
-
-def plan(suite: Suite, folders: Sequence[Path], installed: Registry) -> Plan:
-    """Raises :class:`vioframe.errors.VioframeError` for all that can be told before the first task."""
+    Raises :class:`vioframe.errors.VioframeError` for all that can be told before the first of them.
+    """
     tasks: Iterable[AnyTask]
     if suite.kind == "detector_speed":
         tasks = [_speed(suite, folders, installed)]
@@ -99,7 +42,7 @@ def plan(suite: Suite, folders: Sequence[Path], installed: Registry) -> Plan:
     for task in tasks:
         if by_name.setdefault(task.name, task) is not task:
             raise ConfigError(f"two tasks of {suite.name} would be called {task.name}; give their parts other labels")
-    return Plan(suite, tuple(by_name.values()))
+    return tuple(by_name.values())
 
 
 def _create(suite: Suite, installed: Registry) -> None:
@@ -157,7 +100,13 @@ def _flights(suite: Suite, folders: Sequence[Path], installed: Registry) -> Iter
                 config=fingerprints.of_values(plain, list(suite.metrics)),
                 inputs=flown.digest,
             )
-            yield FlightTask(about, _FLY_S * 20.0 * seconds, config, recording, suite.metrics)
+            yield FlightTask(
+                about=about,
+                cost_s=_FLY_S * 20.0 * seconds,
+                recording=recording,
+                config=config,
+                metrics=suite.metrics,
+            )
 
 
 def _recording(sequence: str, config: SimulationConfig, digest: str, code: str) -> Recording:
@@ -183,7 +132,7 @@ def _trials(suite: Suite, installed: Registry) -> Iterator[TrialTask]:
             inputs=fingerprints.of_values(setup.model_dump(), seed),
         )
         part = PartConfig(name=backend.name, options=options)
-        yield TrialTask(about, _TRIAL_S * setup.duration_s, setup, part)
+        yield TrialTask(about=about, cost_s=_TRIAL_S * setup.duration_s, setup=setup, backend=part)
 
 
 def _speed(suite: Suite, folders: Sequence[Path], installed: Registry) -> SpeedTask:
@@ -205,7 +154,14 @@ def _speed(suite: Suite, folders: Sequence[Path], installed: Registry) -> SpeedT
         "config": fingerprints.of_values(parts, suite.rounds, suite.images),
         "inputs": "drawn" if source.recording is None else fingerprints.of_recordings([source.recording]),
     }
-    return SpeedTask(about, 60.0, suite.detectors, suite.rounds, suite.images, source.recording)
+    return SpeedTask(
+        about=about,
+        cost_s=60.0,
+        detectors=suite.detectors,
+        rounds=suite.rounds,
+        images=suite.images,
+        frames_of=source.recording,
+    )
 
 
 def _about(kind: str, *cell: Any, seed: int, note: str, **fingerprint: str) -> dict[str, Any]:

@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from pydantic_core import to_jsonable_python
 
-from vioframe.bench.suites.plan import Plan, Recording, Task
+from vioframe.bench.suites.suite import Suite
 from vioframe.errors import RunError
 from vioframe.io.calibration import sidecar_folder
 from vioframe.parts.config import read_tree, to_yaml
 from vioframe.runs.recorder import write_whole
-from vioframe.runs.results import RUNS_FOLDER, SUITE_FILE, read_rows, write_rows
+from vioframe.runs.results import RUNS_FOLDER, SUITE_FILE, Row, read_rows, write_rows
 from vioframe.simulation.config import simulation_folder
 
 
@@ -37,9 +36,9 @@ class Store:
         own = path.absolute() / "recordings"
         return cls(path.absolute(), own if recordings is None else recordings.absolute(), recordings is not None)
 
-    def begin(self, plan: Plan, *, overwrite: bool) -> None:
-        """Make the folder that of ``plan``, or go on with it; raises :class:`RunError` where it is another suite's."""
-        text, file = to_yaml(plan.suite), self.path / SUITE_FILE
+    def begin(self, suite: Suite, *, overwrite: bool) -> None:
+        """Make the folder that of ``suite``, or go on with it; raises :class:`RunError` where it is another suite's."""
+        text, file = to_yaml(suite), self.path / SUITE_FILE
         if self.path.exists() and any(self.path.iterdir()):
             if not file.is_file():
                 raise RunError(
@@ -47,7 +46,7 @@ class Store:
                 )
             if file.read_text(encoding="utf-8") != text:
                 if not overwrite:
-                    before, now = read_tree(file), to_jsonable_python(plan.suite.model_dump())
+                    before, now = read_tree(file), to_jsonable_python(suite.model_dump())
                     differing = ", ".join(key for key in now if before.get(key) != now[key]) or "what it says"
                     raise RunError(
                         f"{self.path} holds another suite's results, which differs in {differing}; choose another "
@@ -79,17 +78,17 @@ class Store:
                 if not self.keep_recordings:
                     shutil.rmtree(self.recordings, ignore_errors=True)
 
-    def keep(self, task: Task, rows: Sequence[Mapping[str, Any]]) -> None:
+    def keep(self, task: str, rows: Sequence[Row]) -> None:
         """Put down the ``rows`` of a task in place of any that it had."""
-        write_rows(self.path, {**read_rows(self.path), task.name: [{**task.about, **row} for row in rows]})
+        write_rows(self.path, {**read_rows(self.path), task: rows})
 
-    def run_folder(self, task: Task) -> Path:
-        return self.path / RUNS_FOLDER / task.name
+    def run_folder(self, task: str) -> Path:
+        return self.path / RUNS_FOLDER / task
 
-    def recording(self, recording: Recording) -> Path:
-        return self.recordings / recording.name
+    def recording(self, name: str) -> Path:
+        return self.recordings / name
 
-    def drop(self, recording: Recording) -> None:
+    def drop(self, recording: str) -> None:
         """Nothing needs this recording any more."""
         if not self.keep_recordings:
             path = self.recording(recording)

@@ -12,7 +12,7 @@ from pydantic import Field, model_validator
 from vioframe.bench.montecarlo import Setup
 from vioframe.errors import ConfigError
 from vioframe.frontend import FrontendOptions
-from vioframe.parts.config import PartConfig, Section, read_tree, validate
+from vioframe.parts.config import LabelledPart, Named, PartConfig, Section, read_tree, validate
 from vioframe.parts.options import did_you_mean, validate_options
 from vioframe.runs.results import Reference
 from vioframe.simulation.conditions import Conditions
@@ -21,34 +21,7 @@ Kind = Literal["flights", "detector_speed", "trials"]
 Level = Annotated[float, Field(gt=0.0, le=1.0)]
 
 
-class Named(Section):
-    """Something with a name; a bare name is enough."""
-
-    name: str
-
-    @model_validator(mode="before")
-    @classmethod
-    def _from_name(cls, value: Any) -> Any:
-        return {"name": value} if isinstance(value, str) else value
-
-    @property
-    def called(self) -> str:
-        """What tables and plots call it."""
-        return self.name
-
-
-class NamedPart(Named):
-    """A part by name with its options, to be called ``label``."""
-
-    options: dict[str, Any] = Field(default_factory=dict)
-    label: str = ""
-
-    @property
-    def called(self) -> str:
-        return self.label or self.name
-
-
-class NamedBackend(NamedPart):
+class Estimator(LabelledPart):
     """A back-end, and the loop closer behind it, if any."""
 
     loop_closure: PartConfig | None = None
@@ -84,8 +57,8 @@ class Suite(Section):
     title: str
     description: str = ""
     kind: Kind = "flights"
-    detectors: tuple[NamedPart, ...] = ()
-    backends: tuple[NamedBackend, ...] = ()
+    detectors: tuple[LabelledPart, ...] = ()
+    backends: tuple[Estimator, ...] = ()
     sequences: tuple[Sequence, ...] = ()
     conditions: dict[str, tuple[Level, ...]] = Field(default_factory=dict)
     clear: bool = True
@@ -171,7 +144,7 @@ def narrowed(suite: Suite, *, seeds: int | None = None, **only: Iterable[str]) -
     for kind, names in only.items():
         have = {each.called: each for each in getattr(suite, kind)}
         if not have and suite.kind == "detector_speed":
-            have = {name: NamedPart(name=name) for name in names}  # it names none and means all
+            have = {name: LabelledPart(name=name) for name in names}  # it names none and means all
         for name in names:
             if name not in have:
                 there = f"; it has {', '.join(have)}" if have else ""

@@ -12,14 +12,13 @@ import signal
 from collections import Counter, defaultdict, deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
 from multiprocessing import resource_tracker
 from typing import TYPE_CHECKING, Any
 
 from vioframe.bench.processes import usable_cores
 from vioframe.bench.suites import tasks
-from vioframe.bench.suites.plan import AnyTask, FlightTask, Plan, Recording, SpeedTask
 from vioframe.bench.suites.store import Store
+from vioframe.bench.suites.tasks import AnyTask, Recording, SpeedTask
 from vioframe.errors import PluginError, RunError, VioframeError
 from vioframe.parts.registry import describe
 from vioframe.runs.results import FINGERPRINT, Row, read_rows
@@ -42,123 +41,84 @@ _SETTINGS = {
 _SILENT = 100
 
 
-@dataclass(frozen=True, slots=True)
-class Event:
-    """Something that is done: ``label`` of ``cost_s`` estimated seconds, ``error`` where it came to nothing."""
+class Sweep:
+    """The ``tasks`` that ``store`` has no result of by the same code on the same data, and what comes of them.
 
-    label: str
-    cost_s: float
-    is_task: bool
-    error: str = ""
+    ``left`` are to do and ``recordings`` must be simulated for them; ``reused`` were done before, and ``stale`` of
+    those that are left were, by other code or on other data. ``done`` counts, ``failed`` has errors by name of the
+    task.
+    """
 
+    def __init__(self, tasks: Sequence[AnyTask], store: Store) -> None:
+        kept = read_rows(store.path)
 
-@dataclass
-class Tally:
-    """What a sweep came to: tasks that had been done before, that were done, and that failed, with the error."""
+        def same(task: AnyTask, row: Row) -> bool:
+            return all(row[column] == task.about[column] for column in FINGERPRINT)
 
-    reused: int = 0
-    done: int = 0
-    failed: dict[str, str] = field(default_factory=dict)
+        def is_done(task: AnyTask) -> bool:
+            rows = kept.get(task.name, ())
+            return bool(rows) and all(row["status"] != "failed" and same(task, row) for row in rows)
 
-
-@dataclass(frozen=True, slots=True)
-class Agenda:
-    """What is left to do: tasks, and the recordings that must be simulated first."""
-
-    tasks: tuple[AnyTask, ...]
-    reused: int
-    stale: int
-    """Results there are that other code or data made, and that are made again."""
-
-    @property
-    def recordings(self) -> dict[str, Recording]:
-        return {r.name: r for task in self.tasks if (r := _recording_of(task))}
+        self.left = [task for task in tasks if not is_done(task)]
+        self.recordings = {task.recording.name: task.recording for task in self.left if task.recording is not None}
+        self.reused = len(tasks) - len(self.left)
+        self.stale = sum(not same(task, kept[task.name][0]) for task in self.left if task.name in kept)
+        self.done, self.failed = 0, dict[str, str]()
+        self._store = store
+        self._on_progress: Callable[[str, float], None] = lambda label, cost_s: None
+        self._attempts: Counter[str] = Counter()
+        # Flights first, recordings last: one that nobody needs any more can go.
+        self._queue: deque[AnyTask | Recording] = deque()
+        # Flights that are not done yet, by recording.
+        self._needed: dict[str, list[AnyTask]] = defaultdict(list)
 
     @property
     def cost_s(self) -> float:
-        return sum(task.cost_s for task in self.tasks) + sum(each.cost_s for each in self.recordings.values())
+        """Estimated seconds on one core, for all that is left."""
+        return sum(job.cost_s for job in (*self.left, *self.recordings.values()))
 
-
-def agenda(plan: Plan, store: Store) -> Agenda:
-    """Every task of ``plan`` that ``store`` has no result of, by the same code on the same data."""
-    kept = read_rows(store.path)
-
-    def same(task: AnyTask, row: Row) -> bool:
-        return all(row[column] == task.about[column] for column in FINGERPRINT)
-
-    def done(task: AnyTask) -> bool:
-        rows = kept.get(task.name, ())
-        return bool(rows) and all(row["status"] != "failed" and same(task, row) for row in rows)
-
-    left = tuple(task for task in plan.tasks if not done(task))
-    stale = sum(not same(task, kept[task.name][0]) for task in left if task.name in kept)
-    return Agenda(left, len(plan.tasks) - len(left), stale)
-
-
-def sweep(
-    left: Agenda,
-    store: Store,
-    *,
-    workers: int | None = None,
-    scheduler: str | None = None,
-    on_event: Callable[[Event], None] = lambda event: None,
-) -> Tally:
-    """Do all that is ``left``, by ``workers`` local processes (by default one a core) or by those of ``scheduler``.
-
-    The workers of a scheduler must reach the store's folders under the same paths. Raises :class:`RunError` where there
-    is no scheduler, and :class:`PluginError` where dask is missing.
-    """
-    drive = _Drive(store, left, on_event)
-    # Time is measured on the whole machine, with nothing beside.
-    drive.here([task for task in left.tasks if isinstance(task, SpeedTask)])
-    if flown := [task for task in left.tasks if not isinstance(task, SpeedTask)]:
-        with _connected(workers, scheduler) as client:
-            if scheduler is not None:
-                _check_code(client, planned=flown[0].about["code"])
-            drive.by_workers(client, flown, list(left.recordings.values()), renderers_may_help=scheduler is None)
-    return drive.tally
-
-
-def _check_code(client: Client, planned: str) -> None:
-    """Raise :class:`RunError` where a worker elsewhere has other code than the tasks were ``planned`` with."""
-    others = [worker for worker, version in client.run(tasks.code).items() if version != planned]
-    if others:
-        raise RunError(f"the worker {others[0]} has other code, plug-ins or versions; install the same there")
-
-
-class _Drive:
-    """Hands out jobs one by one as workers become free."""
-
-    def __init__(self, store: Store, left: Agenda, on_event: Callable[[Event], None]) -> None:
-        self.tally = Tally(reused=left.reused)
-        self._store, self._on_event = store, on_event
-        self._attempts: Counter[str] = Counter()
-        self._queue: deque[AnyTask | Recording] = deque()
-        """Flights first, recordings last: one that nobody needs any more can go."""
-        self._needed: dict[str, list[AnyTask]] = defaultdict(list)
-        """Flights that are not done yet, by recording."""
-
-    def here(self, speeds: Sequence[SpeedTask]) -> None:
-        for task in speeds:
-            self._queue.append(task)
-            while self._queue:
-                self._attempts[task.name] += 1
-                try:
-                    rows, error = tasks.perform(task, self._store, self._attempts[task.name]), ""
-                except Exception as failure:
-                    rows, error = [], _one_line(failure)
-                self._finished(self._queue.popleft(), rows, error)
-
-    def by_workers(
-        self, client: Client, flown: Sequence[AnyTask], recordings: Sequence[Recording], *, renderers_may_help: bool
+    def run(
+        self,
+        *,
+        workers: int | None = None,
+        scheduler: str | None = None,
+        on_progress: Callable[[str, float], None] = lambda label, cost_s: None,
     ) -> None:
+        """Do all that is left, by ``workers`` local processes (by default one a core) or by those of ``scheduler``.
+
+        The workers of a scheduler must reach the store's folders under the same paths. ``on_progress`` is told what
+        came to its end, and its part of :attr:`cost_s`. Raises :class:`RunError` where there is no scheduler, and
+        :class:`PluginError` where dask is missing.
+        """
+        self._on_progress = on_progress
+        for task in self.left:
+            if isinstance(task, SpeedTask):
+                self._here(task)
+        if flown := [task for task in self.left if not isinstance(task, SpeedTask)]:
+            for task in flown:
+                self._needed[task.recording.name if task.recording is not None else ""].append(task)
+            self._queue.extend([*self._needed.pop("", ()), *self.recordings.values()])
+            with _connected(workers, scheduler) as client:
+                if scheduler is not None:
+                    _check_code(client, planned=flown[0].about["code"])
+                self._by_workers(client, renderers_may_help=scheduler is None)
+
+    def _here(self, task: SpeedTask) -> None:
+        """Time is measured on the whole machine, with nothing beside."""
+        self._queue.append(task)
+        while self._queue:
+            self._attempts[task.name] += 1
+            try:
+                rows, error = tasks.perform(task, self._store, self._attempts[task.name]), ""
+            except Exception as failure:
+                rows, error = [], _one_line(failure)
+            self._finished(self._queue.popleft(), rows, error)
+
+    def _by_workers(self, client: Client, *, renderers_may_help: bool) -> None:
         from concurrent.futures import CancelledError
 
         from distributed import wait
 
-        for task in flown:
-            self._needed[recording.name if (recording := _recording_of(task)) else ""].append(task)
-        self._queue.extend([*self._needed.pop("", ()), *recordings])
         running: dict[Future[Any], AnyTask | Recording] = {}
         while self._queue or running:
             capacity = max(1, len(client.nthreads()))
@@ -176,48 +136,48 @@ class _Drive:
                     future = client.submit(tasks.perform, job, self._store, attempt, **how)
                 running[future] = job
             try:
-                done = wait(list(running), return_when="FIRST_COMPLETED").done
+                finished = wait(list(running), return_when="FIRST_COMPLETED").done
             except (CancelledError, OSError) as error:
                 raise RunError("the scheduler is gone; the same command goes on where it was") from error
-            for future in done:
+            for future in finished:
                 why = "" if future.status == "finished" else _why(future)
-                self._finished(running.pop(future), None if why else future.result(), why)
+                self._finished(running.pop(future), [] if why else future.result(), why)
                 future.release()
 
-    def _finished(self, job: AnyTask | Recording, rows: list[tasks.Figures] | None, error: str) -> None:
+    def _finished(self, job: AnyTask | Recording, rows: list[tasks.Figures], error: str) -> None:
         """Take in what came of a job; one that failed is tried again, until it has been often enough."""
-        again = bool(error) and self._attempts[job.name] < ATTEMPTS
-        if not isinstance(job, Recording):
-            if again:
-                self._queue.appendleft(job)
-            else:
-                self._ended(job, rows, error)
-        elif again:
-            self._queue.append(job)
+        if error and self._attempts[job.name] < ATTEMPTS:
+            self._queue.appendleft(job)
+        elif not isinstance(job, Recording):
+            self._ended(job, rows, error)
         else:
-            self._on_event(Event(f"{job.name} simulated", job.cost_s, is_task=False, error=error))
+            self._on_progress(f"{job.name} simulated", job.cost_s)
+            waiting = tuple(self._needed[job.name])
             if not error:
-                self._queue.extendleft(reversed(self._needed[job.name]))
+                self._queue.extendleft(reversed(waiting))
                 return
-            for flight in tuple(self._needed[job.name]):
-                self._ended(flight, None, f"its recording could not be simulated: {error}")
+            for flight in waiting:
+                self._ended(flight, [], f"its recording could not be simulated: {error}")
 
-    def _ended(self, task: AnyTask, rows: list[tasks.Figures] | None, error: str) -> None:
+    def _ended(self, task: AnyTask, rows: list[tasks.Figures], error: str) -> None:
         if error:
-            self.tally.failed[task.name] = error
+            self.failed[task.name] = error
+            rows = [tasks.failure(max(1, self._attempts[task.name]), error)]
         else:
-            self.tally.done += 1
-        self._store.keep(task, rows or [tasks.failure(max(1, self._attempts[task.name]), error)])
-        self._on_event(Event(task.name, task.cost_s, is_task=True, error=error))
-        if (recording := _recording_of(task)) is not None:
-            self._needed[recording.name].remove(task)
-            if not self._needed[recording.name]:
-                self._store.drop(recording)
+            self.done += 1
+        self._store.keep(task.name, [{**task.about, **row} for row in rows])
+        self._on_progress(task.name, task.cost_s)
+        if task.recording is not None:
+            self._needed[task.recording.name].remove(task)
+            if not self._needed[task.recording.name]:
+                self._store.drop(task.recording.name)
 
 
-def _recording_of(task: AnyTask) -> Recording | None:
-    """What must be simulated for ``task``."""
-    return task.recording if isinstance(task, FlightTask) else None
+def _check_code(client: Client, planned: str) -> None:
+    """Raise :class:`RunError` where a worker elsewhere has other code than the tasks were ``planned`` with."""
+    others = [worker for worker, version in client.run(tasks.code).items() if version != planned]
+    if others:
+        raise RunError(f"the worker {others[0]} has other code, plug-ins or versions; install the same there")
 
 
 def _why(future: Future[Any]) -> str:

@@ -1,4 +1,4 @@
-"""What a worker does: a flight, a trial, the timing of detectors, or the simulation of a recording.
+"""The tasks of a sweep and what a worker does for them: flights, trials, timing of detectors, simulated recordings.
 
 A task comes back as rows of the table of results (:mod:`vioframe.runs.results`).
 """
@@ -6,6 +6,7 @@ A task comes back as rows of the table of results (:mod:`vioframe.runs.results`)
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -13,26 +14,80 @@ from typing import Any
 import numpy as np
 
 from vioframe import pipeline
-from vioframe.bench.montecarlo import fly
+from vioframe.bench.detectors.entrants import everyone, line_up, parse_entrants
+from vioframe.bench.detectors.speed import pictures, speed_settings, time_detectors
+from vioframe.bench.montecarlo import Setup, fly
 from vioframe.bench.processes import installed, single_threaded
 from vioframe.bench.suites import fingerprints
-from vioframe.bench.suites.plan import AnyTask, FlightTask, Recording, SpeedTask, TrialTask
 from vioframe.bench.suites.store import Store
 from vioframe.errors import RunError, TrajectoryError
-from vioframe.evaluation import Comparison, TrajectoryErrors
+from vioframe.evaluation import TrajectoryErrors
 from vioframe.evaluation.consistency import Trial
 from vioframe.io.convert import appearing
+from vioframe.parts.config import Config, LabelledPart, PartConfig
 from vioframe.parts.registry import describe
 from vioframe.runs import machine
-from vioframe.runs.evaluated import evaluate_path, with_loop_closure, write_matched_truth
+from vioframe.runs.evaluated import create_metrics, evaluate_paths, measure_runs, write_matched_truth
 from vioframe.runs.folder import RunFolder
-from vioframe.runs.metrics import create_metrics, measure
 from vioframe.runs.results import NEES_FILE, RUNS_FOLDER
+from vioframe.simulation.config import SimulationConfig
 from vioframe.simulation.record import record
 from vioframe.simulation.recording import SimulatedRecording
 from vioframe.types import NS_PER_S
 
 Figures = dict[str, Any]
+
+
+@dataclass(frozen=True, slots=True)
+class Recording:
+    """A recording to be simulated, called ``name`` in the folder of recordings; ``cost_s`` is estimated."""
+
+    name: str
+    config: SimulationConfig
+    cost_s: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Task:
+    """``about`` are the columns of its rows that are known beforehand, the fingerprint among them."""
+
+    about: Mapping[str, Any]
+    cost_s: float
+    recording: Recording | None = None
+    """What must be simulated first."""
+
+    @property
+    def name(self) -> str:
+        return str(self.about["task"])
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FlightTask(Task):
+    """A detector and a back-end on a data set, whose path is that of ``recording`` where there is one."""
+
+    config: Config
+    metrics: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TrialTask(Task):
+    """A back-end on simulated tracks."""
+
+    setup: Setup
+    backend: PartConfig
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SpeedTask(Task):
+    """All detectors timed in turns, on so many ``images`` of the data set ``frames_of``, or on drawn surfaces."""
+
+    detectors: tuple[LabelledPart, ...]
+    rounds: int
+    images: int
+    frames_of: Path | None
+
+
+AnyTask = FlightTask | TrialTask | SpeedTask
 
 
 def perform(task: AnyTask, store: Store, attempt: int) -> list[Figures]:
@@ -41,7 +96,7 @@ def perform(task: AnyTask, store: Store, attempt: int) -> list[Figures]:
     if isinstance(task, SpeedTask):
         rows = speed(task)  # on the whole machine
     else:
-        with single_threaded(), appearing(store.run_folder(task), replace=True) as folder:
+        with single_threaded(), appearing(store.run_folder(task.name), replace=True) as folder:
             try:
                 rows = [_trial(task, folder) if isinstance(task, TrialTask) else _flight(task, store, folder)]
             except OSError as error:
@@ -58,7 +113,7 @@ def failure(attempts: int, error: str) -> Figures:
 
 def simulate(recording: Recording, store: Store, processes: int) -> None:
     """Make a recording by so many ``processes``, unless it is there already."""
-    if not (path := store.recording(recording)).exists():
+    if not (path := store.recording(recording.name)).exists():
         with single_threaded():
             record(SimulatedRecording(recording.config, installed(), processes), [path])
 
@@ -71,27 +126,23 @@ def code() -> str:
 def _flight(task: FlightTask, store: Store, folder: Path) -> Figures:
     config = task.config
     if task.recording is not None:
-        dataset = config.dataset.model_copy(update={"path": store.recording(task.recording)})
+        dataset = config.dataset.model_copy(update={"path": store.recording(task.recording.name)})
         config = config.model_copy(update={"dataset": dataset})
     summary = pipeline.record(pipeline.prepare(config, installed()), folder)
     figures = {**_of_summary(summary), **_of_timings(RunFolder.open(folder))}
     try:
-        evaluated = evaluate_path(folder, None)
-        closed = with_loop_closure(evaluated)
+        evaluated = evaluate_paths([folder])
         write_matched_truth(folder)
     except TrajectoryError as error:
         # As where a handful of poses is all there is: the run went through, and there is nothing to measure.
         return figures | {"not_evaluated": " ".join(str(error).split())}
-    last = closed or evaluated
-    if last.estimate is None or last.ground_truth is None or last.errors is None:
+    (last,) = measure_runs(evaluated[-1:], create_metrics(task.metrics, installed()))
+    if last.errors is None or last.measured is None:
         return figures
-    figures |= {"loop_closed": closed is not None, **of_errors(last.errors)}
-    measured = measure(
-        create_metrics(task.metrics, installed()), Comparison(last.estimate, last.ground_truth, last.errors)
-    )
-    for metric, values in measured.figures.items():
+    figures |= {"loop_closed": last.loop_closed, **of_errors(last.errors)}
+    for metric, values in last.measured.figures.items():
         figures |= {f"metrics.{metric}.{name}": value for name, value in values.items()}
-    return figures | ({"metrics_left_out": dict(measured.left_out)} if measured.left_out else {})
+    return figures | ({"metrics_left_out": dict(last.measured.left_out)} if last.measured.left_out else {})
 
 
 def _of_summary(summary: Mapping[str, Any]) -> Figures:
@@ -141,24 +192,12 @@ def fly_trial(task: TrialTask) -> Trial:
 
 def speed(task: SpeedTask) -> list[Figures]:
     """Frames a second, a row a detector; those that lack something are absent, with the reason as their error."""
-    from vioframe.bench.detectors.entrants import Entrant, everyone, line_up, parse_entrants
-    from vioframe.bench.detectors.images import fit, frames_of, procedural_images
-    from vioframe.bench.detectors.speed import RESOLUTION, speed_settings, time_detectors
-
-    entrants = [Entrant(each.called, each.name, each.options) for each in task.detectors]
-    if not entrants:
-        entrants = parse_entrants(everyone(installed(), "speed"), (), installed())
+    entrants = task.detectors or parse_entrants(everyone(installed(), "speed"), (), installed())
     lined_up = line_up(entrants, installed())
-    if task.recording is None:
-        images, source = procedural_images(task.images, RESOLUTION, 0), "drawn surfaces"
-    else:
-        taken = frames_of(installed().open_dataset(task.recording), task.images)
-        images = [fit(image, RESOLUTION) for _, frames in taken if (image := frames.images[0]) is not None]
-        source = f"frames of {task.recording.stem}"
-    timed = time_detectors(lined_up.ready, images, task.rounds)
+    recording = None if task.frames_of is None else installed().open_dataset(task.frames_of)
+    images, source = pictures(task.images, recording=recording)
     settings = speed_settings(source, len(images), task.rounds)
     settings["width"], settings["height"] = settings.pop("resolution")
-    found: list[Any] = timed.astype(object).to_dict("records")
-    rows: list[Figures] = [{**row, **settings} for row in found]
+    timed: list[Any] = time_detectors(lined_up.ready, images, task.rounds).astype(object).to_dict("records")
     absent = [{"detector": name, "status": "absent", "error": why} for name, why in lined_up.absent.items()]
-    return rows + absent
+    return [*({**row, **settings} for row in timed), *absent]

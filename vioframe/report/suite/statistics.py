@@ -16,7 +16,7 @@ import pandas as pd
 
 from vioframe.evaluation import TrajectoryErrors
 from vioframe.evaluation.consistency import AverageNees, average_nees
-from vioframe.runs.evaluated import Evaluated, evaluate_path, with_loop_closure
+from vioframe.runs.evaluated import Evaluated, evaluate_paths
 from vioframe.runs.results import CELL, CLEAR, NEES_FILE, TASK_COLUMNS, Data, Results
 from vioframe.types import NS_PER_S
 
@@ -104,9 +104,8 @@ class Study:
         name = flight["task"]
         if name not in self._evaluated:
             path = self.results.path / flight["folder"] if flight["evaluated"] else None
-            run = evaluate_path(path, None) if path and (path / "trajectory.tum").is_file() else None
-            closed = with_loop_closure(run) if run and flight["loop_closed"] is True else None
-            self._evaluated[name] = closed or run
+            found = evaluate_paths([path]) if path and (path / "trajectory.tum").is_file() else [None]
+            self._evaluated[name] = found[-1 if flight["loop_closed"] is True else 0]
         return self._evaluated[name]
 
     def nees(self, own: pd.DataFrame) -> dict[str, AverageNees]:
