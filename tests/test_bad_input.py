@@ -174,7 +174,7 @@ REFUSED = {
     "wrong reader": (nothing, (*RUN_GOOD, "--reader", "euroc"), "an ASL data set is the folder that holds mav0/"),
     "unknown option": (nothing, (*RUN_GOOD, "-o", "max_clone=9"), "did you mean 'max_clones'?"),
     "unsuitable option": (nothing, (*RUN_GOOD, "-o", "max_clones=few"), "should be a valid integer"),
-    "option out of range": (nothing, (*RUN_GOOD, "-o", "max_clones=1"), "needs max_clones >= 3"),
+    "option out of range": (nothing, (*RUN_GOOD, "-o", "max_clones=1"), "should be greater than or equal to 3"),
     "unknown key": (
         written("c.yaml", "detectr: {name: orb}\n"),
         (*RUN_GOOD, "--config", "c.yaml"),

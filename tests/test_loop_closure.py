@@ -214,7 +214,7 @@ def test_a_reset_in_between_is_joined_by_loops(revisit):
     closure = closure_of(revisit, steps)
     assert len(closure.trajectory) == len(steps) - 2
     assert sum(loop.accepted for loop in closure.loops) >= 5
-    assert evaluate(closure.trajectory, revisit.truth, association="nearest").ate_m.max < 0.5
+    assert evaluate(closure.trajectory, revisit.truth).ate_m.max < 0.5
 
 
 def test_one_texture_all_over_closes_no_loop():

@@ -206,7 +206,7 @@ def test_nees_is_taken_in_the_gauge_of_each_stretchs_first_pose():
         (["--max-points", "0"], "max_points: Input should be greater than or equal to 1, got 0"),
         (["--backend", "msckf:max_clone=5"], "max_clone"),
         (["--backend", "msckf:max_clones"], "options are given as msckf:KEY=VALUE"),
-        (["--backend", "msckf:max_clones=1"], "needs max_clones >= 3"),
+        (["--backend", "msckf:max_clones=1"], "should be greater than or equal to 3"),
         (["--backend", "msckf:max_clones=many"], "should be a valid integer"),
     ],
 )
@@ -348,7 +348,7 @@ def test_ctrl_c_ends_all_processes_and_leaves_nothing(parts, tmp_path):
 # What the project promises
 
 
-@pytest.mark.slow
+@pytest.mark.very_slow
 def test_the_msckf_is_accurate_and_honest_and_not_without_first_estimates():
     """25 flights of 60 s at EuRoC's noise, which it is told, with its own initialisation: every figure promised."""
     honest, nees = flown(25)
