@@ -2,6 +2,7 @@ import json
 
 import matplotlib as mpl
 import numpy as np
+import pandas as pd
 import pytest
 from click.testing import CliRunner
 from trajectory_helpers import disturbed, flight, write_run
@@ -11,7 +12,7 @@ from vioframe.evaluation import evaluate
 from vioframe.geometry.trajectory import Trajectory
 from vioframe.io.trajectories import write_tum
 from vioframe.report.drawing import drawings, write_figures
-from vioframe.report.figures import figures_of_runs
+from vioframe.report.figures import figures_of_runs, stage_bars
 from vioframe.report.style import RC, colour
 from vioframe.runs.evaluated import Evaluated, evaluate_paths
 
@@ -169,6 +170,15 @@ def test_the_bars_add_up_to_the_time_a_frame(runs):
     ends = [bar.get_x() + bar.get_width() for bar in ax.patches]
     assert max(ends) == pytest.approx(sum(runs[0].stage_ms().values()), rel=1e-9)
     assert f"{max(ends):.1f} ms" in {text.get_text() for text in ax.texts}
+
+
+def test_stages_stand_as_a_frame_goes_through_them():
+    stages = ["loop_closure", "backend.update", "klt", "backend.other", "detect"]
+    traces, _ = stage_bars(pd.DataFrame([[1.0] * 5], ["run"], stages), [])
+    assert [trace["meta"]["series"] for trace in traces] == [
+        *("klt", "detect", "backend.update", "backend.other", "loop_closure")
+    ]
+    assert len({trace["marker"]["color"] for trace in traces}) == 5
 
 
 def test_a_run_without_times_has_no_bar(runs):

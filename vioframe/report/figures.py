@@ -34,6 +34,7 @@ _FRONT_END = ("#24415e", "#3f6a94", "#6f9bc4", "#a9c8e4", "#d3e3f2")
 _BACK_END = (
     *("#7a4a12", "#c9873a", "#ecc48d", "#a0671f", "#dfa863", "#f6e3c9", "#8a6d4d", "#b59a7a", "#d8c6ad", "#5f4326"),
 )
+_LOOP_CLOSURE = "#3c8d5a"
 
 Trace = dict[str, Any]
 Layout = dict[str, Any]
@@ -346,28 +347,35 @@ def _timing(lines: Sequence[Line]) -> Figure:
 
 def timing(cases: Mapping[str, Case], rows: int) -> Figure:
     """Of what :func:`stage_bars` makes, with no more than so many ``rows``."""
-    about = "Mean over all frames, without reading and decoding images. Blue: front-end; brown: back-end."
+    about = "Mean over all frames, without reading and decoding images. Blue: front-end, brown: back-end, green: loops."
     return Figure("timing", "Time a frame by stage", cases, about, "Recordings", FRAME + (ROW + 8) * rows)
 
 
 def stage_bars(means: pd.DataFrame, owners: Sequence[Mapping[str, str]]) -> tuple[list[Trace], Layout]:
     """Bars of milliseconds a frame by stage, a column each: a row a run or a contender, by its name."""
-    shades = {False: iter(_FRONT_END * 3), True: iter(_BACK_END * 3)}
+    shades = {"backend": iter(_BACK_END * 3), "loop_closure": iter((_LOOP_CLOSURE,))}
+    front_end, order = iter(_FRONT_END * 3), list(shades)
+
+    def part(stage: str) -> str:
+        return stage.partition(".")[0]
+
+    # As a frame goes through them: the front-end's, of which the order knows nothing, are the first.
+    stages = sorted(means.columns, key=lambda stage: order.index(part(stage)) if part(stage) in order else -1)
     traces = [
         {
             "type": "bar",
             "orientation": "h",
             "x": means[stage].tolist(),
             "y": list(means.index),
-            "marker": {"color": next(shades[str(stage).startswith("backend")])},
-            "text": [str(stage).removeprefix("backend.").replace("_", " ")] * len(means),
+            "marker": {"color": next(shades.get(part(stage), front_end))},
+            "text": [stage.removeprefix("backend.").replace("_", " ")] * len(means),
             "textposition": "inside",
             "insidetextanchor": "middle",
             "textangle": 0,
             "hovertemplate": "%{y}: %{x:.2f} ms" + f"<extra>{stage}</extra>",
             "meta": {"series": stage, "owners": owners},
         }
-        for stage in means.columns
+        for stage in stages
     ]
     layout = {
         "barmode": "stack",
