@@ -1,4 +1,5 @@
 import json
+from dataclasses import replace
 
 import matplotlib as mpl
 import numpy as np
@@ -170,6 +171,16 @@ def test_the_bars_add_up_to_the_time_a_frame(runs):
     ends = [bar.get_x() + bar.get_width() for bar in ax.patches]
     assert max(ends) == pytest.approx(sum(runs[0].stage_ms().values()), rel=1e-9)
     assert f"{max(ends):.1f} ms" in {text.get_text() for text in ax.texts}
+
+
+@pytest.mark.parametrize("figure", ["comparison", "timing"])
+@pytest.mark.filterwarnings("error::UserWarning")
+def test_many_runs_leave_room_for_their_lines(runs, figure):
+    """What is noted of each goes into several rows: in one it would push the panels out."""
+    many = [replace(runs[k % 2], name=f"run {k}") for k in range(8)]
+    canvas = drawn(many, figure)
+    canvas.draw_without_rendering()
+    assert all(ax.get_position().width > 0.6 for ax in canvas.axes)
 
 
 def test_stages_stand_as_a_frame_goes_through_them():

@@ -172,7 +172,9 @@ def _panel(ax: Any, traces: Sequence[Trace], layout: Layout, row: int, *, by_bac
     notes = [(trace, note) for trace in traces if (note := trace["meta"].get("note"))]
     if notes:
         handles = [Line2D([], [], color=trace["line"]["color"], label=note) for trace, note in notes]
-        ax.legend(handles=handles, loc="lower right", bbox_to_anchor=(1.0, 0.97), ncols=len(notes), fontsize=9.5)
+        panel_inch = ax.figure.get_figwidth() / ax.get_gridspec().ncols - 1.0
+        columns = _columns_that_fit(panel_inch, [note for _, note in notes], letters_an_inch=13.0)
+        ax.legend(handles=handles, loc="lower right", bbox_to_anchor=(1.0, 0.97), ncols=columns, fontsize=9.5)
     if scene:
         _space(ax, scene)
     if layout.get("equal"):
@@ -290,8 +292,12 @@ def _legend(canvas: Any, panels: Iterable[Any]) -> None:
             if label not in handles or isinstance(handles[label], Polygon):
                 handles[label] = handle
     if handles:
-        columns_that_fit = int(canvas.get_figwidth() / (0.75 + max(map(len, handles)) / 11.0))
         how: dict[str, Any] = {"loc": "outside upper left", "borderaxespad": 0.2}
-        how["ncols"] = max(1, min(columns_that_fit, len(handles)))
+        how["ncols"] = _columns_that_fit(canvas.get_figwidth(), list(handles), letters_an_inch=11.0)
         for shown in canvas.legend(list(handles.values()), list(handles), **how).get_lines():
             shown.set(lw=max(2.0, shown.get_linewidth()), alpha=1.0)
+
+
+def _columns_that_fit(inch: float, labels: Sequence[str], letters_an_inch: float) -> int:
+    """How many entries of a legend, each with the sample of its line, go side by side."""
+    return max(1, min(len(labels), int(inch / (0.75 + max(map(len, labels)) / letters_an_inch))))
