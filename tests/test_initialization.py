@@ -145,8 +145,8 @@ class TestRealMotion:
     @pytest.mark.parametrize(
         "name",
         [
-            *("MH_03_medium", "MH_05_difficult", "V1_02_medium"),
-            *(pytest.param(name, marks=pytest.mark.very_slow) for name in ("MH_02_easy", "V1_01_easy")),
+            *("MH_05_difficult", "V1_02_medium"),
+            *(pytest.param(name, marks=pytest.mark.very_slow) for name in ("MH_02_easy", "MH_03_medium", "V1_01_easy")),
         ],
     )
     def test_never_wrong_wherever_it_starts(self, shared_data: Path, name: str):

@@ -115,7 +115,7 @@ def mean_nees(flight: str, seeds: int, duration_s: float, options: MsckfOptions)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("flight", ["figure_eight", "aggressive"])
+@pytest.mark.parametrize("flight", ["figure_eight", pytest.param("aggressive", marks=pytest.mark.very_slow)])
 def test_errors_are_as_large_as_the_covariance_says(flight):
     """Three degrees of freedom over twelve flights; errors within a flight hang together, so each counts as one."""
     flights = 12
