@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from heapq import merge
 from itertools import islice
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
@@ -116,6 +116,11 @@ class EurocDataset:
     def _frame(self, t_ns: int, place: int, file: str) -> FrameSet | Unreadable:
         folder = self._mav0 / self._folders[place]
         path = folder / "data" / file
+        # A recording from elsewhere may name any file of this machine, or a pipe that nobody writes to.
+        if PurePath(file).is_absolute() or ".." in PurePath(file).parts:
+            return Unreadable(t_ns, "frame_unreadable", f"{file} leads out of {folder.name}/data")
+        if path.exists() and not path.is_file():
+            return Unreadable(t_ns, "frame_unreadable", f"{path.name} is no ordinary file")
         try:
             image = decode_image(path.read_bytes())
         except OSError as err:

@@ -1,6 +1,7 @@
 """Readers: what is in a recording comes out exactly; what is wrong with one is said in a line, or counted."""
 
 import logging
+import os
 import re
 import shutil
 from collections.abc import Callable, Iterator
@@ -114,6 +115,24 @@ class TestAsl:
         assert [m.t_ns for m in lost] == [int(image.stem) for image in images[1:4]]
         assert [frame.t_ns for frame in frames_of(dataset)] == [int(images[i].stem) for i in (0, 4, 5)]
         assert incidents_of(dataset)["frame_unreadable"] == 3
+
+    def test_no_image_is_read_from_outside_of_its_folder(self, asl: Path, tmp_path: Path) -> None:
+        """Nor from a pipe, which would wait for ever."""
+        folder = asl / "mav0" / "cam0"
+        images = sorted((folder / "data").iterdir())
+        stamps = [image.stem for image in images]
+        shutil.copy(images[0], folder / "secret.png")
+        images[2].unlink()
+        os.mkfifo(images[2])
+        names = ["../secret.png", str(folder / "secret.png"), images[2].name, *(image.name for image in images[3:])]
+        rows = [f"{stamp},{name}" for stamp, name in zip(stamps, names, strict=True)]
+        (folder / "data.csv").write_text("\n".join(["#timestamp,filename", *rows]))
+        dataset = EurocDataset(asl)
+        lost = [m.detail for m in dataset.measurements() if isinstance(m, Unreadable)]
+        assert [detail.partition(" ")[2] for detail in lost] == [
+            *("leads out of cam0/data", "leads out of cam0/data", "is no ordinary file")
+        ]
+        assert [frame.t_ns for frame in frames_of(dataset)] == [int(stamp) for stamp in stamps[3:]]
 
     def test_imu_rows_that_cannot_be_read_are_counted(self, asl: Path) -> None:
         file = asl / "mav0" / "imu0" / "data.csv"
