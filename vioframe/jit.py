@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+import stat
 import tempfile
 from collections.abc import Callable
 from contextlib import suppress
@@ -47,7 +48,22 @@ def _folder(chosen: str) -> Path:
     home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "vioframe" / "kernels"
     with suppress(OSError):
         home.mkdir(parents=True, exist_ok=True)
-    return home if os.access(home, os.W_OK) else Path(tempfile.gettempdir()) / f"vioframe-kernels-{getuser()}"
+    return home if os.access(home, os.W_OK) else _temporary_folder()
+
+
+@cache
+def _temporary_folder() -> Path:
+    """One that stays and only its owner can write to; a new one where somebody else was there first.
+
+    What lies in a cache is run: from a folder that others can fill it would be their code.
+    """
+    folder = Path(tempfile.gettempdir()) / f"vioframe-kernels-{getuser()}"
+    with suppress(OSError):
+        folder.mkdir(mode=0o700, exist_ok=True)
+        found = folder.lstat()
+        if stat.S_ISDIR(found.st_mode) and found.st_uid == os.getuid() and not found.st_mode & 0o022:
+            return folder
+    return Path(tempfile.mkdtemp(prefix="vioframe-kernels-"))
 
 
 @cache
