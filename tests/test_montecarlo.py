@@ -222,13 +222,14 @@ def test_only_a_monte_carlo_is_replaced_and_only_on_request(parts):
         Path(name).mkdir()
     Path("mine/thesis.txt").touch()
     Path("done/montecarlo.json").touch()
-    Path("done/old.png").touch()
+    for name in ("old_trials.png", "mine.txt"):
+        Path("done", name).touch()
     command = ["--backend", "drawn", "--seeds", "1", "--workers", "1", "--out"]
     assert "exists already" in montecarlo(*command, "done", code=2).stderr
     assert "is not overwritten" in montecarlo(*command, "mine", "--overwrite", code=2).stderr
     montecarlo(*command, "done", "--overwrite")
     assert {path.name for path in Path("done").iterdir()} == {
-        *("montecarlo.json", "nees.csv", "nees_of_trials.png", "trials.png")
+        *("montecarlo.json", "nees.csv", "nees_of_trials.png", "trials.png", "mine.txt")
     }
 
 

@@ -238,15 +238,22 @@ def test_two_runs_are_the_same_byte_for_byte(tmp_path):
         assert (tmp_path / "a" / file).read_bytes() == (tmp_path / "b" / file).read_bytes()
 
 
-def test_a_run_is_replaced_only_on_request_and_completely(tmp_path):
+def test_a_run_is_replaced_only_on_request_and_nothing_but_the_run(tmp_path):
     run = tmp_path / "run"
     record(run, [step(0)])
-    (run / "plot.png").touch()
+    mine = [run / "notes.md", run / "calibration" / "mine.yaml", tmp_path / "elsewhere" / "cam0" / "sensor.yaml"]
+    (run / "calibration" / "cam0").mkdir(parents=True)
+    (run / "calibration" / "cam0" / "sensor.yaml").touch()
+    for file in mine:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.touch()
+    (run / "calibration_learned").symlink_to(tmp_path / "elsewhere")
     with pytest.raises(RunError, match="exists already; choose another --out or pass --overwrite"):
         new_run_folder(run)
     assert (run / "trajectory.tum").exists()
     new_run_folder(run, overwrite=True)
-    assert list(run.iterdir()) == []
+    assert all(file.exists() for file in mine)
+    assert {file.name for file in run.rglob("*")} == {"notes.md", "calibration", "mine.yaml", "calibration_learned"}
 
 
 def test_what_is_no_run_is_never_replaced(tmp_path):

@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from vioframe.evaluation.consistency import Trial
 
 MARKER = "montecarlo.json"
+FILES = (MARKER, "nees.csv", "*trials.png")
 """The file by which a folder is known as that of a Monte Carlo."""
 
 
@@ -116,7 +117,7 @@ def montecarlo(
     print_notes(note for own in by_case for note in notes(own))
     # Last: what was found is shown even where the disk is full.
     folder = out or free_run_folder(Path("runs"), "montecarlo")
-    new_run_folder(folder, overwrite=overwrite, marker=MARKER)
+    new_run_folder(folder, overwrite=overwrite, marker=MARKER, files=FILES)
     study.nees_table().to_csv(folder / "nees.csv", index=False, float_format="%.9g")
     write_figures(figures(study), folder)
     cases = []
@@ -128,4 +129,6 @@ def montecarlo(
         by_seed = [trial.to_dict() for _, trial in of_case]
         cases.append({"name": task.about["backend"], **about, **over_trials(own), "nees": averages, "by_seed": by_seed})
     record(folder / MARKER, cases, {"backends": backends, "flights": flights, "seeds": seeds, **sensors})
-    click.echo(f"written to {folder}: {', '.join(sorted(path.name for path in folder.iterdir()))}")
+    click.echo(
+        f"written to {folder}: {', '.join(sorted(path.name for pattern in FILES for path in folder.glob(pattern)))}"
+    )

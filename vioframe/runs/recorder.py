@@ -17,9 +17,9 @@ All but the timings, the machine and the summary's clock-dependent figures are t
 from __future__ import annotations
 
 import json
-import shutil
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from itertools import count
 from pathlib import Path
 from time import perf_counter
@@ -51,6 +51,13 @@ CALIBRATION_COLUMNS = (
 """Of ``calibration.csv``: the camera by its place in the rig, its pose on the body (R_BC as a quaternion, p_BC m), time
 offset, intrinsics, and their standard deviations (rad, m, s, px); zero is what is not estimated."""
 LOOP_COLUMNS = ("earlier_t_ns", "later_t_ns", "x_m", "y_m", "z_m", "yaw_rad", "inliers", "accepted")
+RUN_FILES = (
+    *("summary.json", "config.yaml", "machine.json", "evaluation.json", "evaluation_loop.json"),
+    *("trajectory.tum", "trajectory_loop.tum", "ground_truth.tum", "ground_truth_matched.tum"),
+    *("states.csv", "pose_cov.csv", "calibration.csv", "tracks.csv", "timings.csv", "loops.csv", "map.ply"),
+    *("calibration/*/sensor.yaml", "calibration_learned/*/sensor.yaml"),
+)
+"""What a run folder holds; patterns, as are taken out where a run is replaced by another."""
 _UPPER = np.triu_indices(6)
 _EVENTS_KEPT_PER_KIND = 20
 _RECENT_LANDMARKS = 5000
@@ -69,13 +76,22 @@ def check_run_folder(path: Path, *, overwrite: bool = False, marker: str = "summ
         raise RunError(f"{path} holds no {marker}, is not a run folder and is not overwritten; choose another --out")
 
 
-def new_run_folder(path: Path, *, overwrite: bool = False, marker: str = "summary.json") -> None:
-    """Create the folder ``path``, in place of the run that is there if ``overwrite``."""
+def new_run_folder(
+    path: Path, *, overwrite: bool = False, marker: str = "summary.json", files: Sequence[str] = RUN_FILES
+) -> None:
+    """Create the folder ``path``, in place of the run that is there if ``overwrite``.
+
+    Of that run its own ``files`` go, by patterns; whatever else somebody put there stays.
+    """
     check_run_folder(path, overwrite=overwrite, marker=marker)
     try:
-        if path.exists():
-            shutil.rmtree(path)
-        path.mkdir(parents=True)
+        for old in [file for pattern in files for file in path.glob(pattern)]:
+            if old.parent.resolve().is_relative_to(path.resolve()):  # not what is behind a link to elsewhere
+                old.unlink()
+                for folder in old.relative_to(path).parents[:-1]:
+                    with suppress(OSError):  # that it holds more
+                        (path / folder).rmdir()
+        path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise RunError(f"cannot create the run folder {path}: {error.strerror}") from error
 
