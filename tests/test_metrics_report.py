@@ -103,6 +103,14 @@ def test_runs_without_ground_truth_or_without_a_pose_still_show_how_they_went(tm
     assert "RMSE" not in result.stdout
 
 
+def test_what_is_no_run_among_several_is_left_aside(runs):
+    (runs / "plots").mkdir()
+    result = evaluate_command(runs / "fine", runs / "plots", runs / "coarse", "--format", "json")
+    assert result.exit_code == 0
+    assert [run["name"] for run in json.loads(result.stdout)] == ["fine", "coarse"]
+    assert f"note: {runs / 'plots'} is left aside" in result.stderr
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

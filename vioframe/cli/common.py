@@ -15,7 +15,21 @@ if TYPE_CHECKING:
 
 FILE = click.Path(path_type=Path)
 
-runs_argument = click.argument("runs", metavar="RUN...", type=FILE, nargs=-1, required=True)
+
+def _without_other_folders(context: click.Context, parameter: click.Parameter, paths: tuple[Path, ...]) -> list[Path]:
+    """Of what the shell makes of ``runs/*`` the runs, unless there is none among them."""
+    from vioframe.runs.folder import RunFolder
+
+    others = [path for path in paths if path.is_dir() and not RunFolder.is_at(path)]
+    if len(others) == len(paths):
+        return list(paths)
+    print_notes(f"{path} is left aside: it holds no trajectory.tum and is no run folder" for path in others)
+    return [path for path in paths if path not in others]
+
+
+runs_argument = click.argument(
+    "runs", metavar="RUN...", type=FILE, nargs=-1, required=True, callback=_without_other_folders
+)
 ground_truth_option = click.option(
     "--ground-truth", type=FILE, help="TUM or EuRoC csv; a run folder's own is the default."
 )

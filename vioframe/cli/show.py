@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import click
@@ -42,7 +42,7 @@ def _alignment_option(what: str) -> Callable[[Callable[..., None]], Callable[...
     help="What to print.",
 )
 def evaluate(
-    runs: tuple[Path, ...],
+    runs: Sequence[Path],
     ground_truth: Path | None,
     alignment: str,
     world: Path | None,
@@ -89,7 +89,7 @@ def evaluate(
 )
 @click.option("--svg", is_flag=True, help="Write SVG beside PNG.")
 def plot(
-    runs: tuple[Path, ...], ground_truth: Path | None, alignment: str, out: Path | None, band: float | None, svg: bool
+    runs: Sequence[Path], ground_truth: Path | None, alignment: str, out: Path | None, band: float | None, svg: bool
 ) -> None:
     """Draw each RUN, a run folder or a trajectory file, into the same figures.
 
@@ -119,7 +119,7 @@ def plot(
 @ground_truth_option
 @click.option("--world", type=FILE, metavar="FILE.ply", help="Mesh of the world to show around the flight.")
 def view(
-    runs: tuple[Path, ...], save: Path | None, map_: Path | None, ground_truth: Path | None, world: Path | None
+    runs: Sequence[Path], save: Path | None, map_: Path | None, ground_truth: Path | None, world: Path | None
 ) -> None:
     """Show each RUN, a run folder or a trajectory file, in rerun's viewer.
 

@@ -103,11 +103,16 @@ class RunFolder:
     path: Path
     summary: Mapping[str, Any]
 
+    @staticmethod
+    def is_at(path: Path) -> bool:
+        """Whether ``path`` holds a run."""
+        return (path / "trajectory.tum").is_file()
+
     @classmethod
     def open(cls, path: str | Path) -> Self:
         """Raises :class:`RunError` where ``path`` holds no run."""
         path = Path(path)
-        if not (path / "trajectory.tum").is_file():
+        if not cls.is_at(path):
             raise RunError(f"{path} is not a run folder: it holds no trajectory.tum; give what `vioframe run` wrote")
         try:
             summary = json.loads((path / "summary.json").read_text(encoding="utf-8"))
