@@ -123,7 +123,7 @@ def test_every_listed_command_exists_and_says_what_it_does():
 
 
 def test_an_unknown_command_is_refused():
-    assert "No such command 'rnu'" in vioframe_("rnu", code=2).output
+    assert "No such command 'rnu' (did you mean 'run'?)" in vioframe_("rnu", code=2).output
 
 
 def test_a_run_from_recording_to_folder(toy):

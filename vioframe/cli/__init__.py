@@ -58,6 +58,17 @@ class LazyGroup(click.Group):
         command: click.Command = getattr(import_module(f"vioframe.cli.{self._modules.get(name, name)}"), name)
         return command
 
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        try:
+            return super().resolve_command(ctx, args)
+        except click.UsageError as error:
+            from vioframe.parts.options import did_you_mean
+
+            hint = did_you_mean(args[0], self._summaries)
+            raise click.UsageError(f"{error.message.removesuffix('.')}{hint}", error.ctx) from None
+
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         with formatter.section("Commands"):
             formatter.write_dl(list(self._summaries.items()))

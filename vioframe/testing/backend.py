@@ -69,7 +69,10 @@ def _check_accuracy(estimates: list[Estimate], sequence: TrackSequence, max_ate_
         f"tracked only {errors.truth.path_length_m:.1f} m of {sequence.ground_truth.path_length_m:.1f} m",
     )
     percent = 100.0 * errors.ate_m.rmse / errors.truth.path_length_m
-    require(percent <= max_ate_percent, f"ATE is {percent:.2f} % of the path, more than {max_ate_percent:g} %")
+    require(
+        percent <= max_ate_percent,
+        f"ATE is {percent:.2f} % of the path, more than the {max_ate_percent:g} % of max_ate_percent",
+    )
 
 
 def _blinded(packets: tuple[Packet, ...]) -> list[Packet]:
