@@ -302,7 +302,10 @@ def fly_and_watch(backend: str, duration_s: float, folder: Path) -> Iterator[flo
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize(
+    "backend",
+    ["sliding_window", *(pytest.param(name, marks=pytest.mark.very_slow) for name in ("msckf", "loose_ekf"))],
+)
 def test_no_object_is_kept_of_a_frame_that_is_done(backend, tmp_path):
     """Traced while it flies: what is alive in the last quarter is what was in the second, but for the map."""
     duration_s, alive = 12.0, []
