@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vioframe.errors import ConfigError, RunError, VioframeError
+from vioframe.errors import RunError, VioframeError, needs
 from vioframe.evaluation import evaluate
 from vioframe.geometry.meshes import read_mesh
 from vioframe.report.style import TRUTH_COLOUR, looks
@@ -56,10 +56,8 @@ def view_runs(
     far as they are still there and a reader of ``installed`` opens them. Raises :class:`VioframeError` where rerun, a
     display or a pose is missing.
     """
-    try:
+    with needs("rerun", "view", user="view"):
         import rerun as rr
-    except ImportError as error:
-        raise ConfigError("view needs rerun, which is not installed: pip install 'vioframe[view]'") from error
     if all(run.estimate is None for run in runs):
         raise RunError("there is nothing to show: no pose was estimated; the events in summary.json say why")
     mesh = None if world is None else read_mesh(world)

@@ -19,7 +19,7 @@ from vioframe.bench.processes import usable_cores
 from vioframe.bench.suites import tasks
 from vioframe.bench.suites.store import Store
 from vioframe.bench.suites.tasks import AnyTask, Recording, SpeedTask
-from vioframe.errors import PluginError, RunError, VioframeError
+from vioframe.errors import RunError, VioframeError, needs
 from vioframe.parts.registry import describe
 from vioframe.runs.results import FINGERPRINT, Row, read_rows
 
@@ -199,11 +199,9 @@ def _connected(workers: int | None, scheduler: str | None) -> Iterator[Client]:
 
     Local workers have one thread each, for BLAS and OpenMP too.
     """
-    try:
+    with needs("dask.distributed", "bench", user="a sweep"):
         import dask
         from distributed import Client, LocalCluster
-    except ImportError as error:
-        raise PluginError('sweeps need dask.distributed: pip install "vioframe[bench]"') from error
     with dask.config.set(_SETTINGS):
         if scheduler is None:
             count = usable_cores() if workers is None else workers
