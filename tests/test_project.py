@@ -101,24 +101,14 @@ def test_the_wheel_works_where_it_is_installed(wheel, tmp_path):
     pip = [sys.executable, "-m", "pip", "install", "--quiet", "--no-index", "--no-deps", "--target", tmp_path]
     subprocess.run([*pip, wheel], check=True)
     environment = {**os.environ, "PYTHONPATH": str(tmp_path)}
-    where = subprocess.run(
-        [sys.executable, "-c", "import vioframe; print(vioframe.__file__)"],
-        env=environment,
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-        check=True,
-    ).stdout
+
+    def printed(*arguments):
+        run = [sys.executable, *arguments]
+        return subprocess.run(run, env=environment, cwd=tmp_path, capture_output=True, text=True, check=True).stdout
+
+    where = printed("-c", "import vioframe; print(vioframe.__file__)")
     assert Path(where.strip()).is_relative_to(tmp_path)
-    shown = subprocess.run(
-        [sys.executable, "-m", "vioframe", "bench", "--help"],
-        env=environment,
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-        check=True,
-    ).stdout
-    assert "mh05_comparison" in shown
+    assert "mh05_comparison" in printed("-m", "vioframe", "bench", "--help")
 
 
 def test_every_requirement_is_pinned():
