@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Annotated
 
-import numpy as np
 from pydantic import AfterValidator, Field
 
 from vioframe.errors import TrajectoryError
@@ -85,10 +84,8 @@ class Band:
 
     def measure(self, comparison: Comparison) -> dict[str, float]:
         """Of the instants that were estimated; aligned by position and yaw, along the axes of the truth's world."""
-        inside = np.abs(comparison.errors.position_m) <= self._half_width_m
-        percent = dict(zip("xyz", 100.0 * inside.mean(axis=0), strict=True))
-        percent["all"] = 100.0 * inside.all(axis=1).mean()
-        return {f"inside_{axis}_percent": float(value) for axis, value in percent.items()}
+        inside = comparison.errors.inside_band(self._half_width_m)
+        return {f"inside_{axis}_percent": percent for axis, percent in inside.items()}
 
 
 class Consistency:

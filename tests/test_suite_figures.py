@@ -17,7 +17,7 @@ from trajectory_helpers import disturbed, flight
 from vioframe.cli import main
 from vioframe.report import drawing
 from vioframe.report.drawing import drawings, write_figures
-from vioframe.report.figures import Figure, inside_band
+from vioframe.report.figures import Figure
 from vioframe.report.style import RC
 from vioframe.report.suite.figures import figures
 from vioframe.report.suite.report import write_report
@@ -115,7 +115,7 @@ def test_the_band_is_shaded_and_each_line_says_how_much_of_it_is_inside(compared
         low, high = ax.get_ylim()
         assert low < -0.2 < 0.2 < high
     worst = compared.flights[compared.flights["evaluated"]].groupby("seed").get_group(1).iloc[0]
-    share = inside_band(compared.errors(worst), 0.2)
+    share = compared.errors(worst).inside_band(0.2)
     assert axes[1, 0].get_legend().get_texts()[0].get_text() == f"{share['y']:.1f} % inside"
     assert [text.get_text() for text in canvas.legends[0].get_texts()] == ["shi_tomasi", "keypointnet"]
     assert "±20 cm" in canvas.get_supxlabel()

@@ -17,7 +17,6 @@ import pytest
 from suite_helpers import MadeUp, comparison, labels, stress
 
 from vioframe.errors import PluginError
-from vioframe.report.figures import inside_band
 from vioframe.report.suite.figures import figures
 from vioframe.report.suite.page import facts, headline, write_page
 from vioframe.report.suite.report import write_report
@@ -202,7 +201,7 @@ def test_headline_of_a_claim_is_how_far_it_holds(tmp_path: Path) -> None:
     made.flight(labels(detector="shi_tomasi", backend="msckf"), sigma_m=0.01)
     study = made.study()
     subject = next(row for row in records(study.flights) if row["detector"] == "keypointnet")
-    inside = inside_band(study.errors(subject), 0.2)
+    inside = study.errors(subject).inside_band(0.2)
     assert inside["y"] < 60.0  # The bias shows, so that the two figures cannot be mixed up.
     first, more = headline(study)
     assert first == (

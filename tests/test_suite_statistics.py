@@ -14,7 +14,6 @@ from trajectory_helpers import flight
 from vioframe.evaluation import evaluate
 from vioframe.geometry.trajectory import Trajectory
 from vioframe.io.trajectories import write_tum
-from vioframe.report.figures import inside_band
 from vioframe.report.suite.statistics import (
     Study,
     averages,
@@ -159,7 +158,7 @@ def test_the_band_counts_instants():
     late = (np.arange(100) >= 40)[:, None] * np.array([0.0, 1.0, 0.0])
     errors = evaluate(Trajectory(truth.t_ns, truth.R_WB, truth.p_WB + late), truth)
     within = np.abs(errors.position_m) <= 0.2
-    share = inside_band(errors, 0.2)
+    share = errors.inside_band(0.2)
     assert share["y"] < 50.0
     by_axis = dict(zip("xyz", 100.0 * within.mean(axis=0), strict=True))
     assert share == {**by_axis, "all": 100.0 * within.all(axis=1).mean()}

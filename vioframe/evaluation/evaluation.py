@@ -77,6 +77,12 @@ class TrajectoryErrors:
         """(3,) largest absolute rotation error in roll, pitch, yaw."""
         return np.asarray(np.abs(self.rotation_rpy_deg).max(axis=0))
 
+    def inside_band(self, half_width_m: float) -> dict[str, float]:
+        """Percent of the instants at which |x|, |y|, |z| and all three are within ``half_width_m``."""
+        within = np.abs(self.position_m) <= half_width_m
+        percent = dict(zip("xyz", (100.0 * within.mean(axis=0)).tolist(), strict=True))
+        return {**percent, "all": 100.0 * float(within.all(axis=1).mean())}
+
     def to_dict(self) -> dict[str, object]:
         """The summary without time series, ready for JSON."""
         return {

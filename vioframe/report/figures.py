@@ -206,7 +206,7 @@ def translation_error(courses: Sequence[Course], half_width_m: float = 0.0) -> F
     """Position error along each axis of the world, and how much of it is within the band about zero."""
 
     def series(errors: TrajectoryErrors) -> list[tuple[Int, Float, str]]:
-        share = inside_band(errors, half_width_m)
+        share = errors.inside_band(half_width_m)
         notes = [f"{share[axis]:.1f} % inside" if half_width_m else "" for axis in "xyz"]
         return [(errors.estimate.t_ns, errors.position_m[:, k], notes[k]) for k in range(3)]
 
@@ -259,13 +259,6 @@ def _nees(courses: Sequence[Course]) -> Figure:
         "Position and yaw fixed at the first pose. Errors within a flight hang together: no test at a level."
     )
     return Figure("nees", "NEES of the flights over time", cases, about, height=560, narrow_height=520)
-
-
-def inside_band(errors: TrajectoryErrors, half_width_m: float) -> dict[str, float]:
-    """Percent of the instants at which |x|, |y|, |z| and all three are within ``half_width_m``."""
-    within = np.abs(errors.position_m) <= half_width_m
-    percent = dict(zip("xyz", (100.0 * within.mean(axis=0)).tolist(), strict=True))
-    return {**percent, "all": 100.0 * float(within.all(axis=1).mean())}
 
 
 def _aligned_by(courses: Sequence[Course]) -> str:

@@ -16,7 +16,7 @@ from markupsafe import Markup
 from plotly.offline import get_plotlyjs
 
 from vioframe.evaluation.consistency import PARTS
-from vioframe.report.figures import Figure, inside_band
+from vioframe.report.figures import Figure
 from vioframe.report.style import TRUTH_COLOUR
 from vioframe.report.suite.figures import Look
 from vioframe.report.suite.statistics import (
@@ -204,7 +204,7 @@ def _one_flight(study: Study) -> Iterator[str]:
     first = next(filter(is_subject, having), min(having, key=lambda cell: ate_m[cell]))
     own, who = having[first], _named(study, *first[4:])
     where = f" on {first[1]} ({first[0]})" if study.flights.groupby(["data", "sequence"]).ngroups > 1 else ""
-    shares = [inside_band(e, band.half_width_m) for f in records(own) if band and (e := study.errors(f))]
+    shares = [e.inside_band(band.half_width_m) for f in records(own) if band and (e := study.errors(f))]
     if band and shares:
         percent = pd.DataFrame(shares).mean()
         inside, *others = (f"{percent[axis]:.0f} %" for axis in band.axes)

@@ -13,7 +13,6 @@ import pandas as pd
 
 from vioframe.evaluation import ALIGNED_BY
 from vioframe.evaluation.consistency import PARTS, over_trials
-from vioframe.report.figures import inside_band
 from vioframe.report.suite.statistics import (
     COMPLETE,
     CONTENDER,
@@ -165,7 +164,7 @@ def _band(study: Study) -> Table | None:
 
     def entries(own: pd.DataFrame) -> Entries | None:
         errors = filter(None, map(study.errors, records(own)))
-        inside = pd.DataFrame([inside_band(each, claimed.half_width_m) for each in errors])
+        inside = pd.DataFrame([each.inside_band(claimed.half_width_m) for each in errors])
         if inside.empty:
             return None
         return {
