@@ -117,9 +117,10 @@ class EurocDataset:
         folder = self._mav0 / self._folders[place]
         path = folder / "data" / file
         # A recording from elsewhere may name any file of this machine, or a pipe that nobody writes to.
-        if PurePath(file).is_absolute() or ".." in PurePath(file).parts:
+        named = PurePath(file)
+        if named.is_absolute() or ".." in named.parts:
             return Unreadable(t_ns, "frame_unreadable", f"{file} leads out of {folder.name}/data")
-        if path.exists() and not path.is_file():
+        if not path.is_file() and path.exists():
             return Unreadable(t_ns, "frame_unreadable", f"{path.name} is no ordinary file")
         try:
             image = decode_image(path.read_bytes())

@@ -129,6 +129,5 @@ def montecarlo(
         by_seed = [trial.to_dict() for _, trial in of_case]
         cases.append({"name": task.about["backend"], **about, **over_trials(own), "nees": averages, "by_seed": by_seed})
     record(folder / MARKER, cases, {"backends": backends, "flights": flights, "seeds": seeds, **sensors})
-    click.echo(
-        f"written to {folder}: {', '.join(sorted(path.name for pattern in FILES for path in folder.glob(pattern)))}"
-    )
+    written = sorted(path.name for pattern in FILES for path in folder.glob(pattern))
+    click.echo(f"written to {folder}: {', '.join(written)}")
