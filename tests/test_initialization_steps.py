@@ -45,6 +45,10 @@ ZERO = np.zeros(3)
 NOISE = ImuNoise(1.0e-3, 2.0e-2, 1.0e-4, 1.0e-2, 200.0)
 
 
+# Of the calibration, which is right here: rad, m, s.
+CALIBRATION_SIGMA = np.repeat([1e-5, 1e-5, 1e-6], [3, 3, 1])
+
+
 @dataclass(frozen=True)
 class Scene:
     """Two seconds of the figure of eight seen in eleven keyframes, and the truth there."""
@@ -107,7 +111,7 @@ def problem_of(s: Scene) -> tuple[Problem, Variables]:
     host = s.window.seen.argmax(axis=0)
     p_C = np.einsum("lji,lj->li", R_WC[host], s.p_WF - p_WC[host])
     truth = Variables(s.truth, camera, np.column_stack([p_C[:, :2] / p_C[:, 2:], 1.0 / p_C[:, 2]]))
-    return adjustment(s.window, s.imu(), truth, CAMERA.model.focal_px), truth
+    return adjustment(s.window, s.imu(), truth, CAMERA.model.focal_px, camera, CALIBRATION_SIGMA), truth
 
 
 class TestGyroBias:
@@ -233,7 +237,7 @@ class TestBundleAdjustment:
         start = s.truth.retract(rng.normal(0.0, sigma, (11, 15)))
         points = truth.landmarks + rng.normal(0.0, [0.01, 0.01, 0.05], truth.landmarks.shape)
         start = replace(truth, states=start, landmarks=points)
-        problem = adjustment(s.window, s.imu(), start, CAMERA.model.focal_px)
+        problem = adjustment(s.window, s.imu(), start, CAMERA.model.focal_px, truth.camera, CALIBRATION_SIGMA)
         solution = adjusted(problem, start)
         states = solution.variables.states
         assert solution.converged

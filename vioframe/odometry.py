@@ -144,6 +144,10 @@ class Odometry:
             begin = perf_counter()
             estimate = self._life.process(imu, tracks)
             backend_s = perf_counter() - begin
+        # Another time offset or focal length may have been found while starting.
+        found = self._life.calibration.cameras[0]
+        self._synchroniser.retime(found.time_offset_ns)
+        self._frontend.recalibrate(found.model)
         if estimate.calibration is not None:
             self.calibration = estimate.calibration.calibration
         within = {f"backend.{stage}": seconds for stage, seconds in estimate.stage_seconds.items()}

@@ -16,9 +16,11 @@ from vioframe.estimation.lifecycle import LifeCycle
 from vioframe.estimation.options import EstimationOptions
 from vioframe.evaluation import evaluate
 from vioframe.geometry.trajectory import Trajectory
+from vioframe.incidents import Incidents
 from vioframe.interfaces import Backend
+from vioframe.io.synchronise import Synchroniser
 from vioframe.simulation import TrackSequence
-from vioframe.types import DP, Estimate, Float, NavState, Status
+from vioframe.types import DP, Estimate, Float, FrameSet, FrameTracks, NavState, Status
 
 _POSE = DP.stop  # [dtheta dp] come first in the error state
 
@@ -103,16 +105,22 @@ def run_backend(
     estimation: EstimationOptions | None = None,
     initial_state: NavState | None = None,
 ) -> BackendRun:
-    """Feed every packet of ``sequence`` to ``backend`` in order."""
+    """Feed every packet of ``sequence`` to ``backend`` in order, until the readings end."""
     life = LifeCycle(backend, sequence.calibration, estimation, initial_state)
-    estimates, seconds, cpu_seconds = [], [], []
-    for imu, tracks in sequence.packets:
-        begin, cpu_begin = perf_counter(), thread_time()
-        estimates.append(life.process(imu, tracks))
-        seconds.append(perf_counter() - begin)
-        cpu_seconds.append(thread_time() - cpu_begin)
-    stamps = tuple(tracks.t_ns for _, tracks in sequence.packets)
-    return BackendRun(stamps, tuple(estimates), np.array(seconds), np.array(cpu_seconds))
+    offset_ns = sequence.calibration.cameras[0].time_offset_ns
+    synchroniser = Synchroniser(Incidents(), time_offset_ns=offset_ns, wait_ms=0.0)
+    tracks = {tracks.t_ns: tracks for _, tracks in sequence.packets}
+    t_ns, estimates, seconds, cpu_seconds = [], [], [], []
+    for measured in sequence.measurements():
+        measurement = FrameSet(measured.t_ns, ()) if isinstance(measured, FrameTracks) else measured
+        for imu, frame in synchroniser.add(measurement):
+            begin, cpu_begin = perf_counter(), thread_time()
+            estimates.append(life.process(imu, tracks[frame.t_ns]))
+            seconds.append(perf_counter() - begin)
+            cpu_seconds.append(thread_time() - cpu_begin)
+            t_ns.append(frame.t_ns)
+            synchroniser.retime(life.calibration.cameras[0].time_offset_ns)
+    return BackendRun(tuple(t_ns), tuple(estimates), np.array(seconds), np.array(cpu_seconds))
 
 
 def backend_row(sequence: TrackSequence, run: BackendRun) -> dict[str, Any]:

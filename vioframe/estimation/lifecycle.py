@@ -23,9 +23,7 @@ from vioframe.types import (
     NS_PER_S,
     Calibration,
     CalibrationEstimate,
-    CameraSigma,
     Estimate,
-    Float,
     FrameTracks,
     ImuSegment,
     NavState,
@@ -33,9 +31,6 @@ from vioframe.types import (
     Status,
     g_W,
 )
-
-# How well a calibration is known (rad, m, s, px, distortion), as published for OpenVINS on EuRoC.
-_SIGMA_ROTATION, _SIGMA_POSITION, _SIGMA_OFFSET, _SIGMA_PIXELS, _SIGMA_DISTORTION = 0.005, 0.015, 0.01, 1.0, 0.005
 
 # The flight that compiles everything: frames, and how far the camera moves between two.
 _WARM_UP_FRAMES, _WARM_UP_PERIOD_NS, _WARM_UP_STEP_M = 30, NS_PER_S // 10, 0.2
@@ -67,12 +62,20 @@ class LifeCycle:
         self._following = False
         self._last: NavState | None = None
         self._corrected_ns = 0
-        self._known = CalibrationEstimate(calibration, (_prior(None),))
+        self._known = CalibrationEstimate(calibration, (initialization.GIVEN,))
         self._imu_noise = calibration.imu
+
+    @property
+    def calibration(self) -> Calibration:
+        """That which the next frame must come with: other than given, where something else was found while starting.
+
+        The readings count with its time offset, and reach back to where those of the frame before ended.
+        """
+        return self._initializer.calibration
 
     def process(self, imu: ImuSegment, tracks: FrameTracks) -> Estimate:
         """Begin, or follow one frame; where that fails it says so, and begins anew from where it was."""
-        tracks = tracks.finite()
+        tracks = self._initializer.undistorted(tracks).finite()
         still = self._standstill.sees_standstill(tracks) and self._options.zero_velocity_update
         if not self._following:
             return self._begin(imu, tracks)
@@ -112,7 +115,7 @@ class LifeCycle:
         self._following, self._last, self._known = True, start.state, start.calibration
         self._corrected_ns = start.state.t_ns
         events = [f"initialised ({method})"]
-        if (found := self._initializer.camera_rotation) is not None:
+        if (found := self._initializer.found) is not None:
             events.append(str(found))
         return Estimate(
             Status.TRACKING,
@@ -123,11 +126,10 @@ class LifeCycle:
         )
 
     def _start(self, state: NavState, imu: ImuSegment, tracks: FrameTracks) -> Start:
-        """From ``state``, with the camera's rotation that was found if it was unknown."""
-        found = self._initializer.camera_rotation
+        """From ``state``, with what was found of the calibration while starting."""
         calibration = self._initializer.calibration
         flying = replace(calibration, imu=calibration.imu.in_flight(self._options.imu_noise_factor))
-        prior = CalibrationEstimate(flying, (_prior(None if found is None else found.cov),))
+        prior = CalibrationEstimate(flying, (self._initializer.camera_sigma,))
         return Start(state, prior, calibration.imu, imu, tracks)
 
     def _check(self, estimate: Estimate, t_ns: int) -> None:
@@ -151,13 +153,6 @@ class LifeCycle:
     def _begin_anew(self) -> None:
         self._following = False
         self._initializer.reset()
-
-
-def _prior(rotation_cov: Float | None) -> CameraSigma:
-    """How well a camera's calibration is known to begin with, its rotation as it was found, if it was."""
-    rotation = np.full(3, _SIGMA_ROTATION) if rotation_cov is None else np.sqrt(np.diag(rotation_cov))
-    intrinsics = np.repeat([_SIGMA_PIXELS, _SIGMA_DISTORTION], 4)
-    return CameraSigma(rotation, np.full(3, _SIGMA_POSITION), _SIGMA_OFFSET, intrinsics)
 
 
 def warm_up(backend: Backend, calibration: Calibration) -> None:
@@ -190,6 +185,8 @@ def _fly_along_a_wall(backend: Backend, calibration: Calibration) -> None:
         xy = camera.model.distort(xy_normalised)
         tracks = FrameTracks(int(t_ns[-1]), ids, np.zeros_like(ids), xy, xy_normalised)
         if k == 0:
-            backend.begin(Start(state, CalibrationEstimate(calibration, (_prior(None),)), calibration.imu, imu, tracks))
+            backend.begin(
+                Start(state, CalibrationEstimate(calibration, (initialization.GIVEN,)), calibration.imu, imu, tracks)
+            )
         else:
             backend.process(imu, tracks, False)

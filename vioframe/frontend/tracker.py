@@ -10,6 +10,7 @@ from vioframe.frontend.flow import camera_rotation, equalise, follow, predict
 from vioframe.frontend.options import FrontendOptions
 from vioframe.frontend.refill import spread, thin
 from vioframe.geometry import two_view
+from vioframe.geometry.cameras import Camera
 from vioframe.incidents import Incidents
 from vioframe.interfaces import Detector
 from vioframe.stopwatch import Stopwatch
@@ -82,6 +83,12 @@ class Frontend:
         return FrameTracks(
             frames.t_ns, self._ids.copy(), np.zeros_like(self._ids), self._xy.copy(), self._xy_normalised.copy()
         )
+
+    def recalibrate(self, camera: Camera) -> None:
+        """Count with ``camera`` from the next frame on."""
+        if camera != self._camera:
+            self._camera = camera
+            self._xy_normalised = camera.undistort(self._xy)
 
     def _check(self, image: Image) -> None:
         width, height = self._camera.resolution

@@ -10,6 +10,7 @@ from __future__ import annotations
 from bisect import bisect_left, bisect_right
 from collections import deque
 from collections.abc import Iterable, Iterator
+from dataclasses import replace
 from itertools import pairwise
 from math import inf, isfinite
 from statistics import median
@@ -35,6 +36,8 @@ _PERIOD_SAMPLES = 51
 _READINGS_BEHIND_THE_END = 20
 # Readings kept while no frame waits for them: the next may be late by as much.
 _MOST_IDLE_READINGS = 4000
+# Readings that were used and may be asked for again under another time offset.
+_READINGS_KEPT = 1000
 
 
 class Synchroniser:
@@ -61,6 +64,13 @@ class Synchroniser:
         self._periods_ns: deque[int] = deque(maxlen=_PERIOD_SAMPLES)
         self._incidents = incidents
         self._wait_ns = round(wait_ms * NS_PER_MS)
+
+    def retime(self, time_offset_ns: int) -> None:
+        """Count with another time offset from the next packet on.
+
+        Its segment holds all readings that those before do not reach to: it begins at the frame before, or earlier.
+        """
+        self._imu.retime(time_offset_ns, self._last_packet_ns)
 
     def add(self, measurement: Measurement) -> Iterator[Packet]:
         """Take one measurement; the packets that are complete by it."""
@@ -198,6 +208,30 @@ class _ImuBuffer(_Ordered[ImuSample]):
         self._end: ImuSample | None = None
         self._gap_limit_ns: float | None = None
         self._last_gap_ns: int | None = None
+        self._used: deque[tuple[int, ImuSample]] = deque(maxlen=_READINGS_KEPT)
+
+    def retime(self, offset_ns: int, frame_ns: int | None) -> None:
+        """Move all stamps to the new offset; readings after the last frame's new time are there once more."""
+        moved_ns = self._offset_ns - offset_ns
+        if not moved_ns:
+            return
+        self._offset_ns = offset_ns
+        self.t_ns = [t_ns + moved_ns for t_ns in self.t_ns]
+        self._used = deque(((t_ns + moved_ns, sample) for t_ns, sample in self._used), maxlen=_READINGS_KEPT)
+        self.last_used_ns = None if self.last_used_ns is None else self.last_used_ns + moved_ns
+        self._previous_arrival_ns = None
+        self._last_gap_ns = None
+        if self._end is None or frame_ns is None:
+            return
+        self._end = replace(self._end, t_ns=self._end.t_ns + moved_ns)
+        if self._end.t_ns > frame_ns:
+            while self._used and self._used[-1][0] > frame_ns:
+                t_ns, sample = self._used.pop()
+                self.t_ns.insert(0, t_ns)
+                self.items.insert(0, sample)
+            times, samples = zip(*self._used, strict=True) if self._used else ((), ())
+            self._end = self._reading_at(frame_ns, list(times), list(samples))
+            self.last_used_ns = times[-1] if times else None
 
     def add(self, sample: ImuSample) -> None:
         t_ns = sample.t_ns - self._offset_ns
@@ -226,6 +260,7 @@ class _ImuBuffer(_Ordered[ImuSample]):
         """The readings from the end of the last segment to ``t_ns``; the samples up to there are used up."""
         last_used_ns, usual = self.last_used_ns, self.t_ns[:_PERIOD_SAMPLES]
         times, samples = self.take(bisect_right(self.t_ns, t_ns))
+        self._used.extend(zip(times, samples, strict=True))
         recorded = times[-1:] if last_used_ns is None else [last_used_ns, *times]
         if recorded[-1] < t_ns:
             recorded = [*recorded, self.t_ns[0]]

@@ -66,6 +66,14 @@ class TrackSequence:
     ground_truth: Trajectory
     true_states: tuple[NavState, ...] = ()
 
+    def measurements(self) -> Iterator[ImuSample | FrameTracks]:
+        """The readings, with stamps of the IMU's clock, and the frames: each behind those up to its stamp."""
+        offset_ns = self.calibration.cameras[0].time_offset_ns
+        for k, (imu, tracks) in enumerate(self.packets):
+            new = slice(1 if k else 0, None)
+            yield from map(ImuSample, (imu.t_ns[new] + offset_ns).tolist(), imu.gyro_B[new], imu.accel_B[new])
+            yield tracks
+
 
 @dataclass(frozen=True)
 class TrackOptions:

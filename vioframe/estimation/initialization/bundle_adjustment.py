@@ -12,8 +12,9 @@ import numpy as np
 
 from vioframe.arrays import Float
 from vioframe.estimation.factors.inertial import ImuFactors, StateArrays
+from vioframe.estimation.factors.landmarks import image_velocities
 from vioframe.estimation.factors.problem import STATE_SIZE, Prior, Problem, Variables
-from vioframe.estimation.factors.reprojection import CALIBRATION_SIZE, Sightings
+from vioframe.estimation.factors.reprojection import CALIBRATION_SIZE, Calibrated, Sightings
 from vioframe.estimation.factors.solver import Solution, solve, solve_positive
 from vioframe.estimation.inertial.preintegration import Preintegrated
 from vioframe.estimation.initialization.window import BIAS_ACCEL_SIGMA, BIAS_GYRO_SIGMA, PIXEL_SIGMA, Window
@@ -27,32 +28,45 @@ _RELATIVE_DECREASE = 1e-5
 _HELD, _FIXED = 1e4, 1e8
 
 
-def adjustment(window: Window, imu: list[Preintegrated], x: Variables, focal_px: float) -> Problem:
-    """All factors of ``window``, whose readings are ``imu``, about the values ``x``; the first state is held."""
+def adjustment(
+    window: Window, imu: list[Preintegrated], x: Variables, focal_px: float, given: Calibrated, sigma: Float
+) -> Problem:
+    """All factors of ``window``, whose readings are ``imu``, about the values ``x``; the first state is held.
+
+    ``sigma`` (7,) is how well the calibration ``given`` is known.
+    """
     seen = np.ascontiguousarray(window.seen.T)
     xy = np.ascontiguousarray(np.where(seen[..., None], np.swapaxes(window.xy, 0, 1), 0.0))
     to_px = np.tile(focal_px * np.eye(2), (*seen.shape, 1, 1))
-    sightings = Sightings(seen, xy, np.zeros(xy.shape), to_px, PIXEL_SIGMA, _CAUCHY)
-    return Problem(_prior(x, 0, _HELD), ImuFactors.stack(imu), {}, sightings, first_estimates=False)
+    gyro_B = np.stack([imu[0].imu.gyro_B[0], *(m.imu.gyro_B[-1] for m in imu)])
+    velocity = image_velocities(x.states, x.camera, gyro_B, seen.argmax(axis=1), x.landmarks)
+    sightings = Sightings(seen, xy, velocity, to_px, PIXEL_SIGMA, _CAUCHY)
+    return Problem(_prior(x, 0, _HELD, given, sigma), ImuFactors.stack(imu), {}, sightings, first_estimates=False)
 
 
 def adjusted(problem: Problem, x: Variables) -> Solution:
-    """Minimise from ``x``; the calibration stays."""
-    return solve(problem, x, np.arange(STATE_SIZE * len(x.states)), _MAX_ITERATIONS, _RELATIVE_DECREASE)
+    """Minimise from ``x``."""
+    active = np.arange(STATE_SIZE * len(x.states) + CALIBRATION_SIZE)
+    return solve(problem, x, active, _MAX_ITERATIONS, _RELATIVE_DECREASE)
 
 
 def covariance(problem: Problem, x: Variables) -> Float:
-    """Of all states (15 K, 15 K) at the minimum ``x``, with position and yaw pinned at the *newest* state."""
-    K = len(x.states)
-    prior = _prior(x, K - 1, _FIXED)
+    """Of all states and the calibration (15 K + 7, 15 K + 7) at the minimum ``x``.
+
+    Position and yaw are pinned at the *newest* state.
+    """
+    sigma = 1.0 / np.sqrt(np.diag(problem.prior.H)[-CALIBRATION_SIZE:])
+    prior = _prior(x, len(x.states) - 1, _FIXED, problem.prior.camera, sigma)
     S, _, _ = replace(problem, prior=prior).linearise(x).reduced(0.0)
-    n = STATE_SIZE * K
-    cov = solve_positive(S[:n, :n], np.eye(n))
+    cov = solve_positive(S, np.eye(len(S)))
     return 0.5 * (cov + cov.T)
 
 
-def _prior(x: Variables, held: int, information: float) -> Prior:
-    """The first state's biases about zero, and that state ``held`` neither moves nor turns about gravity."""
+def _prior(x: Variables, held: int, information: float, given: Calibrated, sigma: Float) -> Prior:
+    """The first state's biases about zero, the calibration about ``given`` with ``sigma`` (7,).
+
+    And that state ``held`` neither moves nor turns about gravity.
+    """
     states, K = x.states, len(x.states)
     H = np.zeros((STATE_SIZE * K + CALIBRATION_SIZE, STATE_SIZE * K + CALIBRATION_SIZE))
     first, own = H[:STATE_SIZE, :STATE_SIZE], H[STATE_SIZE * held :, STATE_SIZE * held :]
@@ -63,4 +77,5 @@ def _prior(x: Variables, held: int, information: float) -> Prior:
     own[DP, DP] = information * np.eye(3)
     zero = np.zeros((K, 3))
     about = StateArrays(states.R_WB, states.p_WB, states.v_WB, zero, zero)
-    return Prior(H, np.zeros(len(H)), about, x.camera, np.isin(np.arange(K), (0, held)))
+    H[-CALIBRATION_SIZE:, -CALIBRATION_SIZE:] = np.diag(1.0 / sigma**2)
+    return Prior(H, np.zeros(len(H)), about, given, np.isin(np.arange(K), (0, held)))

@@ -3,7 +3,7 @@
 1. *The gyroscope's bias* from images alone: the one that lets every pair of frames agree with *some* translation.
    Rotations come from the gyroscope, so that all pairs share three unknowns (He et al., "A
    Rotation-Translation-Decoupled Solution for Robust and Efficient Visual-Inertial Initialization", CVPR 2023). What a
-   pair says about its rotation is told in :mod:`vioframe.estimation.initialization.epipolar_pairs`.
+   pair says about its rotation is told in :mod:`vioframe.estimation.turns`.
 2. *Structure*, camera positions and landmarks up to scale given the rotations: linear, from all frames at once. An
    observation says that [1 0 -x; 0 1 -y] R_k' (p_F - c_k) = 0, which is linear in the landmark p_F and the camera's
    position c_k (Rother, Carlsson, "Linear Multi View Reconstruction and Camera Recovery", ICCV 2001). Landmarks are
@@ -26,17 +26,19 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vioframe.arrays import Bool, Float
+from vioframe.arrays import Bool, Float, Int
 from vioframe.estimation.factors.inertial import StateArrays
 from vioframe.estimation.inertial.preintegration import Preintegrated
-from vioframe.estimation.initialization.epipolar_pairs import BearingPairs, Pairs, refine
 from vioframe.estimation.initialization.window import Window, refuse_unless
+from vioframe.estimation.turns import linearise_pairs
+from vioframe.geometry import so3
 from vioframe.types import GRAVITY_M_S2
 
 _FEWEST_COMMON = 10
 # Iterations, the longest pair used (s) and Cauchy's scale (standard deviations) of each stage. Short pairs lead near
 # the minimum; long ones, which a wrong bias turns by tens of pixels, then determine it.
 _STAGES = ((4, 0.5, 50.0), (4, 1.0, 20.0), (8, np.inf, 5.0), (8, np.inf, 2.0))
+_SETTLED = 1e-5  # rad/s
 # The error of an observation is weighed by the depth, which the solution before gives.
 _SOLVES = 4
 # A landmark's information along its ray over what noise alone would show: less is no parallax.
@@ -55,19 +57,62 @@ def estimate_gyro_bias(
     ``imu`` holds the K - 1 measurements between the keyframes; ``sigma`` is the noise of an observation on the z = 1
     plane, ``bias_sigma`` the prior of the bias about zero, rad/s. A track in no pair has distance NaN.
     """
-    stages = [(_pairs_of(window, longest_s), iterations, cauchy) for iterations, longest_s, cauchy in _STAGES]
-    found = refine(stages, imu, imu[0].bias_gyro_B, R_BC, sigma, bias_sigma)
-    common = stages[-1][0].bearings.common
-    return found.bias_gyro_B, _median_over_pairs(np.where(common, found.distance, np.nan))
+    bias, pairs = imu[0].bias_gyro_B, _Pairs.of(window, np.inf)
+    for iterations, longest_s, cauchy in _STAGES:
+        pairs = _Pairs.of(window, longest_s)
+        weight, distance = pairs.common.astype(np.float64), np.full(pairs.common.shape, np.nan)
+        for _ in range(iterations):
+            R_B1B2, by_bias = _relative_rotations(imu, bias, pairs.first, pairs.second)
+            H, b = linearise_pairs(
+                pairs.f, pairs.g, pairs.common, R_BC.T @ R_B1B2 @ R_BC, weight, sigma, cauchy, distance
+            )
+            # R_CB R_B1B2 Exp(dtheta_B) R_BC = R_C1C2 Exp(R_CB dtheta_B)
+            A = R_BC.T @ by_bias
+            transposed = np.swapaxes(A, -1, -2)
+            information = (transposed @ H[:, :3, :3] @ A).sum(axis=0) + np.eye(3) / bias_sigma**2
+            gradient = (transposed @ b[:, :3, None]).sum(axis=0)[:, 0] + bias / bias_sigma**2
+            step = -np.linalg.solve(information, gradient)
+            bias = bias + step
+            if np.linalg.norm(step) < _SETTLED:
+                break
+    return bias, _median_over_pairs(distance)
 
 
-def _pairs_of(window: Window, longest_s: float) -> Pairs:
-    """The pairs that share enough tracks and are at most ``longest_s`` apart, or neighbours; N is the window's L."""
-    i, j = np.triu_indices(len(window.t_ns), 1)
-    near = ((window.t_ns[j] - window.t_ns[i]) * 1e-9 <= longest_s) | (j == i + 1)
-    use = near & ((window.seen[i] & window.seen[j]).sum(axis=1) >= _FEWEST_COMMON)
-    i, j = i[use], j[use]
-    return Pairs(i, j, BearingPairs.of(window.xy[i], window.xy[j], window.seen[i] & window.seen[j]))
+@dataclass(frozen=True, slots=True)
+class _Pairs:
+    """P pairs of frames, ``first`` and ``second`` (P,), and the bearings (P, L, 3) of the tracks ``common`` (P, L)."""
+
+    first: Int
+    second: Int
+    f: Float
+    g: Float
+    common: Bool
+
+    @staticmethod
+    def of(window: Window, longest_s: float) -> _Pairs:
+        """The pairs that share enough tracks and are at most ``longest_s`` apart, or neighbours."""
+        i, j = np.triu_indices(len(window.t_ns), 1)
+        near = ((window.t_ns[j] - window.t_ns[i]) * 1e-9 <= longest_s) | (j == i + 1)
+        use = near & ((window.seen[i] & window.seen[j]).sum(axis=1) >= _FEWEST_COMMON)
+        i, j = i[use], j[use]
+        bearings = np.concatenate([window.xy, np.ones((*window.seen.shape, 1))], axis=2)
+        return _Pairs(i, j, bearings[i], bearings[j], window.seen[i] & window.seen[j])
+
+
+def _relative_rotations(imu: Sequence[Preintegrated], bias: Float, first: Int, second: Int) -> tuple[Float, Float]:
+    """R_BiBj of every pair at ``bias`` (P, 3, 3), and its derivative by the bias (P, 3, 3), right perturbation.
+
+    ``imu`` holds the measurements between consecutive frames, ``first`` and ``second`` (P,) the frames of each pair.
+    """
+    R, J = [np.eye(3)], [np.zeros((3, 3))]
+    for m in imu:
+        correction = m.bias_jacobian[:3, :3] @ (bias - m.bias_gyro_B)
+        step = m.dR @ so3.exp(correction)
+        R.append(R[-1] @ step)
+        J.append(step.T @ J[-1] + so3.right_jacobian(correction) @ m.bias_jacobian[:3, :3])
+    R_0, J_0 = np.stack(R), np.stack(J)
+    R_ij = np.swapaxes(R_0[first], -1, -2) @ R_0[second]
+    return R_ij, J_0[second] - np.swapaxes(R_ij, -1, -2) @ J_0[first]
 
 
 def _median_over_pairs(distance: Float) -> Float:

@@ -16,7 +16,7 @@ from vioframe.arrays import Bool, Float, Int
 from vioframe.estimation.factors.inertial import StateArrays
 from vioframe.estimation.factors.landmarks import positions
 from vioframe.estimation.factors.problem import Problem, Variables
-from vioframe.estimation.factors.reprojection import Calibrated
+from vioframe.estimation.factors.reprojection import CALIBRATION_SIZE, Calibrated
 from vioframe.estimation.factors.solver import Solution
 from vioframe.estimation.inertial.preintegration import Preintegrated, preintegrate
 from vioframe.estimation.initialization.bundle_adjustment import adjusted, adjustment, covariance
@@ -34,13 +34,15 @@ from vioframe.estimation.initialization.window import (
     PIXEL_SIGMA,
     InitialEstimate,
     Packet,
+    UnsureError,
     Window,
     build_window,
     refuse_unless,
     spread_indices,
 )
+from vioframe.geometry import so3
 from vioframe.geometry.so3 import level_rotation
-from vioframe.types import DP, DTHETA, DV, Calibration, FrameTracks, ImuSegment, NavState, g_W
+from vioframe.types import DP, DTHETA, DV, Calibration, ImuSegment, NavState, g_W
 
 _MIN_VIEWS = 4
 # Tracks farther off than this are not noise: standard deviations, typical over all views.
@@ -59,39 +61,42 @@ _MAX_BIAS_ACCEL = 4.0 * BIAS_ACCEL_SIGMA
 _SCALE_SIGMA, _VELOCITY_SIGMA, _TILT_SIGMA_DEG = 0.06, 0.05, 1.0
 
 
-def initialise(packets: Sequence[Packet], calibration: Calibration) -> InitialEstimate:
-    """Estimate from consecutive ``packets``, the newest last; raises :class:`RefusalError`."""
+def initialise(packets: Sequence[Packet], calibration: Calibration, sigma: Float) -> InitialEstimate:
+    """Estimate from consecutive ``packets``, the newest last; raises :class:`RefusalError`.
+
+    ``sigma`` (7,) is how well the camera on the body and the time offset of ``calibration`` are known.
+    """
     t_ns = np.array([tracks.t_ns for _, tracks in packets])
     held_out = int((t_ns > t_ns[-1] - _LOOKAHEAD_S * 1e9).sum())
     chosen = spread_indices(t_ns[:-held_out], _KEYFRAMES)
-    sigma = PIXEL_SIGMA / calibration.cameras[0].model.focal_px
+    noise = PIXEL_SIGMA / calibration.cameras[0].model.focal_px
 
     window = build_window(packets, [*chosen, len(packets) - 1], _MIN_VIEWS, _MOST_LANDMARKS)
     _require(window, "tracks are long enough")
-    window, bias_gyro = _with_gyro_bias(window, calibration, sigma)
+    window, bias_gyro = _with_gyro_bias(window, calibration, noise)
     imu = _preintegrate(window, bias_gyro, np.zeros(3), calibration)
     R_B0B = rotations(imu)
     _check_parallax(window, R_B0B, calibration)
 
-    window, structure = _structure(window, R_B0B @ calibration.cameras[0].R_BC, sigma)
+    window, structure = _structure(window, R_B0B @ calibration.cameras[0].R_BC, noise)
     alignment = align(structure.position, imu[:-1], calibration.cameras[0].p_BC, BIAS_ACCEL_SIGMA)
     refuse_unless(alignment.scale > 0.0, "the readings contradict the direction of the motion in the images")
     x = _start_of_adjustment(window.without_last(), structure, alignment, calibration)
-    problem, solution = _adjusted(window.without_last(), x, calibration)
+    problem, solution = _adjusted(window.without_last(), x, calibration, sigma)
     keep = _explained(problem, solution.variables)
     window = window.only(keep)
     _require(window, "tracks fit the bundle adjustment")
     x = replace(solution.variables, landmarks=solution.variables.landmarks[keep])
-    problem, solution = _adjusted(window.without_last(), x, calibration)
+    problem, solution = _adjusted(window.without_last(), x, calibration, sigma)
     _check_fit(problem, solution)
 
     x = solution.variables
     predicted = _predict(packets[-held_out:], x.states.unstack(window.t_ns[:-1])[-1], calibration)
     p_WF = _positions(problem, x)
-    _check_lookahead(predicted, [tracks for _, tracks in packets[-held_out:]], window.ids, p_WF, calibration)
+    _check_lookahead(predicted, packets[-held_out:], x.camera, window.ids, p_WF, calibration.cameras[0].model.focal_px)
 
     x = replace(x, states=x.states.append(StateArrays.stack(predicted[-1:])))
-    problem, solution = _adjusted(window, x, calibration)
+    problem, solution = _adjusted(window, x, calibration, sigma)
     _check_fit(problem, solution)
     x = solution.variables
     cov = covariance(problem, x)
@@ -150,11 +155,11 @@ def _camera(calibration: Calibration) -> Calibrated:
     return Calibrated(np.ascontiguousarray(camera.R_BC), np.ascontiguousarray(camera.p_BC))
 
 
-def _adjusted(window: Window, x: Variables, calibration: Calibration) -> tuple[Problem, Solution]:
+def _adjusted(window: Window, x: Variables, calibration: Calibration, sigma: Float) -> tuple[Problem, Solution]:
     """The adjustment of ``window`` from ``x``, its readings integrated at the biases there."""
     biases = zip(x.states.bias_gyro_B[:-1], x.states.bias_accel_B[:-1], strict=True)
     imu = [preintegrate(segment, *bias, calibration.imu) for segment, bias in zip(window.segments, biases, strict=True)]
-    problem = adjustment(window, imu, x, calibration.cameras[0].model.focal_px)
+    problem = adjustment(window, imu, x, calibration.cameras[0].model.focal_px, _camera(calibration), sigma)
     return problem, adjusted(problem, x)
 
 
@@ -185,7 +190,7 @@ def _estimate(window: Window, adjusted: StateArrays, cov: Float, p_WF: Float) ->
     turn = np.eye(15)
     turn[DP, DP] = turn[DV, DV] = R_new
     states = replace(adjusted, p_WB=adjusted.p_WB - p_0).turned(R_new).unstack(window.t_ns)
-    newest = turn @ cov[-15:, -15:] @ turn.T
+    newest = turn @ _newest(cov) @ turn.T
     states[-1] = replace(states[-1], cov=0.5 * (newest + newest.T))
     return InitialEstimate("dynamic", tuple(states), window.ids, (p_WF - p_0) @ R_new.T)
 
@@ -220,34 +225,45 @@ def _check_fit(problem: Problem, solution: Solution) -> None:
 
 def _check_lookahead(
     predicted: Sequence[NavState],
-    seen: Sequence[FrameTracks],
+    packets: Sequence[Packet],
+    camera: Calibrated,
     ids: Int,
     p_WF: Float,
-    calibration: Calibration,
+    focal_px: float,
 ) -> None:
     """States predicted by the readings must see the landmarks ``ids`` (L,), ``p_WF`` (L, 3) where the frames do."""
-    camera = calibration.cameras[0]
-    for state, tracks in zip(predicted, seen, strict=True):
+    for state, (imu, tracks) in zip(predicted, packets, strict=True):
         _, a, b = np.intersect1d(ids, tracks.ids, return_indices=True)
         refuse_unless(len(a) >= _FEWEST_COMMON, f"only {len(a)} landmarks were still tracked in the frames held back")
-        p_C = ((p_WF[a] - state.p_WB) @ state.R_WB - camera.p_BC) @ camera.R_BC
+        turned = so3.exp((imu.gyro_B[-1] - state.bias_gyro_B) * camera.offset_s)
+        p_WB = state.p_WB + state.v_WB * camera.offset_s
+        p_C = ((p_WF[a] - p_WB) @ (state.R_WB @ turned) - camera.p_BC) @ camera.R_BC
         error = np.linalg.norm(p_C[:, :2] / p_C[:, 2:] - tracks.xy_normalised[b], axis=1)
-        px = float(np.median(np.where(p_C[:, 2] > 0.0, error, np.inf))) * camera.model.focal_px
+        px = float(np.median(np.where(p_C[:, 2] > 0.0, error, np.inf))) * focal_px
         refuse_unless(px <= _LARGEST_LOOKAHEAD_PX, f"the prediction misses a later frame by {px:.1f} px")
 
 
+def _newest(cov: Float) -> Float:
+    """(15, 15) of the newest state."""
+    return cov[-15 - CALIBRATION_SIZE : -CALIBRATION_SIZE, -15 - CALIBRATION_SIZE : -CALIBRATION_SIZE]
+
+
 def _check_uncertainty(p_WB: Float, cov: Float) -> None:
-    """Velocity, gravity's direction and scale must be determined well; ``cov`` (15 K, 15 K) is of all states.
+    """Velocity, gravity's direction and scale must be determined well; ``cov`` is of all states and the calibration.
 
     ``p_WB`` (K, 3) is the path.
     """
-    newest = cov[-15:, -15:]
+    newest = _newest(cov)
     velocity = float(np.sqrt(np.linalg.eigvalsh(newest[DV, DV])[-1]))
-    refuse_unless(velocity <= _VELOCITY_SIGMA, f"velocity known to {velocity:.3f} m/s only (standard deviation)")
     tilt = float(np.rad2deg(np.sqrt(np.linalg.eigvalsh(newest[DTHETA, DTHETA])[-1])))
-    refuse_unless(tilt <= _TILT_SIGMA_DEG, f"gravity's direction known to {tilt:.2f} deg only (standard deviation)")
     scale = scale_sigma(p_WB, cov)
-    refuse_unless(scale <= _SCALE_SIGMA, f"scale known to {100.0 * scale:.0f} % only (standard deviation)")
+    for unsure, what in (
+        (velocity > _VELOCITY_SIGMA, f"velocity known to {velocity:.3f} m/s only"),
+        (tilt > _TILT_SIGMA_DEG, f"gravity's direction known to {tilt:.2f} deg only"),
+        (scale > _SCALE_SIGMA, f"scale known to {100.0 * scale:.0f} % only"),
+    ):
+        if unsure:
+            raise UnsureError(f"{what} (standard deviation)")
 
 
 def scale_sigma(p_WB: Float, cov: Float) -> float:
@@ -258,7 +274,7 @@ def scale_sigma(p_WB: Float, cov: Float) -> float:
     q = p_WB - p_WB.mean(axis=0)
     by_state = np.zeros((len(q), 15))
     by_state[:, DP] = q / (q**2).sum()
-    a = by_state.ravel()
+    a = np.append(by_state.ravel(), np.zeros(CALIBRATION_SIZE))
     return float(np.sqrt(a @ cov @ a))
 
 
@@ -270,5 +286,5 @@ def warm_up(calibration: Calibration) -> None:
     window = Window(t_ns, segments, np.arange(20), xy, np.ones((4, 20), bool))
     state = NavState(0, np.eye(3), *np.zeros((4, 3)))
     x = Variables(StateArrays.stack([state] * 4), _camera(calibration), np.column_stack([xy[0], np.full(20, 0.2)]))
-    problem, solution = _adjusted(window, x, calibration)
+    problem, solution = _adjusted(window, x, calibration, np.full(CALIBRATION_SIZE, 0.01))
     _explained(problem, solution.variables)

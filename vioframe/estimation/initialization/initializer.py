@@ -7,72 +7,111 @@ from dataclasses import replace
 
 import numpy as np
 
+from vioframe.estimation.inertial.readings import Readings
 from vioframe.estimation.initialization import dynamic, static
-from vioframe.estimation.initialization.hand_eye import CameraRotation, RotationCalibrator
-from vioframe.estimation.initialization.window import LARGEST_IMU_GAP_S, InitialEstimate, Packet, RefusalError
-from vioframe.types import Calibration, FrameTracks, ImuSegment
+from vioframe.estimation.initialization.sensors import Found, SensorCheck, undistorted
+from vioframe.estimation.initialization.window import (
+    LARGEST_IMU_GAP_S,
+    InitialEstimate,
+    Packet,
+    RefusalError,
+    UnsureError,
+)
+from vioframe.types import NS_PER_S, Calibration, CameraSigma, FrameTracks, ImuNoise, ImuSegment
 
 _log = logging.getLogger("vioframe.estimation.initialization")
 
 # Length of the standstill that the static method needs.
 _STATIC_WINDOW_S = 1.0
 # The dynamic method is first tried when the window is this long, and looks back no farther than this; every so often.
-_SHORTEST_WINDOW_S, _LONGEST_WINDOW_S, _ATTEMPT_INTERVAL_S = 1.5, 3.0, 0.1
+_SHORTEST_WINDOW_S, _USUAL_WINDOW_S, _LONGEST_WINDOW_S, _LONGER = 1.5, 3.0, 10.0, 1.2
+# Each attempt that is refused puts the next off by so much more, up to a longest wait.
+_SOON_S, _LATER_S, _LATEST_S = 0.1, 0.05, 0.5
 # Times ``imu_noise_factor`` in the dynamic method, which has no later readings to correct what vibration, scale and
 # alignment errors do over its seconds: with 8 in all its squared errors on EuRoC's flights are as its covariance says.
-_IN_MOTION = 2.0
+# Readings that are smoother than their calibration has it count as such: this many times what they jump by.
+_IN_MOTION, _JUMPS = 2.0, 2.5
+# How well a calibration is known (rad, m, s, px, distortion), as published for OpenVINS on EuRoC.
+GIVEN = CameraSigma(np.full(3, 0.005), np.full(3, 0.015), 0.01, np.repeat([1.0, 0.005], 4))
 
 
 class Initializer:
     """Tries the static method at every frame, and the dynamic one every so often, until one is sure of itself.
 
-    Where the camera's rotation on the body is not known both wait for its hand-eye calibration, which is done once.
+    Ahead of the dynamic method time offset, the camera's rotation on the body and its focal length are held against
+    what turns of camera and gyroscope say, and others found in their place where they do not fit, or are not known.
     ``imu_noise_factor`` is that of :meth:`~vioframe.types.ImuNoise.in_flight`. Every attempt is logged to
     ``vioframe.estimation.initialization``.
     """
 
     def __init__(self, calibration: Calibration, imu_noise_factor: float = 4.0) -> None:
+        self._factor = _IN_MOTION * imu_noise_factor
         self._calibration = calibration
-        self._in_flight = replace(calibration, imu=calibration.imu.in_flight(_IN_MOTION * imu_noise_factor))
-        self._calibrator = None if calibration.cameras[0].rotation_known else RotationCalibrator(calibration)
-        self._camera_rotation: CameraRotation | None = None
+        self._given = calibration.cameras[0].model
+        self._sensors = SensorCheck()
+        self._found: Found | None = None
         self._refusals: dict[str, str] = {}
+        self._readings = Readings()
         self._packets: list[Packet] = []
-        self._last_attempt_ns: int | None = None
+        self._waiting: list[FrameTracks] = []
+        self._begin_waiting()
+
+    def _begin_waiting(self) -> None:
+        self._window_s, self._wait_s, self._next_attempt_ns = _USUAL_WINDOW_S, _SOON_S - _LATER_S, 0
 
     @property
     def calibration(self) -> Calibration:
-        """That of the sensors, with the camera's rotation that was found in place of the unknown one."""
+        """That of the sensors, with what was found in place of what was given."""
         return self._calibration
 
     @property
-    def camera_rotation(self) -> CameraRotation | None:
-        """What the hand-eye calibration found; None where it has not, or was not asked for."""
-        return self._camera_rotation
+    def found(self) -> Found | None:
+        """What was found to fit better than the calibration given, last; None where that fits."""
+        return self._found
+
+    @property
+    def camera_sigma(self) -> CameraSigma:
+        """How well the camera's calibration is known."""
+        return GIVEN if self._found is None else self._found.sigma(GIVEN)
 
     @property
     def refusal(self) -> str:
         """Why the last attempt of each method came to nothing, in one line; "" before the first and after a success."""
         return "; ".join(f"{method}: {reason}" for method, reason in self._refusals.items())
 
+    def undistorted(self, tracks: FrameTracks) -> FrameTracks:
+        """``tracks`` as the camera has them whose focal length was found, if another one was."""
+        model = self._calibration.cameras[0].model
+        return tracks if model == self._given else next(iter(undistorted([tracks], model)))
+
     def reset(self) -> None:
-        """Forget everything seen, but not how the camera is turned on the body."""
-        if self._calibrator is not None:
-            self._calibrator.reset()
+        """Forget everything seen, but not what was found of the calibration."""
+        self._sensors.reset()
+        self._readings = Readings()
         self._packets.clear()
-        self._last_attempt_ns = None
+        self._waiting.clear()
         self._refusals.clear()
+        self._begin_waiting()
 
     def add(self, imu: ImuSegment, tracks: FrameTracks) -> InitialEstimate | None:
-        """Take one frame; an estimate whose newest state is at this frame, or None as long as none can be trusted."""
+        """Take one frame; an estimate whose newest state is at this frame, or None as long as none can be trusted.
+
+        Where :attr:`calibration` has another time offset after it, ``imu`` of the next call must count with it, and
+        begin where that of this call ended on the IMU's own clock, or earlier.
+        """
         if imu.largest_gap_s > LARGEST_IMU_GAP_S:
             self.reset()
             _log.info("no readings for %.2f s: begun anew", imu.largest_gap_s)
-        self._packets.append((imu, tracks.finite()))
-        self._packets = self._last(_LONGEST_WINDOW_S)
-        if self._calibrator is not None and not self._find_camera_rotation(self._calibrator, imu, tracks):
-            return None
-        for method, attempt in (("static", self._static), ("dynamic", self._dynamic)):
+        tracks = tracks.finite()
+        self._readings.add(imu)
+        self._waiting.append(tracks)
+        self._sensors.add(tracks, self._calibration.cameras[0].model)
+        self._cut()
+        if not self._packets or self._packets[-1][1] is not tracks:
+            return None  # its readings are still to come
+        known = self._calibration.cameras[0].rotation_known
+        methods = {"static": self._static, "dynamic": self._dynamic} if known else {"dynamic": self._dynamic}
+        for method, attempt in methods.items():
             try:
                 estimate = attempt()
             except (RefusalError, np.linalg.LinAlgError) as refusal:
@@ -85,17 +124,15 @@ class Initializer:
                 return estimate
         return None
 
-    def _find_camera_rotation(self, calibrator: RotationCalibrator, imu: ImuSegment, tracks: FrameTracks) -> bool:
-        found = calibrator.add(imu, tracks)
-        if found is None:
-            if calibrator.refusal:
-                self._refusals["hand-eye"] = calibrator.refusal
-            return False
-        self._refusals.clear()
-        self._calibrator, self._camera_rotation = None, found
-        self._calibration = self._calibration.with_camera(0, R_BC=found.R_BC, rotation_known=True)
-        self._in_flight = self._in_flight.with_camera(0, R_BC=found.R_BC, rotation_known=True)
-        return True
+    def _cut(self) -> None:
+        """Give the frames that wait for readings theirs, as far as they reach; let go of what is too old."""
+        while self._waiting and self._readings.cover(self._waiting[0].t_ns, self._waiting[0].t_ns):
+            tracks = self._waiting.pop(0)
+            begin_ns = self._packets[-1][1].t_ns if self._packets else tracks.t_ns
+            self._packets.append((self._readings.between(begin_ns, tracks.t_ns), tracks))
+        if self._packets:
+            self._packets = self._last(_LONGEST_WINDOW_S)
+            self._readings.forget_before(self._packets[0][1].t_ns - NS_PER_S // 2)
 
     def _static(self) -> InitialEstimate | None:
         packets = self._last(_STATIC_WINDOW_S)
@@ -105,13 +142,52 @@ class Initializer:
 
     def _dynamic(self) -> InitialEstimate | None:
         newest_ns = self._packets[-1][1].t_ns
-        last_ns = self._last_attempt_ns
-        if last_ns is not None and newest_ns - last_ns < _ATTEMPT_INTERVAL_S * 1e9:
+        if newest_ns < self._next_attempt_ns or _duration_s(self._packets) < _SHORTEST_WINDOW_S:
             return None
-        if _duration_s(self._packets) < _SHORTEST_WINDOW_S:
-            return None
-        self._last_attempt_ns = newest_ns
-        return dynamic.initialise(self._packets, self._in_flight)
+        self._wait_s = min(self._wait_s + _LATER_S, _LATEST_S)
+        self._next_attempt_ns = newest_ns + round((self._wait_s - 1e-3) * NS_PER_S)
+        if (found := self._sensors.judge(self._readings, self._calibration)) is not None:
+            self._take_over(found)
+            if self._packets[-1][1].t_ns != newest_ns:
+                return None
+        known = self.camera_sigma
+        sigma = np.concatenate([known.rotation, known.position, [known.time_offset_s]])
+        calibration = replace(self._calibration, imu=self._noise_in_motion())
+        try:
+            return dynamic.initialise(self._last(self._window_s), calibration, sigma)
+        except UnsureError:
+            self._window_s = min(self._window_s * _LONGER, _LONGEST_WINDOW_S)
+            raise
+        except RefusalError:
+            self._window_s = max(self._window_s / _LONGER, _USUAL_WINDOW_S)
+            raise
+
+    def _noise_in_motion(self) -> ImuNoise:
+        """What the readings of the window are off by: white noise by how they jump, within what is given."""
+        given, readings = self._calibration.imu, self._readings
+        dt_s = float(np.median(np.diff(readings.t_ns))) * 1e-9
+        gyro, accel = (
+            _JUMPS * float(np.sqrt(0.5 * (np.diff(values, axis=0) ** 2).mean() * dt_s))
+            for values in (readings.gyro_B, readings.accel_B)
+        )
+        return replace(
+            given,
+            gyro_density=min(gyro, self._factor * given.gyro_density),
+            accel_density=min(accel, self._factor * given.accel_density),
+        )
+
+    def _take_over(self, found: Found) -> None:
+        """Cut frames and readings anew, and undistort the points, as ``found`` has it."""
+        _log.info("%d %s", self._packets[-1][1].t_ns, found)
+        (before,), (camera,) = self._calibration.cameras, found.calibration.cameras
+        self._found, self._calibration = found.after(self._found), found.calibration
+        self._readings.move(camera.time_offset_ns - before.time_offset_ns)
+        frames = [*(tracks for _, tracks in self._packets), *self._waiting]
+        if camera.model != before.model:
+            frames = undistorted(frames, camera.model)
+            self._sensors.undistort(camera.model)
+        self._packets, self._waiting = [], [f for f in frames if f.t_ns >= self._readings.t_ns[0]]
+        self._cut()
 
     def _last(self, seconds: float) -> list[Packet]:
         """The frames of the last ``seconds``."""

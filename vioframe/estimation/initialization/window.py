@@ -43,6 +43,10 @@ class RefusalError(Exception):
     """An attempt came to nothing; the message says why in one line. Never leaves the package."""
 
 
+class UnsureError(RefusalError):
+    """An attempt that is not sure enough of itself: more of the same motion may make it so."""
+
+
 def refuse_unless(good: object, why: str) -> None:
     """Raise :class:`RefusalError` saying ``why`` where something is not as it must be; a NaN never compares as good."""
     if not good:

@@ -1,0 +1,205 @@
+"""How camera and gyroscope belong together: time offset, the camera's rotation on the body, and its focal length.
+
+A rotation R_BiBj of the body is R_BC R_CiCj R_BC' seen by the camera (Park, Martin, "Robot Sensor Calibration: Solving
+AX = XB on the Euclidean Group", T-RA 1994). Of the camera's turns, which come from tracks alone
+(:mod:`vioframe.estimation.turns`), and the readings of the gyroscope this makes equations for all that can keep the two
+apart: a bias, the rotation between them, readings that are early or late (Li, Mourikis, "Online temporal calibration
+for camera-IMU systems", IJRR 2014), and a focal length that makes turns look larger or smaller than they are.
+Translation plays no part, so that neither scale, gravity nor the lever arm need be known. Derivation:
+``docs/derivations/initialization.md``.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+
+from vioframe.arrays import Float, Int
+from vioframe.estimation.turns import Turn
+from vioframe.geometry import so3
+from vioframe.jit import kernel
+from vioframe.types import NS_PER_S
+
+Part = Literal["offset", "rotation", "focal"]
+"""What may be other than given."""
+
+BIAS_SIGMA = 0.2
+"""Prior of the gyroscope's bias about zero, rad/s; that of EuRoC's IMU is 0.08."""
+LARGEST_OFFSET_S = 0.2
+"""How far from the given one a time offset is looked for."""
+_GRID_S = 0.01
+# What turns are off by beside their noise, rad: distortion, rolling shutter, patches that creep.
+_FLOOR = 1e-3
+# Turns that are off by more than this many standard deviations begin to count less.
+_CAUCHY = 3.0
+_COLUMNS: dict[Part, slice] = {"rotation": slice(3, 6), "offset": slice(6, 7), "focal": slice(7, 8)}
+_ITERATIONS, _GRID_ITERATIONS, _SETTLED = 15, 4, 1e-5
+_LARGEST_STEP = np.array([np.inf] * 3 + [0.3] * 3 + [0.03, 0.05])
+# The median of chi2 with three degrees of freedom.
+_MEDIAN_CHI2 = 2.366
+
+
+@dataclass(frozen=True, slots=True)
+class HandEye:
+    """What makes readings and turns agree: ``bias_gyro_B`` (3,) rad/s, ``R_BC`` (3, 3), and two that add to the given.
+
+    ``offset_s`` is added to the time offset, so that ``t_imu = t_cam + offset``; the focal length is ``exp(log_focal)``
+    times the given one. ``cov`` (8, 8) is of [bias rotation offset log_focal], zero where a part is as given.
+    """
+
+    bias_gyro_B: Float
+    R_BC: Float
+    offset_s: float = 0.0
+    log_focal: float = 0.0
+    cov: Float | None = None
+
+    def sigma(self, part: Part) -> float:
+        """Standard deviation of a part, s, rad or relative; of a rotation about the axis that is known worst."""
+        assert self.cov is not None
+        block = self.cov[_COLUMNS[part], _COLUMNS[part]]
+        return float(np.sqrt(np.linalg.eigvalsh(block)[-1]))
+
+
+class Turns:
+    """P turns of a camera beside the readings of a gyroscope at ``t_ns`` (N,), ``gyro_B`` (N, 3) rad/s.
+
+    Only turns are used whose readings are there whatever the offset.
+    """
+
+    def __init__(self, turns: Sequence[Turn], t_ns: Int, gyro_B: Float) -> None:
+        margin_ns = round(LARGEST_OFFSET_S * NS_PER_S)
+        turns = [t for t in turns if t.t_ns[0] - margin_ns >= t_ns[0] and t.t_ns[1] + margin_ns <= t_ns[-1]]
+        self._t_s, self._gyro_B = (t_ns - t_ns[0]) * 1e-9, gyro_B
+        self._first, self._second = ((np.array([t.t_ns[k] for t in turns]) - t_ns[0]) * 1e-9 for k in (0, 1))
+        self._dt = self._second - self._first
+        self.R_C1C2 = np.array([t.R_C1C2 for t in turns]).reshape(-1, 3, 3)
+        H = np.array([t.H for t in turns]).reshape(-1, 4, 4)
+        cov = np.linalg.inv(H[:, :3, :3])
+        # A longer focal length turns R_C1C2 by this much.
+        self._by_focal = -(cov @ H[:, :3, 3:])[..., 0]
+        self._whitener = np.swapaxes(np.linalg.cholesky(np.linalg.inv(cov + _FLOOR**2 * np.eye(3))), -1, -2)
+
+    def __len__(self) -> int:
+        return len(self._dt)
+
+    def fit(self, start: HandEye, free: Sequence[Part]) -> tuple[HandEye, float]:
+        """From ``start`` to where they agree best: the bias, and the parts that are ``free``; the variance they have.
+
+        Variances are in terms of what the tracks' noise, a pixel, gives a turn.
+        """
+        active = np.r_[0:3, *(np.arange(8)[_COLUMNS[part]] for part in free)]
+        x, variance = start, 1.0
+        for _ in range(_ITERATIONS):
+            r, J = self._linearise(x)
+            squared = (r * r).sum(axis=1)
+            variance = max(float(np.median(squared)) / _MEDIAN_CHI2, 1e-4)
+            weight = 1.0 / (1.0 + squared / (_CAUCHY**2 * variance)) / variance
+            H = np.einsum("p,pki,pkj->ij", weight, J, J)[np.ix_(active, active)]
+            g = np.einsum("p,pki,pk->i", weight, J, r)[active]
+            H[:3, :3] += np.eye(3) / BIAS_SIGMA**2
+            g[:3] += x.bias_gyro_B / BIAS_SIGMA**2
+            # Half a turn that nothing tells of is as likely as none.
+            cov = np.linalg.inv(H + np.eye(len(H)) * 1e-6)
+            step = np.zeros(8)
+            step[active] = -cov @ g
+            step *= min(1.0, float((_LARGEST_STEP / np.maximum(np.abs(step), 1e-12)).min()))
+            x = HandEye(
+                x.bias_gyro_B + step[:3], x.R_BC @ so3.exp(step[3:6]), x.offset_s + step[6], x.log_focal + step[7]
+            )
+            if np.abs(step).max() < _SETTLED:
+                break
+        full = np.zeros((8, 8))
+        full[np.ix_(active, active)] = cov
+        return replace(x, cov=full), variance
+
+    def cost(self, x: HandEye, variance: float) -> float:
+        """The robust sum of squares of what the turns are off by, in terms of ``variance``."""
+        r, _ = self._linearise(x)
+        return float(_CAUCHY**2 * np.log1p((r * r).sum(axis=1) / (_CAUCHY**2 * variance)).sum())
+
+    def unexplained(self, x: HandEye) -> float:
+        """The typical turn that is left over with ``x``, over the typical turn beside a steady one."""
+        turns = so3.log(self.R_C1C2)
+        left = np.linalg.solve(self._whitener, self._linearise(x)[0][..., None])[..., 0]
+        size, beside = np.linalg.norm(left, axis=1), np.linalg.norm(turns - np.median(turns, axis=0), axis=1)
+        return float(np.median(size) / max(np.median(beside), 1e-9))
+
+    def nearest(self, start: HandEye, *, turned: bool) -> HandEye:
+        """The best time offset within :data:`LARGEST_OFFSET_S`, to a grid, with the rotation of ``start`` or any.
+
+        With each offset the bias is eliminated, which leaves an orthogonal Procrustes problem for the rotation.
+        """
+        offsets = np.arange(-LARGEST_OFFSET_S, LARGEST_OFFSET_S + 1e-9, _GRID_S)
+        R = _path(self._t_s, self._gyro_B)
+        R_1, R_2 = (self._at(R, self._gyro_B, t + offsets[:, None])[0] for t in (self._first, self._second))
+        beta, gamma, dt = so3.log(np.swapaxes(R_1, -1, -2) @ R_2), so3.log(self.R_C1C2), self._dt
+        known = np.linalg.norm(self._whitener, axis=(1, 2))
+        weight = np.tile(known**2, (len(offsets), 1))
+        for _ in range(_GRID_ITERATIONS):
+            total = (weight * dt**2).sum(axis=1)[:, None]
+            beta_dt, gamma_dt = np.einsum("gp,p,gpi->gi", weight, dt, beta), (weight * dt) @ gamma
+            R_BC = np.broadcast_to(start.R_BC, (len(offsets), 3, 3))
+            if turned:
+                moments = np.einsum("gp,gpi,pj->gij", weight, beta, gamma)
+                R_BC = so3.project(moments - beta_dt[:, :, None] * gamma_dt[:, None] / total[..., None])
+            bias = (beta_dt - (R_BC @ gamma_dt[..., None])[..., 0]) / total
+            off = beta - np.einsum("gij,pj->gpi", R_BC, gamma) - dt[:, None] * bias[:, None]
+            far = np.linalg.norm(off, axis=2) * known
+            typical = np.median(far, axis=1)
+            weight = known**2 / (1.0 + (far / np.maximum(1.5 * typical, 1e-3)[:, None]) ** 2)
+        best = int(np.argmin(typical))
+        return HandEye(bias[best], R_BC[best], float(offsets[best]))
+
+    def _linearise(self, x: HandEye) -> tuple[Float, Float]:
+        """Whitened residuals (P, 3) and Jacobian (P, 3, 8) by [bias rotation offset log_focal]."""
+        rate_B = self._gyro_B - x.bias_gyro_B
+        R = _path(self._t_s, rate_B)
+        R_1, rate_1 = self._at(R, rate_B, self._first + x.offset_s)
+        R_2, rate_2 = self._at(R, rate_B, self._second + x.offset_s)
+        R_B2B1 = np.swapaxes(R_2, -1, -2) @ R_1
+        R_C1C2 = x.R_BC.T @ np.swapaxes(R_B2B1, -1, -2) @ x.R_BC
+        off = so3.log(np.swapaxes(self.R_C1C2, -1, -2) @ R_C1C2) - self._by_focal * x.log_focal
+        J = np.empty((len(off), 3, 8))
+        J[:, :, 0:3] = -0.5 * x.R_BC.T @ (np.eye(3) + R_B2B1) * self._dt[:, None, None]
+        J[:, :, 3:6] = np.eye(3) - np.swapaxes(R_C1C2, -1, -2)
+        J[:, :, 6] = (rate_2 - (R_B2B1 @ rate_1[..., None])[..., 0]) @ x.R_BC
+        J[:, :, 7] = -self._by_focal
+        return (self._whitener @ off[..., None])[..., 0], self._whitener @ J
+
+    def _at(self, R: Float, rate_B: Float, t_s: Float) -> tuple[Float, Float]:
+        """The path ``R`` (N, 3, 3) and the rate at times of any shape."""
+        k = np.clip(np.searchsorted(self._t_s, t_s, side="right") - 1, 0, len(self._t_s) - 2)
+        after = t_s - self._t_s[k]
+        slope = (rate_B[k + 1] - rate_B[k]) / (self._t_s[k + 1] - self._t_s[k])[..., None]
+        rate = rate_B[k] + slope * after[..., None]
+        return R[k] @ so3.exp(0.5 * (rate_B[k] + rate) * after[..., None]), rate
+
+
+@kernel
+def _path(t_s: Float, rate_B: Float) -> Float:
+    """R_B0B (N, 3, 3) along readings free of bias, by unit quaternions."""
+    R = np.empty((len(t_s), 3, 3))
+    w, x, y, z = 1.0, 0.0, 0.0, 0.0
+    for k in range(len(t_s)):
+        if k:
+            half = 0.25 * (t_s[k] - t_s[k - 1])
+            a = half * (rate_B[k, 0] + rate_B[k - 1, 0])
+            b = half * (rate_B[k, 1] + rate_B[k - 1, 1])
+            c = half * (rate_B[k, 2] + rate_B[k - 1, 2])
+            angle = math.sqrt(a * a + b * b + c * c)
+            s = math.sin(angle) / angle if angle > 1e-8 else 1.0
+            a, b, c, d = s * a, s * b, s * c, math.cos(angle)
+            w, x, y, z = (
+                w * d - x * a - y * b - z * c,
+                w * a + x * d + y * c - z * b,
+                w * b - x * c + y * d + z * a,
+                w * c + x * b - y * a + z * d,
+            )
+        R[k, 0, 0], R[k, 0, 1], R[k, 0, 2] = 1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)
+        R[k, 1, 0], R[k, 1, 1], R[k, 1, 2] = 2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)
+        R[k, 2, 0], R[k, 2, 1], R[k, 2, 2] = 2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)
+    return R

@@ -1,0 +1,240 @@
+"""Whether camera and gyroscope belong together as their calibration says; where they do not, what would make them.
+
+Before anything is estimated from both, the camera's turns are held against the gyroscope's. Where the given time
+offset, rotation or focal length leaves them further apart than others do, those are taken in its place.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from vioframe.estimation.hand_eye import HandEye, Part, Turns
+from vioframe.estimation.inertial.readings import Readings
+from vioframe.estimation.initialization.window import PIXEL_SIGMA, refuse_unless
+from vioframe.estimation.turns import Turn, turn_between
+from vioframe.geometry import so3
+from vioframe.geometry.cameras import Camera
+from vioframe.types import NS_PER_S, Calibration, CameraSigma, FrameTracks
+
+# From the first frame of a pair to the second, for fast and for slow turns, and from one pair to the next.
+_TURNS_NS, _STEP_NS = (190_000_000, 590_000_000), 90_000_000
+_LOOK_BACK_NS = 4 * NS_PER_S
+_FEWEST_TURNS = 8
+# What is given fits where nothing else fits better by so much: as a part of the sum of squares, and in all.
+_BETTER, _BETTER_BY = 1.3, 15.0
+# ... and where what would is farther from it than this, s and rad: less than that an estimator finds by itself.
+_NEAR: dict[Part, float] = {"offset": 0.008, "rotation": np.deg2rad(3.0)}
+# Standard deviations with which a part can be taken over, s, rad and relative.
+_NAMES: dict[Part, str] = {"offset": "the time offset", "rotation": "the camera's rotation on the body"}
+_SURE: dict[Part, float] = {"offset": 0.006, "rotation": np.deg2rad(1.5)}
+# What distortion, rolling shutter and creeping patches cost beyond the scatter of the turns.
+_SYSTEMATIC: dict[Part, float] = {"offset": 0.003, "rotation": np.deg2rad(0.5)}
+# Turns are taken every so often and overlap.
+_OVERLAP = 4.0
+# The scatter of turns over that which the tracks' own noise gives them: up to here nothing else is tried, and beyond,
+# focal lengths are too. One must fit better by this part of the squares to be taken.
+_WELL, _BADLY = 1.5, 1.7
+_FOCALS = np.linspace(-0.15, 0.15, 7)
+_FOCAL_BETTER, _FOCAL_VALLEY, _FOCAL_EVERY_NS, _FOCAL_TURNS, _FOCAL_SIGMA = 0.4, 0.75, NS_PER_S, 15, 0.02
+# The part of what the camera turned that may be left unexplained.
+_LARGEST_UNEXPLAINED = 0.5
+# The median of |x| for x ~ N(0, 1).
+_MEDIAN = 0.6745
+
+
+@dataclass(frozen=True, slots=True)
+class Found:
+    """A calibration in place of the given one, and how well the parts that were found are known.
+
+    ``offset_sigma_s`` and ``rotation_sigma`` rad, ``focal_sigma`` relative; None is what was not looked for.
+    """
+
+    calibration: Calibration
+    offset_sigma_s: float | None = None
+    rotation_sigma: float | None = None
+    focal_sigma: float | None = None
+
+    def sigma(self, given: CameraSigma) -> CameraSigma:
+        """``given``, where nothing else was found."""
+        model = self.calibration.cameras[0].model
+        focal = (self.focal_sigma or 0.0) * np.array([model.fx, model.fy, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+        return replace(
+            given,
+            rotation=np.maximum(self.rotation_sigma or 0.0, given.rotation),
+            time_offset_s=max(self.offset_sigma_s or 0.0, given.time_offset_s),
+            intrinsics=np.maximum(focal, given.intrinsics),
+        )
+
+    def after(self, before: Found | None) -> Found:
+        """With what was found ``before`` and not again."""
+        if before is None:
+            return self
+        kept = {name: getattr(before, name) for name in self.__slots__ if getattr(self, name) is None}
+        return replace(self, **kept)
+
+    def __str__(self) -> str:
+        (camera,), parts = self.calibration.cameras, []
+        if self.offset_sigma_s is not None:
+            offset_ms = 1e-6 * camera.time_offset_ns
+            parts.append(f"time offset {offset_ms:.0f} ms (+- {1e3 * self.offset_sigma_s:.0f} ms)")
+        if self.rotation_sigma is not None:
+            quat = " ".join(f"{q:.5f}" for q in so3.to_quat_xyzw(camera.R_BC))
+            sigma_deg = np.rad2deg(self.rotation_sigma)
+            parts.append(f"camera's rotation on the body, R_BC as quat_xyzw {quat} (+- {sigma_deg:.1f} deg)")
+        if self.focal_sigma is not None:
+            parts.append(f"focal length {camera.model.focal_px:.0f} px (+- {100.0 * self.focal_sigma:.0f} %)")
+        return "found while starting: " + ", ".join(parts)
+
+
+class SensorCheck:
+    """Takes frames as they come, and says what fits them."""
+
+    def __init__(self) -> None:
+        self._frames: deque[FrameTracks] = deque()
+        self._pairs: deque[tuple[FrameTracks, FrameTracks, Turn]] = deque()
+        self._focal_tried_ns: int | None = None
+
+    def reset(self) -> None:
+        self._frames.clear()
+        self._pairs.clear()
+
+    def add(self, tracks: FrameTracks, camera: Camera) -> None:
+        """Take one frame, with points undistorted by ``camera``."""
+        t_ns = tracks.t_ns
+        if self._frames and t_ns - self._frames[-1].t_ns < _STEP_NS:
+            return
+        while self._pairs and self._pairs[0][0].t_ns < t_ns - _LOOK_BACK_NS:
+            self._pairs.popleft()
+        while self._frames and self._frames[0].t_ns < t_ns - 2 * max(_TURNS_NS):
+            self._frames.popleft()
+        for turn_ns in _TURNS_NS:
+            before = next((frame for frame in reversed(self._frames) if t_ns - frame.t_ns >= turn_ns), None)
+            if before is None or t_ns - before.t_ns > 2 * turn_ns:
+                continue
+            if (turn := turn_between(before, tracks, PIXEL_SIGMA / camera.focal_px)) is not None:
+                self._pairs.append((before, tracks, turn))
+        self._frames.append(tracks)
+
+    def undistort(self, camera: Camera) -> None:
+        """Count with ``camera`` from here on."""
+        self._frames = deque(undistorted(self._frames, camera))
+        sigma = PIXEL_SIGMA / camera.focal_px
+        again = [(a, b, turn_between(a, b, sigma)) for a, b in (undistorted(pair, camera) for *pair, _ in self._pairs)]
+        self._pairs = deque((a, b, turn) for a, b, turn in again if turn is not None)
+
+    def judge(self, readings: Readings, calibration: Calibration) -> Found | None:
+        """What to take in place of ``calibration``; None where that fits, or nothing can be said.
+
+        Raises :class:`RefusalError` where it does not fit, but what would is not known well enough yet.
+        """
+        camera = calibration.cameras[0]
+        turns = Turns([turn for *_, turn in self._pairs], readings.t_ns, readings.gyro_B)
+        if len(turns) < _FEWEST_TURNS:
+            refuse_unless(camera.rotation_known, "too few tracks to tell how the camera is turned on the body")
+            return None
+        given = HandEye(np.zeros(3), camera.R_BC)
+        noise = float(np.median([turn.misfit for *_, turn in self._pairs])) / _MEDIAN
+        if camera.rotation_known and _fits(turns, given, noise):
+            return None
+        best, parts, _, variance = _best(turns, given, camera.rotation_known)
+        if variance > (_BADLY * noise) ** 2 and (found := self._other_focal(readings, calibration)) is not None:
+            return found
+        if not parts:
+            return None
+        sigma = {part: best.sigma(part) * np.sqrt(_OVERLAP) for part in parts}
+        unsure = [part for part in parts if not sigma[part] <= _SURE[part]]
+        what = " and ".join(_NAMES[part] for part in parts)
+        wrong = f"{what} given {'do' if len(parts) > 1 else 'does'} not fit, and what does"
+        refuse_unless(
+            not unsure and turns.unexplained(best) < _LARGEST_UNEXPLAINED,
+            f"{wrong if camera.rotation_known else what} is not known well enough yet; turn about two axes",
+        )
+        worse = max(np.sqrt(variance) / noise / _WELL, 1.0)
+        sigma = {part: float(np.hypot(sigma[part], worse * _SYSTEMATIC[part])) for part in parts}
+        offset_ns = camera.time_offset_ns + round(best.offset_s * NS_PER_S)
+        return Found(
+            calibration.with_camera(0, R_BC=best.R_BC, rotation_known=True, time_offset_ns=offset_ns),
+            sigma.get("offset"),
+            sigma.get("rotation"),
+        )
+
+    def _other_focal(self, readings: Readings, calibration: Calibration) -> Found | None:
+        """A focal length with which the turns fit well, and far better, if there is one; tried now and then."""
+        now_ns = self._frames[-1].t_ns
+        if self._focal_tried_ns is not None and now_ns - self._focal_tried_ns < _FOCAL_EVERY_NS:
+            return None
+        self._focal_tried_ns = now_ns
+        camera = calibration.cameras[0]
+        given, sigma = HandEye(np.zeros(3), camera.R_BC), PIXEL_SIGMA / camera.model.focal_px
+        some = [self._pairs[k] for k in np.unique(np.linspace(0, len(self._pairs) - 1, _FOCAL_TURNS).astype(int))]
+        squares, fits_well = [], []
+        for change in _FOCALS:
+            model = with_focal(camera.model, 1.0 + change)
+            seen = [turn_between(a, b, sigma) for a, b in (undistorted(pair, model) for *pair, _ in some)]
+            found = [turn for turn in seen if turn is not None]
+            turns = Turns(found, readings.t_ns, readings.gyro_B)
+            if len(turns) < _FEWEST_TURNS:
+                return None
+            *_, cost, variance = _best(turns, given, camera.rotation_known)
+            squares.append(cost * variance)
+            fits_well.append(variance < (_BADLY * np.median([turn.misfit for turn in found]) / _MEDIAN) ** 2)
+        best, as_given = int(np.argmin(squares)), len(_FOCALS) // 2
+        if best in (0, len(squares) - 1) or not fits_well[best]:
+            return None
+        # A valley, not a hole: what lies between the given one and the best is better than the given one, too.
+        between = best + int(np.sign(as_given - best))
+        if squares[best] > _FOCAL_BETTER * squares[as_given] or squares[between] > _FOCAL_VALLEY * squares[as_given]:
+            return None
+        a, b, c = np.log(squares[best - 1 : best + 2])
+        step = _FOCALS[1] - _FOCALS[0]
+        factor = 1.0 + _FOCALS[best] + 0.5 * step * (a - c) / (a - 2.0 * b + c)
+        return Found(calibration.with_camera(0, model=with_focal(camera.model, factor)), focal_sigma=_FOCAL_SIGMA)
+
+
+def _fits(turns: Turns, given: HandEye, noise: float) -> bool:
+    """Whether turns scatter about ``given`` as their tracks' ``noise`` has them, and nothing near fits much better."""
+    x, variance = turns.fit(given, ())
+    if variance > (_WELL * noise) ** 2:
+        return False
+    near, variance = turns.fit(x, ("rotation", "offset"))
+    return turns.cost(x, variance) < turns.cost(near, variance) + _BETTER_BY
+
+
+def _best(turns: Turns, given: HandEye, rotation_known: bool) -> tuple[HandEye, tuple[Part, ...], float, float]:
+    """The fewest parts that have to be other than ``given``, how, the sum of squares then, and their variance."""
+    starts: dict[tuple[Part, ...], HandEye] = {}
+    if rotation_known:
+        starts[()] = given
+        starts["offset",] = turns.nearest(given, turned=False)
+    turned = turns.nearest(given, turned=True)
+    starts["rotation",] = replace(turned, offset_s=0.0)
+    starts["rotation", "offset"] = turned
+    fits = {parts: turns.fit(start, parts) for parts, start in starts.items()}
+    variance = min(variance for _, variance in fits.values())
+    costs = {parts: turns.cost(x, variance) for parts, (x, _) in fits.items()}
+    limit = _BETTER * min(costs.values()) + _BETTER_BY
+    # In the order of how much they change.
+    parts = next(parts for parts, cost in costs.items() if cost <= limit)
+    (x, _), cost = fits[parts], costs[parts]
+    if rotation_known and _is_near(x, given, parts):
+        parts = ()
+    return x, parts, cost, variance
+
+
+def _is_near(x: HandEye, given: HandEye, parts: Sequence[Part]) -> bool:
+    off = {"offset": abs(x.offset_s), "rotation": float(np.linalg.norm(so3.log(given.R_BC.T @ x.R_BC)))}
+    return all(off[part] <= _NEAR[part] for part in parts)
+
+
+def with_focal(camera: Camera, factor: float) -> Camera:
+    """Both focal lengths times ``factor``."""
+    return replace(camera, fx=camera.fx * factor, fy=camera.fy * factor)
+
+
+def undistorted(frames: Iterable[FrameTracks], camera: Camera) -> list[FrameTracks]:
+    """The same pixels as ``camera`` has them on the z = 1 plane."""
+    return [replace(tracks, xy_normalised=camera.undistort(tracks.xy)).finite() for tracks in frames]

@@ -1,0 +1,232 @@
+"""How a camera turned between frames, from its tracks alone, whatever it did beside: a gyroscope's independent twin.
+
+For bearings f, g of one landmark in two cameras with rotation R, the normals n = f x R g of all epipolar planes are
+perpendicular to the translation, whichever it is (Kneip, Lynen, "Direct Optimization of Frame-to-Frame Rotation", ICCV
+2013). Works on planes and without parallax, where an essential matrix does not. Derivation:
+``docs/derivations/initialization.md``.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from vioframe.arrays import Bool, Float
+from vioframe.geometry import kernels
+from vioframe.jit import kernel
+from vioframe.types import FrameTracks
+
+FEWEST_TRACKS = 15
+_MOST_TRACKS = 80
+# Iterations and Cauchy's scale (standard deviations) of each stage.
+_STAGES = np.array([[6, 20.0], [6, 5.0], [6, 2.0]])
+_PRIOR, _LARGEST_STEP, _SETTLED = 0.5, 0.2, 1e-6  # rad
+
+
+@dataclass(frozen=True, slots=True)
+class Turn:
+    """R_C1C2 (3, 3) between frames at ``t_ns`` (2,), and what tracks say of changes to it and to the focal length.
+
+    Half the sum of squares is d' H d / 2 + b' d, about d = [dtheta, dlog f] = 0: ``H`` (4, 4) and ``b`` (4,) in terms
+    of pixels of noise, R <- R Exp(dtheta). ``misfit`` is the typical distance of a track from its epipolar line, in
+    standard deviations.
+    """
+
+    t_ns: tuple[int, int]
+    R_C1C2: Float
+    H: Float
+    b: Float
+    misfit: float
+
+
+def turn_between(before: FrameTracks, now: FrameTracks, sigma: float) -> Turn | None:
+    """From the tracks that both frames share, with noise ``sigma`` on the z = 1 plane; None where they are too few."""
+    _, i, j = np.intersect1d(before.ids, now.ids, assume_unique=True, return_indices=True)
+    if len(i) < FEWEST_TRACKS:
+        return None
+    some = np.linspace(0, len(i) - 1, min(len(i), _MOST_TRACKS)).astype(np.int64)
+    f, g = _rays(before.xy_normalised[i[some]]), _rays(now.xy_normalised[j[some]])
+    R, H, b, misfit = _turn(f, g, sigma, _STAGES)
+    return Turn((before.t_ns, now.t_ns), R, H, b, misfit)
+
+
+def _rays(xy: Float) -> Float:
+    return np.column_stack([xy, np.ones(len(xy))])
+
+
+@kernel
+def _turn(f: Float, g: Float, sigma: float, stages: Float) -> tuple[Float, Float, Float, float]:
+    """R_C1C2, equations of [dtheta, dlog f] there, and the typical misfit; f and g (N, 3) on the z = 1 plane."""
+    # To begin with, the rotation that explains it best without moving.
+    M = np.zeros((3, 3))
+    for k in range(len(f)):
+        u = f[k] / math.sqrt(f[k] @ f[k])
+        v = g[k] / math.sqrt(g[k] @ g[k])
+        for a in range(3):
+            for c in range(3):
+                M[a, c] += u[a] * v[c]
+    U, _, Vt = np.linalg.svd(M)
+    if np.linalg.det(U @ Vt) < 0.0:
+        U[:, 2] = -U[:, 2]
+    R = U @ Vt
+    weight = np.ones(len(f))
+    H, b, distance = np.zeros((4, 4)), np.zeros(4), np.zeros(len(f))
+    for s in range(len(stages)):
+        for _ in range(int(stages[s, 0])):
+            linearise_pair(f, g, len(f), R, weight, sigma, stages[s, 1], H, b, distance)
+            A = H[:3, :3].copy()
+            for a in range(3):
+                A[a, a] += 1.0 / (_PRIOR * _PRIOR)
+            step = -np.linalg.solve(A, b[:3])
+            length = math.sqrt(step @ step)
+            if length > _LARGEST_STEP:
+                step *= _LARGEST_STEP / length
+            R = R @ kernels.exp(step)  # type: ignore[arg-type]
+            if length < _SETTLED:
+                break
+    linearise_pair(f, g, len(f), R, weight, sigma, stages[-1, 1], H, b, distance)
+    return R, H, b, np.median(distance)
+
+
+@kernel
+def linearise_pairs(
+    f: Float, g: Float, common: Bool, R_C1C2: Float, weight: Float, sigma: float, cauchy: float, distance: Float
+) -> tuple[Float, Float]:
+    """:func:`linearise_pair` of P pairs, (P, N, 3) and (P, 3, 3), with the tracks ``common`` (P, N): H, b of each.
+
+    ``weight`` (P, N) and ``distance`` are filled in where there is a track.
+    """
+    count = len(f)
+    H, b = np.zeros((count, 4, 4)), np.zeros((count, 4))
+    for p in range(count):
+        rows = np.flatnonzero(common[p])
+        w, d = weight[p][rows], np.empty(len(rows))
+        linearise_pair(f[p][rows], g[p][rows], len(rows), R_C1C2[p], w, sigma, cauchy, H[p], b[p], d)
+        for k in range(len(rows)):
+            weight[p, rows[k]], distance[p, rows[k]] = w[k], d[k]
+    return H, b
+
+
+@kernel
+def linearise_pair(
+    f: Float,
+    g: Float,
+    count: int,
+    R: Float,
+    weight: Float,
+    sigma: float,
+    cauchy: float,
+    H: Float,
+    b: Float,
+    distance: Float,
+) -> None:
+    """Gauss-Newton equations ``H`` (4, 4), ``b`` (4,) of [dtheta, dlog f] for the rotation ``R`` = R_C1C2 of a pair.
+
+    The translation is the direction that the normals, weighed by ``weight`` (N,), are most perpendicular to, and is
+    eliminated. ``weight`` becomes that of the next call, ``distance`` (N,) each track's from its epipolar line, in
+    standard deviations. ``cauchy`` is the scale of the robust loss in standard deviations.
+    """
+    N = np.zeros((3, 3))
+    S_y, S_f = np.zeros((3, 3)), np.zeros((3, 3))
+    for k in range(count):
+        w = weight[k]
+        y0 = R[0, 0] * g[k, 0] + R[0, 1] * g[k, 1] + R[0, 2] * g[k, 2]
+        y1 = R[1, 0] * g[k, 0] + R[1, 1] * g[k, 1] + R[1, 2] * g[k, 2]
+        y2 = R[2, 0] * g[k, 0] + R[2, 1] * g[k, 1] + R[2, 2] * g[k, 2]
+        f0, f1, f2 = f[k, 0], f[k, 1], f[k, 2]
+        n0, n1, n2 = f1 * y2 - f2 * y1, f2 * y0 - f0 * y2, f0 * y1 - f1 * y0
+        _add_outer(N, n0, n1, n2, w)
+        _add_outer(S_y, y0, y1, y2, w)
+        _add_outer(S_f, f0, f1, f2, w)
+    for M in (N, S_y, S_f):
+        M[1, 0], M[2, 0], M[2, 1] = M[0, 1], M[0, 2], M[1, 2]
+    t = likeliest_translation(N, S_y, S_f, R)
+
+    # Two directions across t.
+    u, v = np.zeros(3), np.zeros(3)
+    a = 0
+    for k in range(1, 3):
+        if abs(t[k]) < abs(t[a]):
+            a = k
+    u[a] = 1.0
+    u -= t[a] * t
+    u /= math.sqrt(u @ u)
+    v[:] = kernels.cross(t, u)
+
+    E = np.zeros((6, 6))
+    e = np.zeros(6)
+    J = np.empty(6)
+    for k in range(count):
+        g0, g1, g2 = g[k, 0], g[k, 1], g[k, 2]
+        y0 = R[0, 0] * g0 + R[0, 1] * g1 + R[0, 2] * g2
+        y1 = R[1, 0] * g0 + R[1, 1] * g1 + R[1, 2] * g2
+        y2 = R[2, 0] * g0 + R[2, 1] * g1 + R[2, 2] * g2
+        f0, f1, f2 = f[k, 0], f[k, 1], f[k, 2]
+        n0, n1, n2 = f1 * y2 - f2 * y1, f2 * y0 - f0 * y2, f0 * y1 - f1 * y0
+        # d (n . t) by f: y x t; by g: R' (t x f).
+        p0, p1 = y1 * t[2] - y2 * t[1], y2 * t[0] - y0 * t[2]
+        c0, c1, c2 = t[1] * f2 - t[2] * f1, t[2] * f0 - t[0] * f2, t[0] * f1 - t[1] * f0
+        q0 = R[0, 0] * c0 + R[1, 0] * c1 + R[2, 0] * c2
+        q1 = R[0, 1] * c0 + R[1, 1] * c1 + R[2, 1] * c2
+        q2 = R[0, 2] * c0 + R[1, 2] * c1 + R[2, 2] * c2
+        # Sampson's distance: the residual n . t over the deviation that the noise of both points gives it.
+        scale = sigma * math.sqrt(p0 * p0 + p1 * p1 + q0 * q0 + q1 * q1) + 1e-12
+        r = (n0 * t[0] + n1 * t[1] + n2 * t[2]) / scale
+        robust = 1.0 / (1.0 + (r / cauchy) ** 2)
+        J[0], J[1], J[2] = g1 * q2 - g2 * q1, g2 * q0 - g0 * q2, g0 * q1 - g1 * q0
+        J[3] = -(f0 * p0 + f1 * p1 + g0 * q0 + g1 * q1)  # a longer focal length draws bearings together
+        J[4] = n0 * u[0] + n1 * u[1] + n2 * u[2]
+        J[5] = n0 * v[0] + n1 * v[1] + n2 * v[2]
+        for i in range(6):
+            J[i] /= scale
+        for i in range(6):
+            e[i] += robust * J[i] * r
+            for j in range(i, 6):
+                E[i, j] += robust * J[i] * J[j]
+        weight[k] = robust / (scale * scale)
+        distance[k] = abs(r)
+    # The translation is at its own minimum; its two angles, with a prior of 1 rad, are eliminated.
+    d00, d01, d11 = E[4, 4] + 1.0, E[4, 5], E[5, 5] + 1.0
+    det = d00 * d11 - d01 * d01
+    for i in range(4):
+        b[i] = e[i]
+        x = (d11 * E[i, 4] - d01 * E[i, 5]) / det
+        y = (d00 * E[i, 5] - d01 * E[i, 4]) / det
+        for j in range(i, 4):
+            H[i, j] = E[i, j] - x * E[j, 4] - y * E[j, 5]
+            H[j, i] = H[i, j]
+
+
+@kernel
+def _add_outer(M: Float, v0: float, v1: float, v2: float, w: float) -> None:
+    M[0, 0] += w * v0 * v0
+    M[0, 1] += w * v0 * v1
+    M[0, 2] += w * v0 * v2
+    M[1, 1] += w * v1 * v1
+    M[1, 2] += w * v1 * v2
+    M[2, 2] += w * v2 * v2
+
+
+@kernel
+def likeliest_translation(N: Float, S_y: Float, S_f: Float, R: Float) -> Float:
+    """The unit t that minimises t' N t over t' noise t (Kanatani 2005), N the moments of the normals n = f x y.
+
+    Noise e across the optical axis z moves a normal by e x y, and the average of (e x y)(e x y)' over the plane is
+    |y|^2 I - y y' - (z x y)(z x y)'. That of the second point lies across its own axis, R z. Plain eigenvectors are
+    drawn to where noise hurts least, and the more so the smaller the parallax.
+    """
+    noise = np.zeros((3, 3))
+    for second in range(2):
+        S = S_f if second else S_y
+        z = R[:, 2].copy() if second else np.array([0.0, 0.0, 1.0])
+        Z = kernels.hat(z)
+        noise += (S[0, 0] + S[1, 1] + S[2, 2]) * np.eye(3) - S - Z @ S @ Z.T
+    trace = noise[0, 0] + noise[1, 1] + noise[2, 2]
+    for k in range(3):
+        noise[k, k] += 1e-6 * trace
+    W = np.linalg.inv(np.linalg.cholesky(noise))
+    t = W.T @ np.ascontiguousarray(np.linalg.eigh(W @ N @ W.T)[1][:, 0])
+    out: Float = t / math.sqrt(t @ t)
+    return out
