@@ -149,6 +149,51 @@ def test_quiet_says_nothing(toy):
     assert run_toy(toy, "--quiet").output == ""
 
 
+FRESH = """
+from vioframe.jit import kernel
+from vioframe.parts.hooks import hookimpl
+from toy_parts import Still
+
+@kernel
+def doubled(x):
+    return 2.0 * x
+
+class Compiled(Still):
+    def __init__(self): super().__init__(); doubled(1.0)
+
+@hookimpl
+def vioframe_backends(): return {"compiled": Compiled}
+"""
+
+
+def test_compiling_is_said_once_and_never_with_quiet(toy, tmp_path, monkeypatch):
+    import numba
+
+    install(tmp_path / "site2", monkeypatch, distribution="fresh", module="fresh_parts", code=FRESH)
+    for cache, quiet, said in (("a", [], 1), ("a", [], 0), ("b", ["--quiet"], 0)):
+        monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path / cache))
+        monkeypatch.delitem(sys.modules, "fresh_parts", raising=False)
+        result = vioframe_("run", toy, "--backend", "compiled", "--out", "run", "--overwrite", *quiet)
+        assert result.stderr.count("compiling kernels (once after installation)") == said, result.stderr
+
+
+@pytest.mark.parametrize(
+    ("played", "total"),
+    [([], 60), (["--duration", "1"], 21), (["--start", "1"], 40), (["--start", "1", "--duration", "9"], 40)],
+)
+def test_the_bar_knows_how_many_frames_a_part_of_a_recording_has(toy, played, total, monkeypatch):
+    totals = []
+
+    def told(bar, *_, total=None, **__):
+        totals.append(total)
+        bar.progress.update(bar._id, advance=1)
+
+    monkeypatch.setattr("vioframe.cli.common.Bar.__call__", told)
+    run_toy(toy, *played)
+    assert abs(totals[10] - total) <= 3
+    assert abs(totals[-1] - total) <= 1
+
+
 def test_a_run_is_repeated_from_its_own_configuration(toy):
     run_toy(toy, "-o", "speed=0.5", "-o", "max_points=37", "--start", 0.2, "--duration", 1.4, "--out", "a", "--quiet")
     vioframe_("run", "--config", "a/config.yaml", "--out", "b", "--quiet")

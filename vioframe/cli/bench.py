@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from vioframe.cli import LazyGroup
-from vioframe.cli.common import Bar, print_notes, quiet_option, workers_option
+from vioframe.cli.common import Bar, compiling_shown, print_notes, quiet_option, workers_option
 from vioframe.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -98,7 +98,8 @@ def _suite_command(name: str, summary: str) -> click.Command:
         given = {"data": data, "scheduler": scheduler, "workers": workers, "recordings": recordings}
         _check_used(whole, **given, seeds=narrowing["seeds"])
         suite = suites.narrowed(whole, **narrowing)
-        tasks = plan(suite, data, registry.load())
+        with compiling_shown(quiet=quiet):
+            tasks = plan(suite, data, registry.load())
         store = Store.at(out or Path("results") / suite.name, recordings)
         store.begin(suite, overwrite=overwrite)
         with store.alone():

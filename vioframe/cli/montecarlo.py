@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from vioframe.cli.common import FILE, Bar, print_notes, print_table, quiet_option, workers_option
+from vioframe.cli.common import FILE, Bar, compiling_shown, print_notes, print_table, quiet_option, workers_option
 
 if TYPE_CHECKING:
     from vioframe.evaluation.consistency import Trial
@@ -95,7 +95,8 @@ def montecarlo(
     tasks = []
     for flight in dict.fromkeys(flights):
         tree = {"name": flight, "title": flight, **grid, "setup": {"flight": flight, **sensors}}
-        planned = plan(validate(Suite, tree, "command line"), (), installed)
+        with compiling_shown(quiet=quiet):
+            planned = plan(validate(Suite, tree, "command line"), (), installed)
         tasks += [task for task in planned if isinstance(task, TrialTask)]
     with Bar(len(tasks), "first trials under way", quiet=quiet) as bar:
         failed = 0

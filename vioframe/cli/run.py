@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from math import inf
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ from vioframe.geometry.trajectory import Trajectory
 from vioframe.parts import config as configuration
 from vioframe.parts import registry
 from vioframe.parts.config import Config
-from vioframe.pipeline import prepare, record
+from vioframe.pipeline import Experiment, prepare, record
 from vioframe.runs.folder import RunFolder
 from vioframe.runs.recorder import check_run_folder, free_run_folder
 from vioframe.types import NS_PER_S, Step
@@ -45,11 +46,11 @@ def run(out: Path | None, overwrite: bool, quiet: bool, **choices: Any) -> None:
     if out is not None:
         check_run_folder(out, overwrite=overwrite)
     installed = registry.load()
-    experiment = prepare(_configure(installed, **choices), installed)
-    folder = out or free_run_folder(Path("runs"), experiment.name)
-    whole = experiment.config.start_s == 0.0 and experiment.config.duration_s is None
-    with Bar(experiment.dataset.frame_count if whole else None, quiet=quiet, late=True) as bar:
-        summary = record(experiment, folder, overwrite=overwrite, on_step=_watched(bar))
+    config = _configure(installed, **choices)
+    with Bar(None, quiet=quiet, late=True) as bar:
+        experiment = prepare(config, installed)
+        folder = out or free_run_folder(Path("runs"), experiment.name)
+        summary = record(experiment, folder, overwrite=overwrite, on_step=_watched(bar, experiment))
     if not quiet:
         _report(folder, summary)
 
@@ -73,9 +74,22 @@ def _configure(
     return configuration.override(configuration.parse(tree, "command line"), installed, options)
 
 
-def _watched(bar: Bar) -> Callable[[Step], None]:
+def _watched(bar: Bar, experiment: Experiment) -> Callable[[Step], None]:
     """Has ``bar`` show frame rate, real-time factor, tracked points and what the back-end says."""
+    config, frame_count = experiment.config, experiment.dataset.frame_count
     first_t_ns: int | None = None
+
+    def expected(data_s: float) -> float | None:
+        """Frames to come through, judged by those of the first ``data_s`` seconds where a part is played."""
+        if config.start_s == 0.0 and config.duration_s is None:
+            return frame_count
+        if data_s == 0.0:
+            return None
+        rate_hz = bar.completed / data_s
+        left = inf if frame_count is None else frame_count - round(config.start_s * rate_hz)
+        wanted = inf if config.duration_s is None else round(config.duration_s * rate_hz)
+        total = max(min(left, wanted), bar.completed + 1)
+        return None if total == inf else total
 
     def on_step(step: Step) -> None:
         nonlocal first_t_ns
@@ -83,7 +97,8 @@ def _watched(bar: Bar) -> Callable[[Step], None]:
         data_s = (step.frames.t_ns - first_t_ns) / NS_PER_S
         bar(
             f"{(bar.completed + 1) / bar.elapsed_s:.1f} frames/s, {data_s / bar.elapsed_s:.2f}x real time, "
-            f"{len(step.tracks.ids)} points, {step.estimate.status}"
+            f"{len(step.tracks.ids)} points, {step.estimate.status}",
+            total=expected(data_s),
         )
 
     return on_step
