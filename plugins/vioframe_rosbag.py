@@ -71,7 +71,10 @@ class RosbagDataset:
             _check_topic(path, self._imu_topic, imu_topics, "IMU")
             files = self._calibration_files(calibration, reader, topics)
             self.calibration, self._topics = match_cameras(files, topics, wanted)
-            _log.info("%s: using %s and %s", path.name, ", ".join(self._topics), self._imu_topic)
+            self._tell_choice(
+                [t for t in topics if t not in self._topics] if wanted is None else [],
+                [t for t in imu_topics if t != self._imu_topic] if imu_topic is None else [],
+            )
             for topic in self._topics:
                 if not any(isinstance(m, FrameSet) for m in self._messages(reader, topic)):
                     raise DatasetError(f"{path}: no image of {topic} can be read")
@@ -117,6 +120,15 @@ class RosbagDataset:
         with _opened(self._path) as reader:
             yield from gathered(self._messages(reader, *self._topics, self._imu_topic))
 
+    def _tell_choice(self, cameras: list[str], imus: list[str]) -> None:
+        """Which topics are read, where there are others that nobody has decided against."""
+        if others := [*cameras, *imus]:
+            hints = [f"-o cameras={topic}" for topic in cameras[:1]] + [f"-o imu_topic={topic}" for topic in imus[:1]]
+            _log.warning(
+                *("%s: %s and %s are read, %s left aside; to choose: %s", self._path.name, ", ".join(self._topics)),
+                *(self._imu_topic, ", ".join(others), " ".join(hints)),
+            )
+
     def _messages(self, reader: AnyReader, *topics: str) -> Iterator[Measurement]:
         for topic, message in self._deserialized(reader, *topics):
             yield _imu_sample(message) if topic == self._imu_topic else self._frame(topic, message)
@@ -142,9 +154,10 @@ class RosbagDataset:
     def _calibration_files(self, given: list[Path] | Path | None, reader: AnyReader, topics: list[str]) -> list[Path]:
         if given:
             return [given] if isinstance(given, Path) else given
-        sidecar = sidecar_folder(self._path)
-        if sidecar.is_dir():
-            return [sidecar]
+        within = (self._path.parent / "metadata.yaml").is_file()  # a file of a ROS 2 recording
+        sidecars = [sidecar_folder(path) for path in (self._path, *[self._path.parent] * within)]
+        if there := [sidecar for sidecar in sidecars if sidecar.is_dir()]:
+            return there[:1]
         as_eurocs = [topic for topic in topics if topic in _EUROC_CAMERA_TOPICS and self._imu_topic == _EUROC_IMU_TOPIC]
         _, first = next(self._deserialized(reader, *as_eurocs), (None, None))
         if hasattr(first, "height") and (first.height, first.width) == _EUROC_SHAPE:
@@ -153,7 +166,8 @@ class RosbagDataset:
             )
             return [PACKAGED / "euroc"]
         raise DatasetError(
-            f"{self._path} brings no calibration; name its files with the option calibration, or put them in {sidecar}"
+            f"{self._path} brings no calibration: --calibration FILE names one, and {sidecars[-1]} is where it is "
+            "looked for"
         )
 
 

@@ -318,13 +318,33 @@ def test_ctrl_c_completes_the_folder_and_exits_130(toy, tmp_path):
         (["flight.toy", "--backend", "still", "-o", "speed=fast"], "speed='fast': Input should be a valid number"),
         (["flight.toy", "--config", "none.yaml"], "cannot read the configuration none.yaml"),
         (["flight.toy", "--start", "-1"], "command line: start_s: Input should be greater than or equal to 0"),
-        (["flight.toy", "--backend", "still", "--start", "50"], "toy has no image to process; check --start"),
+        (["flight.toy", "--backend", "still", "--start", "50"], "its images span 3.0 s, of which --start and"),
         (["flight.toy", "--backend", "still", "--ground-truth", "none.tum"], "none.tum: no such trajectory file"),
     ],
 )
 def test_bad_input_is_one_line_and_exit_code_2(toy, arguments, why):
     assert why in error_line("run", *arguments)
     assert not Path("runs").exists()
+
+
+def test_clocks_apart_are_said_with_both_spans(toy):
+    late = PARTS.replace("yield FrameSet(10**9 +", "yield FrameSet(10**12 +")
+    Path("site/toy_parts.py").write_text("from vioframe.parts.hooks import hookimpl\n" + late)
+    line = error_line("run", toy, "--backend", "still")
+    assert "camera (1000.000 .. 1002.950 s) and IMU (1.000 .. 4.195 s) overlap nowhere" in line
+
+
+def test_cameras_left_aside_are_named(toy):
+    pair = PARTS.replace("broken_at: int = 99,", "cameras: list[str] | None = None, broken_at: int = 99,").replace(
+        "        self.broken_at,",
+        "        if not cameras:\n"
+        "            other = replace(self.calibration.cameras[0], name='cam1')\n"
+        "            self.calibration = replace(self.calibration, cameras=(*self.calibration.cameras, other))\n"
+        "        self.broken_at,",
+    )
+    Path("site/toy_parts.py").write_text("from vioframe.parts.hooks import hookimpl\n" + pair)
+    shown = run_toy(toy).stdout
+    assert "camera cam0 is used, cam1 left aside; -o cameras=cam1 takes another" in shown
 
 
 def test_plugins_lists_what_is_there_and_what_failed(toy, tmp_path, monkeypatch):
@@ -338,6 +358,18 @@ def test_plugins_lists_what_is_there_and_what_failed(toy, tmp_path, monkeypatch)
     assert failed.split()[1:3] == ["bad-parts", "1.0"]
     assert "ModuleNotFoundError: No module named 'not_there_at_all'" in failed
     assert "warning: plug-in bad_parts (bad-parts 1.0) is skipped" in result.stderr
+
+
+def test_plugins_shows_both_of_a_name_and_says_so(toy, tmp_path, monkeypatch):
+    code = "class Mine:\n  def detect(self, image, n): ...\n@hookimpl\ndef vioframe_detectors(): return {'orb': Mine}"
+    install(tmp_path / "thief", monkeypatch, distribution="thief", module="thief_parts", code=code)
+    monkeypatch.setenv("COLUMNS", "200")
+    result = vioframe_("plugins")
+    assert "detector     orb@thief" in result.stdout
+    assert "detector     orb@vioframe" in result.stdout
+    assert "note: several plug-ins provide a detector called 'orb'; say orb@vioframe or orb@thief" in result.stderr
+    assert "(thief 1.0)" in vioframe_("plugins", "orb").stdout
+    assert "say orb@vioframe or orb@thief" in error_line("run", toy, "--backend", "still", "--detector", "orb")
 
 
 def test_plugins_shows_the_options_of_one(monkeypatch):

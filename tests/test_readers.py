@@ -530,11 +530,27 @@ class TestCalibrationOfABag:
         assert (record.name, record.levelno) == ("vioframe.rosbag", logging.WARNING)
         assert "using EuRoC's published calibration" in record.getMessage()
 
+    def test_topics_left_aside_are_named(self, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+        images = [image_message(topic, T0_NS, IMAGE, "mono8") for topic in ("/cam0/image_raw", "/thermal/image")]
+        other_imu = imu_message("/imu1", ImuSample(T0_NS, np.ones(3), np.ones(3)))
+        path = bag_with(tmp_path, *images, other_imu)
+        RosbagDataset(path, cameras="cam0", imu_topic="/imu0")
+        assert not caplog.records
+        RosbagDataset(path)
+        assert [record.getMessage() for record in caplog.records] == [
+            "test.bag: /cam0/image_raw and /imu0 are read, /thermal/image, /imu1 left aside; to choose: "
+            "-o cameras=/thermal/image -o imu_topic=/imu1"
+        ]
+
+    def test_a_bare_sqlite_file_has_the_calibration_beside_its_folder(self, tmp_path: Path) -> None:
+        convert(measurements(), CALIBRATION, tmp_path / "flight.ros2")
+        assert_same_rig(RosbagDataset(tmp_path / "flight.ros2" / "flight.ros2.db3").calibration, CALIBRATION)
+
     def test_any_other_bag_needs_one(self, tmp_path: Path) -> None:
         for options in ({"topic": "/camera/image_raw"}, {"width": 640}):
             path = self.euroc_like(tmp_path, **options)
             with pytest.raises(
-                DatasetError, match=r"brings no calibration; name its files .* or put them in"
+                DatasetError, match=r"brings no calibration: --calibration FILE names one, .* is where it is looked for"
             ) as caught:
                 RosbagDataset(path)
             one_line(caught)

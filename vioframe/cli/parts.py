@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from vioframe.cli.common import FILE
+from vioframe.cli.common import FILE, print_notes
 from vioframe.errors import PluginError
 from vioframe.parts import config as configuration
 from vioframe.parts import registry
@@ -40,8 +40,9 @@ def plugins(name: str | None) -> None:
                 for each in installed.failures
             ]
             console.print(_table(("failed to load", "distribution", "version", "why"), failed))
+        print_notes(map(str, installed.clashes))
         return
-    parts = [part for _, part in every if part.name == name]
+    parts = [part for _, part in every if name in (part.name, part.name.partition("@")[0])]
     if not parts:
         known = sorted({part.name for _, part in every})
         raise PluginError(f"no part is called {name!r}{did_you_mean(name, known)}; installed: {', '.join(known)}")

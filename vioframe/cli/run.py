@@ -52,6 +52,9 @@ def run(out: Path | None, overwrite: bool, quiet: bool, **choices: Any) -> None:
         folder = out or free_run_folder(Path("runs"), experiment.name)
         summary = record(experiment, folder, overwrite=overwrite, on_step=_watched(bar, experiment))
     if not quiet:
+        if others := experiment.left_aside:
+            used = experiment.dataset.calibration.cameras[0].name
+            click.echo(f"camera {used} is used, {', '.join(others)} left aside; -o cameras={others[0]} takes another")
         _report(folder, summary)
 
 
