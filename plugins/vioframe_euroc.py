@@ -72,7 +72,8 @@ class EurocDataset:
         file = self._mav0 / sensor / "data.csv"
         if not file.is_file():
             there = ", ".join(sorted(file.parent.name for file in self._mav0.glob("*/data.csv")))
-            remedy = f"choose cameras and imu among: {there}" if there else "no sensor is there; copy it again"
+            choice = f"choose by -o cameras=NAME and -o imu=NAME among: {there}"
+            remedy = choice if there else "no sensor is there; copy it again"
             raise DatasetError(f"{file} is missing; {remedy}")
         return file
 

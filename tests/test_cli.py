@@ -122,6 +122,15 @@ def test_every_listed_command_exists_and_says_what_it_does():
         assert "Usage: " in vioframe_(name, "--help").output
 
 
+def test_progress_and_summary_are_left_out_by_one_word():
+    """By every command that shows progress, and no other; and no help text names what is not installed."""
+    commands = [[name] for name in vioframe.cli._COMMANDS] + [["bench", "euroc"], ["bench", "detectors"]]
+    texts = {" ".join(words): " ".join(vioframe_(*words, "--help").output.split()) for words in commands}
+    quiet = {name for name, text in texts.items() if "--quiet No progress bar and no summary." in text}
+    assert quiet == {"run", "simulate", "convert", "train", "montecarlo", "bench euroc", "bench detectors"}
+    assert not [name for name, text in texts.items() if "docs/" in text]
+
+
 def test_an_unknown_command_is_refused():
     assert "No such command 'rnu' (did you mean 'run'?)" in vioframe_("rnu", code=2).output
 
@@ -313,11 +322,11 @@ def test_ctrl_c_completes_the_folder_and_exits_130(toy, tmp_path):
         ([], "no data given: `vioframe run DATA`"),
         (["flight.toy", "--detector", "obr"], "no detector is called 'obr' (did you mean 'orb'?)"),
         (["flight.toy", "--backend", "stil"], "no backend is called 'stil' (did you mean 'still'?)"),
-        (["flight.toy", "--reader", "tyo"], "no dataset is called 'tyo' (did you mean 'toy'?)"),
+        (["flight.toy", "--reader", "tyo"], "no reader is called 'tyo' (did you mean 'toy'?)"),
         (["flight.toy", "--backend", "still", "-o", "sped=1"], "no part has such an option (did you mean 'speed'?)"),
         (["flight.toy", "--backend", "still", "-o", "speed=fast"], "speed='fast': Input should be a valid number"),
         (["flight.toy", "--config", "none.yaml"], "cannot read the configuration none.yaml"),
-        (["flight.toy", "--start", "-1"], "command line: start_s: Input should be greater than or equal to 0"),
+        (["flight.toy", "--start", "-1"], "error: --start: Input should be greater than or equal to 0"),
         (["flight.toy", "--backend", "still", "--start", "50"], "its images span 3.0 s, of which --start and"),
         (["flight.toy", "--backend", "still", "--ground-truth", "none.tum"], "none.tum: no such trajectory file"),
     ],

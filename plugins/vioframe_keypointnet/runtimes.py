@@ -92,7 +92,7 @@ def _by_torch(weights: Weights, descriptors: bool, device: str, half: bool, thre
 
         from vioframe_keypointnet.network import of_weights
     if device == "cuda" and not torch.cuda.is_available():
-        raise ConfigError("torch finds no CUDA device; leave the option runtime out, or install torch with CUDA")
+        raise ConfigError("torch finds no CUDA device; leave -o runtime out, or install torch with CUDA")
     if threads:
         torch.set_num_threads(threads)
     network = of_weights(weights).to(device)

@@ -42,7 +42,7 @@ class _Suites(LazyGroup):
         if args and not args[0].startswith("-") and self.get_command(ctx, args[0]) is None:
             from vioframe.bench.suites.suite import find
 
-            find(args[0])
+            find(args[0], _COMMANDS)
         return super().resolve_command(ctx, args)
 
 
@@ -51,7 +51,7 @@ def bench() -> None:
     """Compare parts with one another: by a question to detectors, or by a suite.
 
     A suite is a YAML file of detectors, back-ends, sequences, conditions and seeds; `vioframe bench my_suite.yaml` runs
-    one of your own. docs/bench.md says what is in it.
+    one of your own.
     """
 
 
@@ -116,13 +116,14 @@ def _suite_command(name: str, summary: str) -> click.Command:
 
                 sweep.run(workers=workers or suite.workers, scheduler=scheduler, on_progress=on_progress)
         failures = f", {len(sweep.failed)} failed" if sweep.failed else ""
-        click.echo(f"{sweep.done} tasks done{reused}{failures}; results in {store.path}")
+        if not quiet:
+            click.echo(f"{sweep.done} tasks done{reused}{failures}; results in {store.path}")
         for key, error in sweep.failed.items():
             click.echo(f"failed: {key}: {error}", err=True)
         if not no_report:
             from vioframe.cli.show import write_and_say
 
-            write_and_say(store.path)
+            write_and_say(store.path, quiet=quiet)
         if sweep.failed:
             click.get_current_context().exit(EXIT_FAILED)
 

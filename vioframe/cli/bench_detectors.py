@@ -70,8 +70,6 @@ def detectors(
                 itself (--hpatches DIR), as they are and degraded
     --frontend  how long and how truly the front-end follows what was detected
                 along DATASET, as it is and degraded
-
-    docs/bench_detectors.md says what the figures mean.
     """
     if quality and frontend:
         raise ConfigError("--quality and --frontend are two questions; ask one at a time")
@@ -106,7 +104,8 @@ def detectors(
         rows += [{"detector": label, "absent": reason} for label, reason in absent.items()]
         taking_part = {entrant.called: entrant.options for entrant, _ in lined_up().ready}
         record(keep, rows, {"question": question, "seed": seed, **settings, "detectors": taking_part})
-        click.echo(f"written to {keep}")
+        if not quiet:
+            click.echo(f"written to {keep}")
 
 
 def _given(question: str, specific: dict[str, Any]) -> dict[str, Any]:

@@ -43,7 +43,7 @@ runs_argument = click.argument(
 ground_truth_option = click.option(
     "--ground-truth", type=FILE, help="TUM or EuRoC csv; a run folder's own is the default."
 )
-quiet_option = click.option("--quiet", is_flag=True, help="No progress bar.")
+quiet_option = click.option("--quiet", is_flag=True, help="No progress bar and no summary.")
 workers_option = click.option(
     "--workers", type=click.IntRange(1), metavar="N", help="Processes.  [default: one a core]"
 )

@@ -64,7 +64,7 @@ def montecarlo(
     """Fly simulated flights that differ by their noise alone, and compare errors with what back-ends say of them.
 
     Landmarks instead of images, EuRoC's camera and IMU noise, true calibration, the back-end's own initialisation. A
-    trial that fails counts and is shown. docs/montecarlo.md says how to read the table and the plots.
+    trial that fails counts and is shown.
     """
     from vioframe.bench.processes import map_in_processes, usable_cores
     from vioframe.bench.results import record
@@ -130,5 +130,7 @@ def montecarlo(
         by_seed = [trial.to_dict() for _, trial in of_case]
         cases.append({"name": task.about["backend"], **about, **over_trials(own), "nees": averages, "by_seed": by_seed})
     record(folder / MARKER, cases, {"backends": backends, "flights": flights, "seeds": seeds, **sensors})
+    if quiet:
+        return
     written = sorted(path.name for pattern in FILES for path in folder.glob(pattern))
     click.echo(f"written to {folder}: {', '.join(written)}")

@@ -9,7 +9,7 @@ from typing import Any
 
 import click
 
-from vioframe.cli.common import FILE, Bar, calibration_option
+from vioframe.cli.common import FILE, Bar, calibration_option, quiet_option
 from vioframe.errors import DatasetError, TrajectoryError
 from vioframe.evaluation import evaluate
 from vioframe.geometry.trajectory import Trajectory
@@ -36,7 +36,7 @@ from vioframe.types import NS_PER_S, Step
 @click.option("--duration", "duration_s", type=float, metavar="S", help="Stop after S seconds.")
 @click.option("--out", type=FILE, help="Run folder.  [default: runs/DATASET_DETECTOR_BACKEND]")
 @click.option("--overwrite", is_flag=True, help="Replace the run that is in --out.")
-@click.option("--quiet", is_flag=True, help="No progress bar and no summary.")
+@quiet_option
 def run(out: Path | None, overwrite: bool, quiet: bool, **choices: Any) -> None:
     """Estimate the motion along DATA, a bag or an ASL folder, and write a run folder.
 

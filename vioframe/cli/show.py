@@ -158,16 +158,18 @@ def report(results: Path, out: Path | None, no_page: bool) -> None:
     write_and_say(results, out, page=not no_page)
 
 
-def write_and_say(results: Path, out: Path | None = None, *, page: bool = True) -> None:
+def write_and_say(results: Path, out: Path | None = None, *, page: bool = True, quiet: bool = False) -> None:
     """Write the report, and say what was written."""
     from vioframe.report.suite.report import write_report
     from vioframe.runs.results import load_results
 
     written = write_report(load_results(results), out, page=page)
+    print_notes(written.notes)
+    if quiet:
+        return
     counts = Counter((path.parent.as_posix(), path.suffix[1:]) for path in written.files if path.parent != Path())
     for (folder, ending), count in counts.items():
         click.echo(f"{written.folder / folder}: {count} {ending}")
     for path in written.files:
         if path.parent == Path():
             click.echo(written.folder / path)
-    print_notes(written.notes)

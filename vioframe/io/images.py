@@ -38,9 +38,7 @@ def to_gray8(image: NDArray[Any], bit_depth: int | None, where: str) -> Image:
 
     if image.dtype == np.uint16:
         if bit_depth is None:
-            raise DatasetError(
-                f"{where} has 16-bit images; set the reader's option bit_depth to the bits in use (8-16)"
-            )
+            raise DatasetError(f"{where} has 16-bit images; say how many bits are in use, -o bit_depth=8 to 16")
         image = np.minimum(image >> (bit_depth - 8), 255).astype(np.uint8)
     if image.dtype != np.uint8:
         raise DatasetError(f"{where} has images of {image.dtype}; convert them to 8 or 16 bits")
@@ -71,7 +69,7 @@ def frame_set(
         calibrated = "x".join(map(str, resolution))
         raise DatasetError(
             f"{where} has images of {width}x{height}, but the calibration is for {calibrated}; "
-            "name the right one with the reader's option calibration"
+            "name the right one with --calibration FILE"
         )
     return FrameSet(t_ns, tuple(gray if i == place else None for i in range(len(calibration.cameras))))
 

@@ -157,8 +157,9 @@ class Registry:
             return table[name]
         if clash := next((each for each in self.clashes if (each.kind, each.name) == (kind, name)), None):
             raise PluginError(str(clash))
+        what = "reader" if kind is DATASET else kind.name
         raise PluginError(
-            f"no {kind.name} is called {name!r}{did_you_mean(name, table)}; "
+            f"no {what} is called {name!r}{did_you_mean(name, table)}; "
             f"installed: {', '.join(sorted(table)) or 'none'}{self._failure_hint()}"
         )
 

@@ -154,5 +154,5 @@ def _source_of(part: CameraPart, sources: Sequence[str]) -> str | None:
 def _no_images(camera: str, sources: Sequence[str]) -> CalibrationError:
     return CalibrationError(
         f"it is not clear which images are those of {camera}: there are {', '.join(sources)}; "
-        f"say so with the reader's option cameras, as in cameras={camera}:{sources[0]}"
+        f"say so, as in -o cameras={camera}:{sources[0]}"
     )
