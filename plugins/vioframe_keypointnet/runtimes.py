@@ -87,7 +87,10 @@ def _by_torch(weights: Weights, descriptors: bool, device: str, half: bool, thre
 
     With ``half`` the convolutions have half precision, and nothing else.
     """
-    with needs("torch", "keypointnet", user="KeypointNet by PyTorch"):
+    user = "KeypointNet by PyTorch"
+    if device == "cpu":
+        user += " (for a CPU -o runtime=openvino is enough, with vioframe[openvino],)"
+    with needs("torch", "keypointnet", user=user):
         import torch
 
         from vioframe_keypointnet.network import of_weights

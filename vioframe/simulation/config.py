@@ -18,7 +18,7 @@ from vioframe.parts.registry import FLIGHT, WORLD, Kind, Registry
 from vioframe.simulation.conditions import Conditions
 from vioframe.simulation.imu import ImuErrors
 
-MANIFEST, TRUTH, MESH = "manifest.yaml", "ground_truth.csv", "world.ply"
+MANIFEST, TRUTH, MESH = SIMULATION_FILES = "manifest.yaml", "ground_truth.csv", "world.ply"
 """Files of a simulation's folder: all settings, the exact states in EuRoC's format, and the mesh of the world in W."""
 
 

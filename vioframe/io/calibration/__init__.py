@@ -79,6 +79,10 @@ def match_cameras(
     return _rig([part for part, _ in pairs], imu), tuple(source for _, source in pairs)
 
 
+CALIBRATION_FILES = ("*/sensor.yaml",)
+"""What :func:`write_calibration` writes, as patterns."""
+
+
 def sidecar_folder(recording: Path) -> Path:
     """Where the calibration of a recording that cannot hold one is kept: ``flight.bag.calib`` beside ``flight.bag``."""
     recording = recording.absolute()
