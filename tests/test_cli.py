@@ -131,6 +131,20 @@ def test_progress_and_summary_are_left_out_by_one_word():
     assert not [name for name, text in texts.items() if "docs/" in text]
 
 
+@pytest.mark.parametrize(
+    ("words", "found"),
+    [
+        ("run --backend s", {"still", "sliding_window"}),
+        ("plugins sti", {"still"}),
+        ("simulate --flight fig", {"figure_eight"}),
+    ],
+)
+def test_the_shell_completes_the_names_of_parts(toy, words, found):
+    asked = {"COMP_WORDS": f"vioframe {words}", "COMP_CWORD": str(len(words.split()))}
+    result = CliRunner().invoke(main, env={**asked, "_VIOFRAME_COMPLETE": "bash_complete"}, prog_name="vioframe")
+    assert set(result.stdout.split()) == {f"plain,{name}" for name in found}
+
+
 def test_an_unknown_command_is_refused():
     assert "No such command 'rnu' (did you mean 'run'?)" in vioframe_("rnu", code=2).output
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from vioframe.cli import LazyGroup
-from vioframe.cli.common import Bar, compiling_shown, print_notes, quiet_option, workers_option
+from vioframe.cli.common import Bar, PartName, compiling_shown, print_notes, quiet_option, workers_option
 from vioframe.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -67,8 +67,22 @@ def _suite_command(name: str, summary: str) -> click.Command:
     @click.command(name, short_help=summary, help=_help(name))
     @click.option("--out", type=_FOLDER, metavar="RESULTS", help="Results folder.  [default: results/SUITE]")
     @click.option("--data", type=_FOLDER, multiple=True, metavar="DIR", help="Where recordings are. Repeatable.")
-    @click.option("--detector", "detectors", metavar="NAME", multiple=True, help="Only these of the suite's detectors.")
-    @click.option("--backend", "backends", metavar="NAME", multiple=True, help="Only these of its back-ends.")
+    @click.option(
+        "--detector",
+        "detectors",
+        metavar="NAME",
+        type=PartName("DETECTOR"),
+        multiple=True,
+        help="Only these of the suite's detectors.",
+    )
+    @click.option(
+        "--backend",
+        "backends",
+        metavar="NAME",
+        type=PartName("BACKEND"),
+        multiple=True,
+        help="Only these of its back-ends.",
+    )
     @click.option("--sequence", "sequences", metavar="NAME", multiple=True, help="Only these of its sequences.")
     @click.option("--seeds", type=click.IntRange(1), metavar="N", help="Repetitions.  [default: the suite's]")
     @workers_option

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from vioframe.cli.common import FILE, Bar, print_notes, quiet_option, workers_option
+from vioframe.cli.common import FILE, Bar, PartName, print_notes, quiet_option, workers_option
 from vioframe.errors import ConfigError, DatasetError
 
 if TYPE_CHECKING:
@@ -34,7 +34,12 @@ _Answer = tuple["pd.DataFrame", dict[str, Any], str]
 @click.option("--quality", is_flag=True, help="Find places again, instead of speed.")
 @click.option("--frontend", is_flag=True, help="Tracks of the front-end along DATASET, instead of speed.")
 @click.option(
-    "--detector", "detectors", metavar="NAME[:KEY=VALUE,...]", multiple=True, help="Detector.  [default: all]"
+    "--detector",
+    "detectors",
+    metavar="NAME[:KEY=VALUE,...]",
+    type=PartName("DETECTOR"),
+    multiple=True,
+    help="Detector.  [default: all]",
 )
 @click.option("-o", "--option", "options", metavar="NAME.KEY=VALUE", multiple=True, help="Set a detector's option.")
 @click.option("--images", type=FILE, metavar="DIR", help="Photographs.  [default for speed: drawn surfaces]")

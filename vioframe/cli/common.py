@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Self
 
 import click
+from click.shell_completion import CompletionItem
 from rich.console import Console
 from rich.progress import (
     BarColumn,
@@ -24,6 +26,26 @@ if TYPE_CHECKING:
     from rich.table import Table
 
 FILE = click.Path(path_type=Path)
+
+
+class PartName(click.types.StringParamType):
+    """The name of an installed part of ``kinds``, constants of :mod:`vioframe.parts.registry`, or of any; the shell
+    completes it."""
+
+    name = "name"
+
+    def __init__(self, *kinds: str) -> None:
+        self._kinds = kinds
+
+    def shell_complete(self, ctx: click.Context, param: click.Parameter, incomplete: str) -> list[CompletionItem]:
+        from vioframe.parts import registry
+
+        # What is wrong with a plug-in is for the command itself to say.
+        logging.getLogger("vioframe").addHandler(logging.NullHandler())
+        installed = registry.load()
+        asked = [getattr(registry, kind) for kind in self._kinds] or registry.KINDS
+        known = sorted({name for kind in asked for name in installed.names(kind)})
+        return [CompletionItem(name) for name in known if name.startswith(incomplete)]
 
 
 def _without_other_folders(context: click.Context, parameter: click.Parameter, paths: tuple[Path, ...]) -> list[Path]:

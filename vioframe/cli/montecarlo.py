@@ -7,7 +7,16 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from vioframe.cli.common import FILE, Bar, compiling_shown, print_notes, print_table, quiet_option, workers_option
+from vioframe.cli.common import (
+    FILE,
+    Bar,
+    PartName,
+    compiling_shown,
+    print_notes,
+    print_table,
+    quiet_option,
+    workers_option,
+)
 
 if TYPE_CHECKING:
     from vioframe.evaluation.consistency import Trial
@@ -22,6 +31,7 @@ FILES = (MARKER, "nees.csv", "*trials.png")
     "--backend",
     "backends",
     metavar="NAME[:KEY=VALUE,...]",
+    type=PartName("BACKEND"),
     multiple=True,
     default=("msckf",),
     show_default=True,
@@ -30,7 +40,7 @@ FILES = (MARKER, "nees.csv", "*trials.png")
 @click.option(
     "--flight",
     "flights",
-    metavar="NAME",
+    type=PartName("FLIGHT"),
     multiple=True,
     default=("figure_eight",),
     show_default=True,

@@ -10,7 +10,7 @@ from typing import Any
 
 import click
 
-from vioframe.cli.common import FILE, Bar, calibration_option, print_notes, quiet_option
+from vioframe.cli.common import FILE, Bar, PartName, calibration_option, print_notes, quiet_option
 from vioframe.errors import DatasetError
 from vioframe.io.convert import FORMATS, format_of
 from vioframe.io.convert import convert as write_converted
@@ -30,11 +30,16 @@ _COMPRESSIONS = sorted({name for format in FORMATS.values() for name in format.c
 @click.command("simulate")
 @click.argument("destinations", metavar="DST...", type=FILE, nargs=-1)
 @click.option("--list", "only_list", is_flag=True, help="List flights, worlds and conditions.")
-@click.option("--flight", metavar="NAME|FILE", help="Flight by name, or a trajectory file (TUM, EuRoC) to fly along.")
+@click.option(
+    "--flight",
+    metavar="NAME|FILE",
+    type=PartName("FLIGHT"),
+    help="Flight by name, or a trajectory file (TUM, EuRoC) to fly along.",
+)
 @click.option(
     "--imu", "recorded", type=FILE, metavar="SEQ", help="EuRoC sequence, or its imu0/data.csv: its real IMU, motion."
 )
-@click.option("--world", metavar="NAME", help="World to fly through.  [default: hall]")
+@click.option("--world", type=PartName("WORLD"), help="World to fly through.  [default: hall]")
 @click.option("-c", "--condition", "conditions", metavar="NAME=LEVEL", multiple=True, help="Hard condition, 0 to 1.")
 @click.option("-o", "--option", "options", metavar="KEY=VALUE", multiple=True, help="Option of flight, world or IMU.")
 @click.option("--start", "start_s", type=float, metavar="S", help="Skip the first S seconds of a file or sequence.")
@@ -147,7 +152,7 @@ def _list_simulations(installed: registry.Registry) -> None:
 )
 @click.option("-o", "--option", "options", metavar="KEY=VALUE", multiple=True, help="Set an option of the reader.")
 @calibration_option
-@click.option("--reader", metavar="NAME", help="Data-set reader, where several accept SRC.")
+@click.option("--reader", type=PartName("DATASET"), help="Data-set reader, where several accept SRC.")
 @quiet_option
 def convert(
     source: Path,

@@ -9,7 +9,7 @@ from typing import Any
 
 import click
 
-from vioframe.cli.common import FILE, Bar, calibration_option, quiet_option
+from vioframe.cli.common import FILE, Bar, PartName, calibration_option, quiet_option
 from vioframe.errors import DatasetError, TrajectoryError
 from vioframe.evaluation import evaluate
 from vioframe.geometry.trajectory import Trajectory
@@ -24,14 +24,18 @@ from vioframe.types import NS_PER_S, Step
 
 @click.command("run")
 @click.argument("data", type=FILE, required=False)
-@click.option("--detector", metavar="NAME", help="Keypoint detector.  [default: shi_tomasi]")
-@click.option("--backend", metavar="NAME", help="Estimator.  [default: msckf]")
-@click.option("--loop-closure", metavar="NAME", help="Loop closer, such as pose_graph.  [default: none]")
+@click.option("--detector", type=PartName("DETECTOR"), help="Keypoint detector.  [default: shi_tomasi]")
+@click.option("--backend", type=PartName("BACKEND"), help="Estimator.  [default: msckf]")
+@click.option(
+    "--loop-closure",
+    type=PartName("LOOP_CLOSER"),
+    help="Loop closer, such as pose_graph.  [default: none]",
+)
 @click.option("-o", "--option", "options", metavar="KEY=VALUE", multiple=True, help="Set an option of a part.")
 @click.option("--config", "file", type=FILE, help="Configuration file; the other options override it.")
 @click.option("--ground-truth", type=FILE, help="Trajectory to compare with: TUM or EuRoC csv.")
 @calibration_option
-@click.option("--reader", metavar="NAME", help="Data-set reader, where several accept DATA.")
+@click.option("--reader", type=PartName("DATASET"), help="Data-set reader, where several accept DATA.")
 @click.option("--start", "start_s", type=float, metavar="S", help="Skip the first S seconds.")
 @click.option("--duration", "duration_s", type=float, metavar="S", help="Stop after S seconds.")
 @click.option("--out", type=FILE, help="Run folder.  [default: runs/DATASET_DETECTOR_BACKEND]")

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import click
 
-from vioframe.cli.common import FILE, ground_truth_option, print_notes, print_table, runs_argument
+from vioframe.cli.common import FILE, PartName, ground_truth_option, print_notes, print_table, runs_argument
 
 
 def _alignment_option(what: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
@@ -30,6 +30,7 @@ def _alignment_option(what: str) -> Callable[[Callable[..., None]], Callable[...
     "--metric",
     "metrics",
     metavar="NAME[:KEY=VALUE,...]",
+    type=PartName("METRIC"),
     multiple=True,
     help="Measure this as well; repeatable. `vioframe plugins` lists them.",
 )

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import click
 
-from vioframe.cli.common import FILE, Bar, quiet_option
+from vioframe.cli.common import FILE, Bar, PartName, quiet_option
 from vioframe.interfaces import Trainer
 from vioframe.parts import config as configuration
 from vioframe.parts import registry
@@ -15,7 +15,7 @@ from vioframe.types import TrainingJob, TrainingStep
 
 
 @click.command("train")
-@click.argument("name")
+@click.argument("name", type=PartName("TRAINER"))
 @click.option("--images", type=FILE, multiple=True, required=True, help="Folder of photographs, or recording; repeat.")
 @click.option("--out", type=FILE, help="Folder for checkpoint, log and weights.  [default: training/NAME]")
 @click.option("--hold-out", metavar="PATTERN", multiple=True, help="Images to validate on, by name; repeat.")
