@@ -4,6 +4,8 @@ import logging
 import os
 import re
 import shutil
+import struct
+import zlib
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from itertools import count
@@ -31,6 +33,7 @@ from recordings import (
     true_trajectory,
     write_bag,
 )
+from rosbags.rosbag2.storage_mcap import zstd
 
 from vioframe.errors import CalibrationError, DatasetError
 from vioframe.incidents import Incidents
@@ -515,6 +518,66 @@ def _point() -> object:
     from rosbags.typesys import Stores, get_typestore
 
     return get_typestore(Stores.ROS1_NOETIC).types["geometry_msgs/msg/Point"](x=1.0, y=2.0, z=3.0)
+
+
+class TestBombs:
+    """A few bytes that would expand to gigabytes: refused by the size that they declare, or when a bound is passed."""
+
+    @staticmethod
+    def png_bomb(side: int = 30_000) -> bytes:
+        header = struct.pack(">IIBBBBB", side, side, 1, 0, 0, 0, 0)
+        rows = zlib.compress(bytes(side * (side // 8 + 1)))
+        chunks = ((b"IHDR", header), (b"IDAT", rows), (b"IEND", b""))
+        sealed = (struct.pack(">I", len(d)) + n + d + struct.pack(">I", zlib.crc32(n + d)) for n, d in chunks)
+        return b"\x89PNG\r\n\x1a\n" + b"".join(sealed)
+
+    @pytest.mark.parametrize("side", [9_000, 12_000, 30_000])
+    def test_an_image_in_a_folder(self, tmp_path: Path, side: int) -> None:
+        convert(measurements(), CALIBRATION, tmp_path / "flight")
+        first = min((tmp_path / "flight" / "mav0" / "cam0" / "data").iterdir())
+        first.write_bytes(self.png_bomb(side))
+        with pytest.raises(DatasetError, match=r"png says that it has more than 64 million pix") as caught:
+            list(EurocDataset(tmp_path / "flight").measurements())
+        one_line(caught)
+
+    def test_an_image_in_a_bag(self, tmp_path: Path) -> None:
+        path = bag_with(tmp_path, compressed_message("/cam0/image_raw", T0_NS, self.png_bomb(9_000)))
+        with pytest.raises(DatasetError, match=r"test.bag.*\[/cam0/image_raw\] says that it has more than 64 million"):
+            list(RosbagDataset(path).measurements())
+
+    def test_an_image_file_of_no_image_s_size(self, tmp_path: Path) -> None:
+        convert(measurements(), CALIBRATION, tmp_path / "flight")
+        first = min((tmp_path / "flight" / "mav0" / "cam0" / "data").iterdir())
+        with first.open("r+b") as file:
+            file.truncate(1 << 40)  # it has holes, and takes no place
+        unread, *_ = [m for m in EurocDataset(tmp_path / "flight").measurements() if isinstance(m, Unreadable)]
+        assert "is larger than 256 MiB" in unread.detail
+
+    @pytest.mark.parametrize(
+        ("name", "compression"), [("a.bag", "bz2"), ("a.bag", "lz4"), ("a.ros2", "zstd"), ("a.mcap", "zstd")]
+    )
+    def test_a_chunk(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, compression: str) -> None:
+        convert(measurements(), CALIBRATION, tmp_path / name, compression=compression)
+        assert_equal(RosbagDataset(tmp_path / name).measurements(), measurements())
+        monkeypatch.setattr("vioframe_rosbag._LARGEST_CHUNK", 100)
+        with pytest.raises(DatasetError, match=rf"{name}: a chunk of the recording expands to more than") as caught:
+            list(RosbagDataset(tmp_path / name).measurements())
+        one_line(caught)
+
+    def test_a_recording_compressed_as_a_whole(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        convert(measurements(), CALIBRATION, tmp_path / "a.ros2")
+        database = tmp_path / "a.ros2" / "a.ros2.db3"
+        database.with_suffix(".db3.zstd").write_bytes(zstd.compress(database.read_bytes()))
+        database.unlink()
+        metadata = tmp_path / "a.ros2" / "metadata.yaml"
+        text = metadata.read_text().replace("a.ros2.db3", "a.ros2.db3.zstd")
+        text = re.sub("compression_format: .*", "compression_format: zstd", text)
+        metadata.write_text(re.sub("compression_mode: .*", "compression_mode: file", text))
+        assert_equal(RosbagDataset(tmp_path / "a.ros2").measurements(), measurements())
+        monkeypatch.setattr("vioframe_rosbag._LARGEST_CHUNK", 0)
+        monkeypatch.setattr("vioframe_rosbag._MOST_EXPANSION", 1)
+        with pytest.raises(DatasetError, match=r"a.ros2: the compressed recording expands more than 1-fold"):
+            RosbagDataset(tmp_path / "a.ros2")
 
 
 class TestCalibrationOfABag:
