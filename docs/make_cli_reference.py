@@ -20,6 +20,9 @@ _HEAD = """\
 <!-- Written by docs/make_cli_reference.py; change the help texts in the code and run it again. -->
 
 Bad input ends with one line on stderr and exit code 2, Ctrl-C with 130; `vioframe --debug ...` shows the traceback.
+
+The shell completes commands, options and the names of parts with this line in its start-up file (or with `zsh_source`):
+`eval "$(_VIOFRAME_COMPLETE=bash_source vioframe)"`.
 """
 _PARTS = """\
 ## Options of the parts

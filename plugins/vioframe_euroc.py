@@ -23,6 +23,8 @@ from vioframe.types import FrameSet, ImuSample, Measurement, Unreadable
 if TYPE_CHECKING:
     from vioframe.geometry.trajectory import Trajectory
 
+_LARGEST_IMAGE = 1 << 28
+"""Bytes of an image file."""
 # An IMU row counts as due when one of it and the next few rows is: a single wild stamp must not hold up all the rest.
 _ROWS_AHEAD = 5
 
@@ -72,7 +74,8 @@ class EurocDataset:
         file = self._mav0 / sensor / "data.csv"
         if not file.is_file():
             there = ", ".join(sorted(file.parent.name for file in self._mav0.glob("*/data.csv")))
-            remedy = f"choose cameras and imu among: {there}" if there else "no sensor is there; copy it again"
+            choice = f"choose by -o cameras=NAME and -o imu=NAME among: {there}"
+            remedy = choice if there else "no sensor is there; copy it again"
             raise DatasetError(f"{file} is missing; {remedy}")
         return file
 
@@ -123,7 +126,9 @@ class EurocDataset:
         if not path.is_file() and path.exists():
             return Unreadable(t_ns, "frame_unreadable", f"{path.name} is no ordinary file")
         try:
-            image = decode_image(path.read_bytes())
+            if path.is_file() and path.stat().st_size > _LARGEST_IMAGE:
+                return Unreadable(t_ns, "frame_unreadable", f"{path.name} is larger than {_LARGEST_IMAGE >> 20} MiB")
+            image = decode_image(path.read_bytes(), str(path))
         except OSError as err:
             return Unreadable(t_ns, "frame_unreadable", f"{path.name}: {err.strerror}")
         if image is None:

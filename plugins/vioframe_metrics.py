@@ -57,7 +57,7 @@ class RelativeError:
         if not found:
             raise TrajectoryError(
                 f"no stretch of {min(self._lengths_m):g} m fits into the path of {errors.truth.path_length_m:.2f} m; "
-                "ask for shorter ones with the option lengths_m"
+                "ask for shorter ones: --metric relative:lengths_m=[1,2]"
             )
         return {
             f"{what}_{length:g}m_{unit}": Stats.of(values).mean

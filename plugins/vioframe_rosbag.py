@@ -10,12 +10,13 @@ The calibration is, in this order: the option ``calibration``; the folder ``<rec
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator, Mapping
+import os
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 from itertools import chain, takewhile
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,6 +39,11 @@ _log = logging.getLogger("vioframe.rosbag")
 _RAW_IMAGE = "sensor_msgs/msg/Image"
 _COMPRESSED_IMAGE = "sensor_msgs/msg/CompressedImage"
 _IMU = "sensor_msgs/msg/Imu"
+
+_LARGEST_CHUNK = 1 << 29
+"""Bytes that a chunk, or a message that is compressed alone, may expand to."""
+_MOST_EXPANSION = 100
+"""Of a file that is compressed as a whole, which may be large."""
 
 _EUROC_CAMERA_TOPICS = ("/cam0/image_raw", "/cam1/image_raw")
 _EUROC_IMU_TOPIC = "/imu0"
@@ -71,7 +77,10 @@ class RosbagDataset:
             _check_topic(path, self._imu_topic, imu_topics, "IMU")
             files = self._calibration_files(calibration, reader, topics)
             self.calibration, self._topics = match_cameras(files, topics, wanted)
-            _log.info("%s: using %s and %s", path.name, ", ".join(self._topics), self._imu_topic)
+            self._tell_choice(
+                [t for t in topics if t not in self._topics] if wanted is None else [],
+                [t for t in imu_topics if t != self._imu_topic] if imu_topic is None else [],
+            )
             for topic in self._topics:
                 if not any(isinstance(m, FrameSet) for m in self._messages(reader, topic)):
                     raise DatasetError(f"{path}: no image of {topic} can be read")
@@ -117,13 +126,22 @@ class RosbagDataset:
         with _opened(self._path) as reader:
             yield from gathered(self._messages(reader, *self._topics, self._imu_topic))
 
+    def _tell_choice(self, cameras: list[str], imus: list[str]) -> None:
+        """Which topics are read, where there are others that nobody has decided against."""
+        if others := [*cameras, *imus]:
+            hints = [f"-o cameras={topic}" for topic in cameras[:1]] + [f"-o imu_topic={topic}" for topic in imus[:1]]
+            _log.warning(
+                *("%s: %s and %s are read, %s left aside; to choose: %s", self._path.name, ", ".join(self._topics)),
+                *(self._imu_topic, ", ".join(others), " ".join(hints)),
+            )
+
     def _messages(self, reader: AnyReader, *topics: str) -> Iterator[Measurement]:
         for topic, message in self._deserialized(reader, *topics):
             yield _imu_sample(message) if topic == self._imu_topic else self._frame(topic, message)
 
     def _frame(self, topic: str, message: Any) -> FrameSet | Unreadable:
         t_ns, where = _stamp_ns(message), f"{self._path} [{topic}]"
-        image = _raw_image(message, where) if hasattr(message, "encoding") else decode_image(message.data)
+        image = _raw_image(message, where) if hasattr(message, "encoding") else decode_image(message.data, where)
         if image is None:
             return Unreadable(t_ns, "frame_unreadable", f"the image's data on {topic} are damaged or incomplete")
         return frame_set(t_ns, image, self._topics.index(topic), self.calibration, self._bit_depth, where)
@@ -142,9 +160,10 @@ class RosbagDataset:
     def _calibration_files(self, given: list[Path] | Path | None, reader: AnyReader, topics: list[str]) -> list[Path]:
         if given:
             return [given] if isinstance(given, Path) else given
-        sidecar = sidecar_folder(self._path)
-        if sidecar.is_dir():
-            return [sidecar]
+        within = (self._path.parent / "metadata.yaml").is_file()  # a file of a ROS 2 recording
+        sidecars = [sidecar_folder(path) for path in (self._path, *[self._path.parent] * within)]
+        if there := [sidecar for sidecar in sidecars if sidecar.is_dir()]:
+            return there[:1]
         as_eurocs = [topic for topic in topics if topic in _EUROC_CAMERA_TOPICS and self._imu_topic == _EUROC_IMU_TOPIC]
         _, first = next(self._deserialized(reader, *as_eurocs), (None, None))
         if hasattr(first, "height") and (first.height, first.width) == _EUROC_SHAPE:
@@ -153,7 +172,8 @@ class RosbagDataset:
             )
             return [PACKAGED / "euroc"]
         raise DatasetError(
-            f"{self._path} brings no calibration; name its files with the option calibration, or put them in {sidecar}"
+            f"{self._path} brings no calibration: --calibration FILE names one, and {sidecars[-1]} is where it is "
+            "looked for"
         )
 
 
@@ -165,6 +185,7 @@ def _opened(path: Path) -> Iterator[AnyReader]:
 
     if not path.exists():
         raise DatasetError(f"{path} does not exist")
+    _bound_decompression()
     try:
         for file in path.glob("*.db3") if path.is_dir() else [path]:
             _check_sqlite_size(file)
@@ -180,6 +201,58 @@ def _opened(path: Path) -> Iterator[AnyReader]:
         reader.close()
 
 
+def _bound_decompression() -> None:
+    """Have rosbags decompress no chunk, message or file beyond its bound: a few bytes can expand to any size.
+
+    It has no setting for that, but tables of what decompresses.
+    """
+    import bz2
+    from types import SimpleNamespace
+
+    from lz4.frame import LZ4FrameDecompressor
+    from rosbags.rosbag1 import reader as ros1
+    from rosbags.rosbag2 import reader as ros2
+    from rosbags.rosbag2 import storage_mcap as mcap
+
+    def bounded(decompressor: Callable[[], Any]) -> Callable[..., bytes]:
+        def decompress(data: bytes, _: object = None) -> bytes:
+            under_way = decompressor()
+            out: bytes = under_way.decompress(data, max_length=_LARGEST_CHUNK + 1)
+            if len(out) > _LARGEST_CHUNK:
+                raise DatasetError(f"a chunk of the recording expands to more than {_LARGEST_CHUNK >> 20} MiB")
+            if not under_way.eof:
+                raise EOFError("a compressed chunk is incomplete")
+            return out
+
+        return decompress
+
+    zstd = mcap.zstd
+
+    @contextmanager
+    def bounded_file(stream: BinaryIO, mode: str) -> Iterator[_Bounded]:
+        with zstd.open(stream, mode) as expanded:
+            yield _Bounded(expanded, _LARGEST_CHUNK + _MOST_EXPANSION * os.fstat(stream.fileno()).st_size)
+
+    by_lz4, by_zstd = bounded(LZ4FrameDecompressor), bounded(zstd.ZstdDecompressor)
+    ros1.decompressors |= {"bz2": bounded(bz2.BZ2Decompressor), "lz4": by_lz4}
+    mcap.DECOMPRESSORS |= {"lz4": by_lz4, "zstd": by_zstd}
+    ros2.zstd = SimpleNamespace(decompress=by_zstd, open=bounded_file)
+
+
+class _Bounded:
+    """A stream of which no more than ``limit`` bytes can be read."""
+
+    def __init__(self, stream: BinaryIO, limit: int) -> None:
+        self._stream, self._left = stream, limit
+
+    def read(self, count: int) -> bytes:
+        out = self._stream.read(count)
+        self._left -= len(out)
+        if self._left < 0:
+            raise DatasetError(f"the compressed recording expands more than {_MOST_EXPANSION}-fold")
+        return out
+
+
 def _check_sqlite_size(file: Path) -> None:
     """Raise EOFError for a truncated sqlite file: sqlite itself reads what is missing of the last page as zeros."""
     with file.open("rb") as stream:
@@ -192,6 +265,8 @@ def _check_sqlite_size(file: Path) -> None:
 
 
 def _damaged(path: Path, err: Exception) -> DatasetError:
+    if isinstance(err, DatasetError):
+        return err if str(path) in str(err) else DatasetError(f"{path}: {err}")
     command = {".bag": "rosbag reindex", ".mcap": "mcap recover"}.get(path.suffix, "ros2 bag reindex")
     reason = " ".join(str(err).split()).rstrip(".") or type(err).__name__
     return DatasetError(

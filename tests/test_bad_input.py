@@ -145,14 +145,14 @@ REFUSED = {
     "16-bit images": (
         bag_of(ImuSample, FrameSet, image=lambda i: i.astype(np.uint16) << 4, encoding="mono16"),
         RUN_BAD,
-        "has 16-bit images; set the reader's option bit_depth",
+        "has 16-bit images; say how many bits are in use, -o bit_depth",
     ),
     "float images": (
         bag_of(ImuSample, FrameSet, image=lambda i: i.astype(np.float32), encoding="32FC1"),
         RUN_BAD,
         "convert the images to mono8, rgb8 or bgr8",
     ),
-    "no calibration": (without_calibration, RUN_BAD, "name its files with the option calibration"),
+    "no calibration": (without_calibration, RUN_BAD, "brings no calibration: --calibration FILE names one"),
     "calibration is not yaml": (
         written("c.yaml", "camera: [1, 2\n"),
         (*RUN_GOOD, "--calibration", "c.yaml"),
@@ -185,7 +185,7 @@ REFUSED = {
         ("config", "--check", "c.yaml"),
         "unknown key 'backend.nmae' (did you mean 'name'?)",
     ),
-    "nothing left to play": (nothing, (*RUN_GOOD, "--start", "100"), "check --start and --duration"),
+    "nothing left to play": (nothing, (*RUN_GOOD, "--start", "100"), "of which --start and --duration leave none"),
     "vicon": (
         written("vicon0/data.csv", VICON),
         (*RUN_GOOD, "--ground-truth", "vicon0/data.csv"),

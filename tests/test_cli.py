@@ -122,6 +122,29 @@ def test_every_listed_command_exists_and_says_what_it_does():
         assert "Usage: " in vioframe_(name, "--help").output
 
 
+def test_progress_and_summary_are_left_out_by_one_word():
+    """By every command that shows progress, and no other; and no help text names what is not installed."""
+    commands = [[name] for name in vioframe.cli._COMMANDS] + [["bench", "euroc"], ["bench", "detectors"]]
+    texts = {" ".join(words): " ".join(vioframe_(*words, "--help").output.split()) for words in commands}
+    quiet = {name for name, text in texts.items() if "--quiet No progress bar and no summary." in text}
+    assert quiet == {"run", "simulate", "convert", "train", "montecarlo", "bench euroc", "bench detectors"}
+    assert not [name for name, text in texts.items() if "docs/" in text]
+
+
+@pytest.mark.parametrize(
+    ("words", "found"),
+    [
+        ("run --backend s", {"still", "sliding_window"}),
+        ("plugins sti", {"still"}),
+        ("simulate --flight fig", {"figure_eight"}),
+    ],
+)
+def test_the_shell_completes_the_names_of_parts(toy, words, found):
+    asked = {"COMP_WORDS": f"vioframe {words}", "COMP_CWORD": str(len(words.split()))}
+    result = CliRunner().invoke(main, env={**asked, "_VIOFRAME_COMPLETE": "bash_complete"}, prog_name="vioframe")
+    assert set(result.stdout.split()) == {f"plain,{name}" for name in found}
+
+
 def test_an_unknown_command_is_refused():
     assert "No such command 'rnu' (did you mean 'run'?)" in vioframe_("rnu", code=2).output
 
@@ -147,6 +170,51 @@ def test_a_run_from_recording_to_folder(toy):
 
 def test_quiet_says_nothing(toy):
     assert run_toy(toy, "--quiet").output == ""
+
+
+FRESH = """
+from vioframe.jit import kernel
+from vioframe.parts.hooks import hookimpl
+from toy_parts import Still
+
+@kernel
+def doubled(x):
+    return 2.0 * x
+
+class Compiled(Still):
+    def __init__(self): super().__init__(); doubled(1.0)
+
+@hookimpl
+def vioframe_backends(): return {"compiled": Compiled}
+"""
+
+
+def test_compiling_is_said_once_and_never_with_quiet(toy, tmp_path, monkeypatch):
+    import numba
+
+    install(tmp_path / "site2", monkeypatch, distribution="fresh", module="fresh_parts", code=FRESH)
+    for cache, quiet, said in (("a", [], 1), ("a", [], 0), ("b", ["--quiet"], 0)):
+        monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path / cache))
+        monkeypatch.delitem(sys.modules, "fresh_parts", raising=False)
+        result = vioframe_("run", toy, "--backend", "compiled", "--out", "run", "--overwrite", *quiet)
+        assert result.stderr.count("compiling kernels (once after installation)") == said, result.stderr
+
+
+@pytest.mark.parametrize(
+    ("played", "total"),
+    [([], 60), (["--duration", "1"], 21), (["--start", "1"], 40), (["--start", "1", "--duration", "9"], 40)],
+)
+def test_the_bar_knows_how_many_frames_a_part_of_a_recording_has(toy, played, total, monkeypatch):
+    totals = []
+
+    def told(bar, *_, total=None, **__):
+        totals.append(total)
+        bar.progress.update(bar._id, advance=1)
+
+    monkeypatch.setattr("vioframe.cli.common.Bar.__call__", told)
+    run_toy(toy, *played)
+    assert abs(totals[10] - total) <= 3
+    assert abs(totals[-1] - total) <= 1
 
 
 def test_a_run_is_repeated_from_its_own_configuration(toy):
@@ -268,18 +336,38 @@ def test_ctrl_c_completes_the_folder_and_exits_130(toy, tmp_path):
         ([], "no data given: `vioframe run DATA`"),
         (["flight.toy", "--detector", "obr"], "no detector is called 'obr' (did you mean 'orb'?)"),
         (["flight.toy", "--backend", "stil"], "no backend is called 'stil' (did you mean 'still'?)"),
-        (["flight.toy", "--reader", "tyo"], "no dataset is called 'tyo' (did you mean 'toy'?)"),
+        (["flight.toy", "--reader", "tyo"], "no reader is called 'tyo' (did you mean 'toy'?)"),
         (["flight.toy", "--backend", "still", "-o", "sped=1"], "no part has such an option (did you mean 'speed'?)"),
         (["flight.toy", "--backend", "still", "-o", "speed=fast"], "speed='fast': Input should be a valid number"),
         (["flight.toy", "--config", "none.yaml"], "cannot read the configuration none.yaml"),
-        (["flight.toy", "--start", "-1"], "command line: start_s: Input should be greater than or equal to 0"),
-        (["flight.toy", "--backend", "still", "--start", "50"], "toy has no image to process; check --start"),
+        (["flight.toy", "--start", "-1"], "error: --start: Input should be greater than or equal to 0"),
+        (["flight.toy", "--backend", "still", "--start", "50"], "its images span 3.0 s, of which --start and"),
         (["flight.toy", "--backend", "still", "--ground-truth", "none.tum"], "none.tum: no such trajectory file"),
     ],
 )
 def test_bad_input_is_one_line_and_exit_code_2(toy, arguments, why):
     assert why in error_line("run", *arguments)
     assert not Path("runs").exists()
+
+
+def test_clocks_apart_are_said_with_both_spans(toy):
+    late = PARTS.replace("yield FrameSet(10**9 +", "yield FrameSet(10**12 +")
+    Path("site/toy_parts.py").write_text("from vioframe.parts.hooks import hookimpl\n" + late)
+    line = error_line("run", toy, "--backend", "still")
+    assert "camera (1000.000 .. 1002.950 s) and IMU (1.000 .. 4.195 s) overlap nowhere" in line
+
+
+def test_cameras_left_aside_are_named(toy):
+    pair = PARTS.replace("broken_at: int = 99,", "cameras: list[str] | None = None, broken_at: int = 99,").replace(
+        "        self.broken_at,",
+        "        if not cameras:\n"
+        "            other = replace(self.calibration.cameras[0], name='cam1')\n"
+        "            self.calibration = replace(self.calibration, cameras=(*self.calibration.cameras, other))\n"
+        "        self.broken_at,",
+    )
+    Path("site/toy_parts.py").write_text("from vioframe.parts.hooks import hookimpl\n" + pair)
+    shown = run_toy(toy).stdout
+    assert "camera cam0 is used, cam1 left aside; -o cameras=cam1 takes another" in shown
 
 
 def test_plugins_lists_what_is_there_and_what_failed(toy, tmp_path, monkeypatch):
@@ -293,6 +381,18 @@ def test_plugins_lists_what_is_there_and_what_failed(toy, tmp_path, monkeypatch)
     assert failed.split()[1:3] == ["bad-parts", "1.0"]
     assert "ModuleNotFoundError: No module named 'not_there_at_all'" in failed
     assert "warning: plug-in bad_parts (bad-parts 1.0) is skipped" in result.stderr
+
+
+def test_plugins_shows_both_of_a_name_and_says_so(toy, tmp_path, monkeypatch):
+    code = "class Mine:\n  def detect(self, image, n): ...\n@hookimpl\ndef vioframe_detectors(): return {'orb': Mine}"
+    install(tmp_path / "thief", monkeypatch, distribution="thief", module="thief_parts", code=code)
+    monkeypatch.setenv("COLUMNS", "200")
+    result = vioframe_("plugins")
+    assert "detector     orb@thief" in result.stdout
+    assert "detector     orb@vioframe" in result.stdout
+    assert "note: several plug-ins provide a detector called 'orb'; say orb@vioframe or orb@thief" in result.stderr
+    assert "(thief 1.0)" in vioframe_("plugins", "orb").stdout
+    assert "say orb@vioframe or orb@thief" in error_line("run", toy, "--backend", "still", "--detector", "orb")
 
 
 def test_plugins_shows_the_options_of_one(monkeypatch):

@@ -1,8 +1,10 @@
 """Where compiled kernels are kept."""
 
+import runpy
 import tempfile
 from pathlib import Path
 
+import numba
 import pytest
 
 from vioframe import jit
@@ -46,3 +48,23 @@ def test_a_cache_that_others_could_fill_is_not_used(no_home, tmp_path, prepared)
     assert folder.stat().st_mode & 0o077 == 0
     assert jit._folder("") == folder
     assert Path(folder).is_dir()
+
+
+FRESH = """
+from vioframe.jit import kernel
+
+@kernel
+def doubled(x):
+    return 2.0 * x
+"""
+
+
+def test_what_is_compiled_is_told_and_what_comes_from_the_cache_is_not(monkeypatch, tmp_path):
+    monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path / "kernels"))
+    (tmp_path / "fresh.py").write_text(FRESH)
+    told: list[str] = []
+    for _ in range(2):
+        module = runpy.run_path(str(tmp_path / "fresh.py"))
+        with jit.heard(told.append):
+            assert module["doubled"](2.0) == 4.0
+    assert told == ["doubled"]

@@ -4,6 +4,8 @@ import logging
 import os
 import re
 import shutil
+import struct
+import zlib
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from itertools import count
@@ -31,6 +33,7 @@ from recordings import (
     true_trajectory,
     write_bag,
 )
+from rosbags.rosbag2.storage_mcap import zstd
 
 from vioframe.errors import CalibrationError, DatasetError
 from vioframe.incidents import Incidents
@@ -181,7 +184,7 @@ class TestAsl:
         deep = np.random.default_rng(1).integers(0, 4096, (HEIGHT, WIDTH), dtype=np.uint16)
         for image in (asl / "mav0" / "cam0" / "data").iterdir():
             cv2.imwrite(str(image), deep)
-        with pytest.raises(DatasetError, match=r"cam0 has 16-bit images; set the reader's option bit_depth"):
+        with pytest.raises(DatasetError, match=r"cam0 has 16-bit images; say how many bits are in use, -o bit_depth"):
             frames_of(EurocDataset(asl))
         for frame in frames_of(EurocDataset(asl, bit_depth=12)):
             np.testing.assert_array_equal(image_of(frame), deep // 16)
@@ -228,7 +231,7 @@ class TestAsl:
         assert not EurocDataset.accepts(tmp_path / "empty")
         with pytest.raises(DatasetError, match=r"empty holds no mav0/; name the folder of one sequence"):
             EurocDataset(tmp_path / "empty")
-        with pytest.raises(DatasetError, match=r"cam1/data.csv is missing; choose cameras and imu among: cam0, imu0"):
+        with pytest.raises(DatasetError, match=r"cam1/data.csv is missing; choose by -o .* among: cam0, imu0"):
             EurocDataset(asl, cameras="cam1")
         mav0 = asl / "mav0"
         (mav0 / "imu0" / "sensor.yaml").rename(mav0 / "imu0" / "sensor.txt")
@@ -247,7 +250,7 @@ class TestAsl:
         with pytest.raises(DatasetError, match=r"'1.4e18,a.png' does not begin with a stamp in integer nanoseconds"):
             EurocDataset(asl)
         (mav0 / "imu0" / "data.csv").unlink()
-        with pytest.raises(DatasetError, match=r"imu0/data.csv is missing; choose cameras and imu among: cam0"):
+        with pytest.raises(DatasetError, match=r"imu0/data.csv is missing; choose by -o .* among: cam0"):
             EurocDataset(asl)
 
 
@@ -433,7 +436,9 @@ class TestRosbag:
     def test_16_bit_images_need_their_depth(self, tmp_path: Path) -> None:
         deep = np.random.default_rng(5).integers(0, 4096, (HEIGHT, WIDTH), dtype=np.uint16)
         path = bag_with(tmp_path, image_message("/cam0/image_raw", T0_NS, deep, "mono16", padding=6))
-        with pytest.raises(DatasetError, match=r"image_raw\] has 16-bit images; set the reader's option bit_depth"):
+        with pytest.raises(
+            DatasetError, match=r"image_raw\] has 16-bit images; say how many bits are in use, -o bit_depth"
+        ):
             RosbagDataset(path)
         np.testing.assert_array_equal(image_of(frames_of(RosbagDataset(path, bit_depth=12))[0]), deep // 16)
 
@@ -515,6 +520,66 @@ def _point() -> object:
     return get_typestore(Stores.ROS1_NOETIC).types["geometry_msgs/msg/Point"](x=1.0, y=2.0, z=3.0)
 
 
+class TestBombs:
+    """A few bytes that would expand to gigabytes: refused by the size that they declare, or when a bound is passed."""
+
+    @staticmethod
+    def png_bomb(side: int = 30_000) -> bytes:
+        header = struct.pack(">IIBBBBB", side, side, 1, 0, 0, 0, 0)
+        rows = zlib.compress(bytes(side * (side // 8 + 1)))
+        chunks = ((b"IHDR", header), (b"IDAT", rows), (b"IEND", b""))
+        sealed = (struct.pack(">I", len(d)) + n + d + struct.pack(">I", zlib.crc32(n + d)) for n, d in chunks)
+        return b"\x89PNG\r\n\x1a\n" + b"".join(sealed)
+
+    @pytest.mark.parametrize("side", [9_000, 12_000, 30_000])
+    def test_an_image_in_a_folder(self, tmp_path: Path, side: int) -> None:
+        convert(measurements(), CALIBRATION, tmp_path / "flight")
+        first = min((tmp_path / "flight" / "mav0" / "cam0" / "data").iterdir())
+        first.write_bytes(self.png_bomb(side))
+        with pytest.raises(DatasetError, match=r"png says that it has more than 64 million pix") as caught:
+            list(EurocDataset(tmp_path / "flight").measurements())
+        one_line(caught)
+
+    def test_an_image_in_a_bag(self, tmp_path: Path) -> None:
+        path = bag_with(tmp_path, compressed_message("/cam0/image_raw", T0_NS, self.png_bomb(9_000)))
+        with pytest.raises(DatasetError, match=r"test.bag.*\[/cam0/image_raw\] says that it has more than 64 million"):
+            list(RosbagDataset(path).measurements())
+
+    def test_an_image_file_of_no_image_s_size(self, tmp_path: Path) -> None:
+        convert(measurements(), CALIBRATION, tmp_path / "flight")
+        first = min((tmp_path / "flight" / "mav0" / "cam0" / "data").iterdir())
+        with first.open("r+b") as file:
+            file.truncate(1 << 40)  # it has holes, and takes no place
+        unread, *_ = [m for m in EurocDataset(tmp_path / "flight").measurements() if isinstance(m, Unreadable)]
+        assert "is larger than 256 MiB" in unread.detail
+
+    @pytest.mark.parametrize(
+        ("name", "compression"), [("a.bag", "bz2"), ("a.bag", "lz4"), ("a.ros2", "zstd"), ("a.mcap", "zstd")]
+    )
+    def test_a_chunk(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, compression: str) -> None:
+        convert(measurements(), CALIBRATION, tmp_path / name, compression=compression)
+        assert_equal(RosbagDataset(tmp_path / name).measurements(), measurements())
+        monkeypatch.setattr("vioframe_rosbag._LARGEST_CHUNK", 100)
+        with pytest.raises(DatasetError, match=rf"{name}: a chunk of the recording expands to more than") as caught:
+            list(RosbagDataset(tmp_path / name).measurements())
+        one_line(caught)
+
+    def test_a_recording_compressed_as_a_whole(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        convert(measurements(), CALIBRATION, tmp_path / "a.ros2")
+        database = tmp_path / "a.ros2" / "a.ros2.db3"
+        database.with_suffix(".db3.zstd").write_bytes(zstd.compress(database.read_bytes()))
+        database.unlink()
+        metadata = tmp_path / "a.ros2" / "metadata.yaml"
+        text = metadata.read_text().replace("a.ros2.db3", "a.ros2.db3.zstd")
+        text = re.sub("compression_format: .*", "compression_format: zstd", text)
+        metadata.write_text(re.sub("compression_mode: .*", "compression_mode: file", text))
+        assert_equal(RosbagDataset(tmp_path / "a.ros2").measurements(), measurements())
+        monkeypatch.setattr("vioframe_rosbag._LARGEST_CHUNK", 0)
+        monkeypatch.setattr("vioframe_rosbag._MOST_EXPANSION", 1)
+        with pytest.raises(DatasetError, match=r"a.ros2: the compressed recording expands more than 1-fold"):
+            RosbagDataset(tmp_path / "a.ros2")
+
+
 class TestCalibrationOfABag:
     def euroc_like(self, folder: Path, topic: str = "/cam0/image_raw", width: int = 752) -> Path:
         image = image_message(topic, T0_NS, np.zeros((480, width), np.uint8), "mono8")
@@ -530,11 +595,27 @@ class TestCalibrationOfABag:
         assert (record.name, record.levelno) == ("vioframe.rosbag", logging.WARNING)
         assert "using EuRoC's published calibration" in record.getMessage()
 
+    def test_topics_left_aside_are_named(self, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+        images = [image_message(topic, T0_NS, IMAGE, "mono8") for topic in ("/cam0/image_raw", "/thermal/image")]
+        other_imu = imu_message("/imu1", ImuSample(T0_NS, np.ones(3), np.ones(3)))
+        path = bag_with(tmp_path, *images, other_imu)
+        RosbagDataset(path, cameras="cam0", imu_topic="/imu0")
+        assert not caplog.records
+        RosbagDataset(path)
+        assert [record.getMessage() for record in caplog.records] == [
+            "test.bag: /cam0/image_raw and /imu0 are read, /thermal/image, /imu1 left aside; to choose: "
+            "-o cameras=/thermal/image -o imu_topic=/imu1"
+        ]
+
+    def test_a_bare_sqlite_file_has_the_calibration_beside_its_folder(self, tmp_path: Path) -> None:
+        convert(measurements(), CALIBRATION, tmp_path / "flight.ros2")
+        assert_same_rig(RosbagDataset(tmp_path / "flight.ros2" / "flight.ros2.db3").calibration, CALIBRATION)
+
     def test_any_other_bag_needs_one(self, tmp_path: Path) -> None:
         for options in ({"topic": "/camera/image_raw"}, {"width": 640}):
             path = self.euroc_like(tmp_path, **options)
             with pytest.raises(
-                DatasetError, match=r"brings no calibration; name its files .* or put them in"
+                DatasetError, match=r"brings no calibration: --calibration FILE names one, .* is where it is looked for"
             ) as caught:
                 RosbagDataset(path)
             one_line(caught)

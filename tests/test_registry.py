@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from dataclasses import dataclass
+from importlib.metadata import EntryPoint
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -97,6 +98,17 @@ def test_a_third_party_part_is_found_and_created_with_coerced_options(add):
         ("not_callable", "@hookimpl\ndef vioframe_backends(): return {'x': 3}", "must map names to callables"),
         ("no_accepts", "@hookimpl\ndef vioframe_datasets(): return {'x': dict}", "'x' has no accepts(path)"),
         ("no_signature", "@hookimpl\ndef vioframe_detectors(): return {'x': dict}", "ValueError: no signature found"),
+        ("a_list", "@hookimpl\ndef vioframe_detectors(): return ['x']", "vioframe_detectors() must return a dict"),
+        (
+            "no_given",
+            "@hookimpl\ndef vioframe_loop_closers(): return {'x': lambda *, loops=3: 0}",
+            "the loop closer 'x' must take the calibration ahead of its options",
+        ),
+        (
+            "old_style",
+            "@hookimpl\ndef vioframe_backends(): return {'x': lambda calibration, loops=3: 0}",
+            "the backend 'x' asks for a calibration, which comes with begin(start)",
+        ),
         ("wrong_arguments", "@hookimpl\ndef vioframe_backends(a): return {}", "PluginValidationError"),
     ],
 )
@@ -118,10 +130,21 @@ def test_a_broken_plugin_does_not_trip_the_next(add):
     assert "b_fine" in loaded.names(registry.DETECTOR)
 
 
-def test_a_name_taken_twice_names_both_distributions(add):
+def test_a_name_taken_twice_is_an_error_only_where_it_is_used(add):
     add("thief", detector('"orb": Blank'), version="0.3")
-    with pytest.raises(PluginError, match=r"'orb': orb of vioframe \d.* and thief of thief 0\.3; uninstall"):
-        registry.load()
+    loaded = registry.load()
+    assert loaded.create_detector("sift")
+    with pytest.raises(PluginError, match=r"several .* detector called 'orb'; say orb@vioframe or orb@thief"):
+        loaded.create_detector("orb")
+    assert loaded.create_detector("orb@thief", {"size": 5}).size == 5
+    assert {"orb@thief", "orb@vioframe"} <= set(loaded.names(registry.DETECTOR))
+
+
+def test_a_name_taken_twice_within_a_distribution_is_told_by_the_entry_points(add):
+    for module in ("first_half", "second_half"):
+        add(module, detector('"blank": Blank'))
+    loaded = registry.load([EntryPoint(module, module, "vioframe") for module in ("first_half", "second_half")])
+    assert loaded.names(registry.DETECTOR) == ["blank@first_half", "blank@second_half"]
 
 
 def test_the_same_name_may_serve_two_kinds(add):
@@ -210,6 +233,7 @@ def test_two_readers_for_one_path_ask_for_a_choice(add, tmp_path):
 def test_a_reader_that_fails_to_look_is_passed_over(add, tmp_path, caplog):
     code = """
     class Clumsy:
+        def __init__(self, path): ...
         accepts = staticmethod(lambda path: 1 / 0)
     @hookimpl
     def vioframe_datasets(): return {"clumsy": Clumsy}

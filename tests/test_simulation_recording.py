@@ -1,6 +1,7 @@
 """Simulated recordings: the conditions do what they say, files hold what was simulated, and failure leaves nothing."""
 
 import errno
+import sqlite3
 import subprocess
 import sys
 from dataclasses import replace
@@ -17,7 +18,7 @@ from vioframe.errors import ConfigError, DatasetError, TrajectoryError
 from vioframe.geometry import so3
 from vioframe.io.calibration import sidecar_folder, write_calibration
 from vioframe.io.trajectories import load_trajectory, true_values
-from vioframe.io.writers import TRUE_VECTOR_TOPICS, Ros1Writer
+from vioframe.io.writers import TRUE_VECTOR_TOPICS, AslWriter, McapWriter, Ros1Writer, Ros2Writer
 from vioframe.simulation.conditions import CONDITIONS, Conditions
 from vioframe.simulation.config import MANIFEST, MESH, TRUTH, simulation_folder
 from vioframe.simulation.record import record
@@ -361,18 +362,30 @@ def test_destinations_are_checked_before_anything_is_rendered(tmp_path, small):
     assert "cannot be compressed by bz2" in simulate(tmp_path / "a.mcap", "--compression", "bz2").output
 
 
-def test_a_full_disk_leaves_no_half_written_bag(tmp_path, small, monkeypatch):
+@pytest.mark.parametrize(
+    ("name", "writer", "problem"),
+    [
+        ("a", AslWriter, OSError(errno.ENOSPC, "No space left on device")),
+        ("a.bag", Ros1Writer, OSError(errno.ENOSPC, "No space left on device")),
+        ("a.ros2", Ros2Writer, sqlite3.OperationalError("database or disk is full")),
+        ("a.mcap", McapWriter, OSError(errno.ENOSPC, "No space left on device")),
+    ],
+)
+def test_a_full_disk_leaves_no_half_written_recording(tmp_path, small, monkeypatch, name, writer, problem):
     written = []
 
     def write_frame(self, frame):
         written.append(frame)
         if len(written) > 2:
-            raise OSError(errno.ENOSPC, "No space left on device")
+            raise problem
 
-    monkeypatch.setattr(Ros1Writer, "write_frame", write_frame)
-    done = simulate(tmp_path / "a.bag", "--calibration", small, "--duration", 1, "--workers", 1)
+    monkeypatch.setattr(writer, "write_frame", write_frame)
+    done = simulate(tmp_path / name, "--calibration", small, "--duration", 1, "--workers", 1, "--quiet")
     assert done.exit_code == 2
-    assert "No space left on device" in done.output
+    reason = getattr(problem, "strerror", None) or problem
+    assert done.output == (
+        f"vioframe: error: cannot write {tmp_path / name}: {reason}; check permissions and free space\n"
+    )
     assert [path.name for path in tmp_path.iterdir()] == ["small"]
 
 
@@ -390,6 +403,20 @@ def test_a_simulated_recording_is_replaced_only_by_a_complete_one(tmp_path, smal
     assert simulate(*settings, "--seed", 1, "--overwrite").exit_code == 0
     assert (tmp_path / "a.bag").read_bytes() != first
     assert sidecar_folder(tmp_path / "a.bag").is_dir()
+
+
+@pytest.mark.parametrize("name", ["a", "a.ros2"])
+def test_what_others_put_into_a_recording_stays(tmp_path, small, name):
+    settings = [tmp_path / name, "--calibration", small, "--duration", 0.3, "--workers", 1, "--quiet"]
+    assert simulate(*settings).exit_code == 0
+    first = {path.relative_to(tmp_path) for path in tmp_path.rglob("*")}
+    theirs = [tmp_path / name / "notes.txt", simulation_folder(tmp_path / name) / "notes.txt"]
+    for path in theirs:
+        path.write_text("precious")
+    assert simulate(*settings, "--overwrite", "--rate", 10).exit_code == 0
+    assert [path.read_text() for path in theirs] == ["precious"] * 2
+    second = {path.relative_to(tmp_path) for path in tmp_path.rglob("*") if path not in theirs}
+    assert second < first if name == "a" else second == first  # images of the other rate are gone
 
 
 def test_errors_of_the_library_have_their_types(tmp_path):

@@ -63,6 +63,10 @@ class TestFiles:
         ("text", "complaint"),
         [
             (TOY + "seed: 3\n", "unknown key 'seed' (did you mean 'seeds'?)"),
+            (
+                TOY.replace("sequences:", "sequences: [{name: a, flight: b}] #"),
+                "unknown key 'sequences.0.flight'; keys here: name, start_s, duration_s",
+            ),
             (TOY + "conditions: {fgo: [0.5]}\n", "did you mean 'fog'"),
             (TOY + "conditions: {fog: [0.0]}\n", "greater than 0"),
             (TOY + "clear: false\n", "nothing to fly"),

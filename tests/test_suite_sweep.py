@@ -125,10 +125,16 @@ class TestSweep:
         assert run(tmp_path, GRID, toy)[0].done == 1
 
     def test_another_suite_does_not_get_the_folder(self, tmp_path, toy):
-        run(tmp_path, GRID, toy)
+        path = run(tmp_path, GRID, toy)[2]
         with pytest.raises(RunError, match="another suite's results, which differs in frontend"):
             run(tmp_path, GRID + "frontend: {max_points: 50}\n", toy)
+        theirs = [path / "notes.txt", next((path / "runs").iterdir()) / "notes.txt"]
+        for note in theirs:
+            note.write_text("precious")
+        stale = set(path.rglob("*.tum"))
         assert run(tmp_path, GRID + "frontend: {max_points: 50}\n", toy, overwrite=True)[0].done == 4
+        assert [note.read_text() for note in theirs] == ["precious"] * 2
+        assert set(path.rglob("*.tum")) == stale
         (tmp_path / "mine").mkdir()
         (tmp_path / "mine" / "thesis.tex").touch()
         with pytest.raises(RunError, match="is no results folder"):

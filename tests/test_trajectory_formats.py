@@ -164,7 +164,7 @@ def test_files_that_are_no_trajectories(tmp_path):
         (tmp_path / "missing.tum", "no such trajectory file"),
         (truncated, "cannot be read"),
         (binary, "not a text file"),
-        (tmp_path, "cannot be read"),
+        (tmp_path, "a folder without"),
     ]:
         with pytest.raises(TrajectoryError, match=message):
             load_trajectory(path)
@@ -187,3 +187,19 @@ def test_the_first_pose_of_a_euroc_file(shared_data):
     assert found.t_ns[0] == 1403638519492829440
     np.testing.assert_array_equal(found.p_WB[0], [4.460675, -1.680515, 0.579614])
     np.testing.assert_allclose(found.quat_xyzw[0], [-0.757610, -0.348629, -0.497711, 0.238261], atol=1e-6)
+
+
+@pytest.mark.parametrize("inside", ["mav0/state_groundtruth_estimate0/data.csv", "ground_truth.tum"])
+def test_the_truth_is_found_in_its_folder(tmp_path, inside):
+    file = tmp_path / "sequence" / inside
+    file.parent.mkdir(parents=True)
+    truth = Trajectory(np.array([1, 2]), np.array([np.eye(3)] * 2), np.zeros((2, 3)))
+    (write_euroc if file.suffix == ".csv" else write_tum)(truth, file)
+    for folder in {tmp_path / "sequence", file.parent}:
+        np.testing.assert_array_equal(load_trajectory(folder).t_ns, [1, 2])
+
+
+def test_a_folder_without_truth_is_refused_with_what_it_holds(tmp_path):
+    (tmp_path / "mine.tum").touch()
+    with pytest.raises(TrajectoryError, match=r"a folder without .* or ground_truth.tum; name one of its files: mine"):
+        load_trajectory(tmp_path)

@@ -11,14 +11,15 @@ import hashlib
 import os
 import stat
 import tempfile
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from functools import cache
 from getpass import getuser
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import numba
+from numba.core import event
 
 FunctionT = TypeVar("FunctionT", bound=Callable[..., object])
 
@@ -39,6 +40,26 @@ def kernel(function: FunctionT) -> FunctionT:
         return cast(FunctionT, numba.njit(cache=True, error_model="numpy")(function))
     finally:
         settings.CACHE_DIR = before
+
+
+@contextmanager
+def heard(tell: Callable[[str], None]) -> Iterator[None]:
+    """Within it ``tell`` is called with the name of each kernel that has to be compiled: none, once all are cached."""
+    with event.install_listener("numba:compile", _Listener(tell)):
+        yield
+
+
+class _Listener(event.Listener):
+    def __init__(self, tell: Callable[[str], None]) -> None:
+        self._tell = tell
+
+    def on_start(self, begun: Any) -> None:
+        function = begun.data["dispatcher"].py_func
+        if not function.__module__.startswith("numba."):  # what a kernel calls of numba's own
+            self._tell(function.__name__)
+
+    def on_end(self, begun: Any) -> None:
+        """What is compiled is of use at once."""
 
 
 def _folder(chosen: str) -> Path:

@@ -12,6 +12,8 @@ from pathlib import Path
 from time import perf_counter
 from typing import Any
 
+import numpy as np
+
 from vioframe.errors import DatasetError, RunError
 from vioframe.geometry.trajectory import Trajectory
 from vioframe.incidents import Incidents
@@ -25,7 +27,7 @@ from vioframe.parts.config import Config
 from vioframe.parts.registry import BACKEND, DATASET, DETECTOR, LOOP_CLOSER, Registry
 from vioframe.runs import machine
 from vioframe.runs.recorder import Recorder, new_run_folder, write_json
-from vioframe.types import LoopClosure, Step
+from vioframe.types import NS_PER_S, FrameSet, ImuSample, LoopClosure, Step, Unreadable
 
 
 def run(
@@ -48,6 +50,8 @@ class Experiment:
     odometry: Odometry
     ground_truth: Trajectory | None
     loop_closer: LoopCloser | None = None
+    left_aside: tuple[str, ...] = ()
+    """Cameras of the rig that are not used."""
 
     @property
     def name(self) -> str:
@@ -84,7 +88,7 @@ def prepare(config: Config, registry: Registry) -> Experiment:
     config = configuration.complete(config, registry)
     if config.dataset.path is None:
         raise DatasetError("no data set given; name a bag or folder, or set dataset.path in the configuration")
-    dataset, options = _one_camera(registry, config)
+    dataset, options, left_aside = _one_camera(registry, config)
     config = config.model_copy(update={"dataset": config.dataset.model_copy(update={"options": options})})
     odometry = Odometry(
         dataset.calibration,
@@ -106,19 +110,23 @@ def prepare(config: Config, registry: Registry) -> Experiment:
         None
         if config.loop_closure is None
         else registry.create_loop_closer(config.loop_closure.name, dataset.calibration, config.loop_closure.options),
+        left_aside,
     )
 
 
-def _one_camera(registry: Registry, config: Config) -> tuple[Dataset, dict[str, Any]]:
-    """The data set, of a rig its first camera where nothing is said: front-end and back-ends take one for now."""
+def _one_camera(registry: Registry, config: Config) -> tuple[Dataset, dict[str, Any], tuple[str, ...]]:
+    """The data set, of a rig its first camera where nothing is said: front-end and back-ends take one for now.
+
+    With its options, and the names of the cameras that are left aside.
+    """
     path, reader, options = config.dataset.path, config.dataset.reader, dict(config.dataset.options)
     assert path is not None
     dataset = registry.open_dataset(path, reader, options)
     cameras = dataset.calibration.cameras
     if len(cameras) > 1 and "cameras" in options and options["cameras"] is None:
         options["cameras"] = [cameras[0].name]
-        dataset = registry.open_dataset(path, reader, options)
-    return dataset, options
+        return registry.open_dataset(path, reader, options), options, tuple(camera.name for camera in cameras[1:])
+    return dataset, options, ()
 
 
 def record(
@@ -137,12 +145,33 @@ def record(
     steps = experiment.steps()
     first = next(steps, None)
     if first is None:
-        raise DatasetError(f"{experiment.dataset.name} has no image to process; check --start and --duration")
+        raise DatasetError(f"{experiment.dataset.name} has no image to process: {_why_none(experiment)}")
     new_run_folder(folder, overwrite=overwrite)
     try:
         return _write(experiment, folder, chain([first], steps), begin_s, on_step)
     except OSError as error:
         raise RunError(f"cannot write to {folder}: {error.strerror}; is the disk full?") from error
+
+
+def _why_none(experiment: Experiment) -> str:
+    """Why not one frame got as far as the estimator, told by the stamps."""
+    stamps: dict[type, list[int]] = {FrameSet: [], ImuSample: [], Unreadable: []}
+    for measurement in experiment.dataset.measurements():
+        stamps[type(measurement)].append(measurement.t_ns)
+    frames_ns, imu_ns = np.array(stamps[FrameSet], np.int64), np.array(stamps[ImuSample], np.int64)
+    if not len(frames_ns) or not len(imu_ns):
+        what = "no IMU sample" if len(frames_ns) else "no image"
+        return f"{what} can be read; look at its files, or copy it again"
+    frames_ns += experiment.dataset.calibration.cameras[0].time_offset_ns
+    if frames_ns.max() < imu_ns.min() or imu_ns.max() < frames_ns.min():
+        spans = (f"{t_ns.min() / NS_PER_S:.3f} .. {t_ns.max() / NS_PER_S:.3f} s" for t_ns in (frames_ns, imu_ns))
+        camera, imu = spans
+        return (
+            f"the times of camera ({camera}) and IMU ({imu}) overlap nowhere; put both on one clock, or state the "
+            "camera's time offset in the calibration"
+        )
+    length_s = (frames_ns.max() - frames_ns.min()) / NS_PER_S
+    return f"its images span {length_s:.1f} s, of which --start and --duration leave none that the IMU covers"
 
 
 def _write(

@@ -191,7 +191,8 @@ class Calibration:
         """The only camera; raises :class:`ConfigError` naming ``user``, who takes one, where there are more."""
         if len(self.cameras) > 1:
             names = ", ".join(camera.name for camera in self.cameras)
-            raise ConfigError(f"{user} takes one camera for now, the calibration has {names}; choose one of them")
+            choice = f"choose one, as by -o cameras={self.cameras[0].name}"
+            raise ConfigError(f"{user} takes one camera for now, the calibration has {names}; {choice}")
         return self.cameras[0]
 
     def with_camera(self, index: int, **changes: Any) -> Calibration:

@@ -87,12 +87,15 @@ def _by_torch(weights: Weights, descriptors: bool, device: str, half: bool, thre
 
     With ``half`` the convolutions have half precision, and nothing else.
     """
-    with needs("torch", "keypointnet", user="KeypointNet by PyTorch"):
+    user = "KeypointNet by PyTorch"
+    if device == "cpu":
+        user += " (for a CPU -o runtime=openvino is enough, with vioframe[openvino],)"
+    with needs("torch", "keypointnet", user=user):
         import torch
 
         from vioframe_keypointnet.network import of_weights
     if device == "cuda" and not torch.cuda.is_available():
-        raise ConfigError("torch finds no CUDA device; leave the option runtime out, or install torch with CUDA")
+        raise ConfigError("torch finds no CUDA device; leave -o runtime out, or install torch with CUDA")
     if threads:
         torch.set_num_threads(threads)
     network = of_weights(weights).to(device)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import logging
+import re
 from collections.abc import Mapping
 from importlib import import_module
 from typing import Any
@@ -83,7 +84,7 @@ class _Main(LazyGroup):
         except VioframeError as error:
             if ctx.params["debug"]:
                 raise
-            _say(f"error: {error}", error)
+            _say(f"error: {self._in_options(ctx, str(error))}", error)
             ctx.exit(EXIT_BAD_INPUT)
         except OSError as error:
             # A reader that closed its end of the pipe, as `head` does, has all it wants: click ends quietly.
@@ -95,6 +96,16 @@ class _Main(LazyGroup):
         except KeyboardInterrupt as error:
             _say("interrupted", error)
             ctx.exit(EXIT_INTERRUPTED)
+
+    def _in_options(self, ctx: click.Context, message: str) -> str:
+        """A key of the configuration that an option has set is called by the option: ``start_s`` by ``--start``."""
+        command = self.get_command(ctx, ctx.invoked_subcommand or "")
+        set_by = {each.name: each.opts[-1] for each in command.params} if command else {}
+
+        def option(match: re.Match[str]) -> str:
+            return set_by.get(match[1], match[0].removesuffix(":")) + ":"
+
+        return re.sub(r"^command line: (?:\w+\.)*(\w+):", option, message).replace("command line: --", "--", 1)
 
 
 def _say(text: str, error: BaseException) -> None:

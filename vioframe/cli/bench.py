@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from vioframe.cli import LazyGroup
-from vioframe.cli.common import Bar, print_notes, quiet_option, workers_option
+from vioframe.cli.common import Bar, PartName, compiling_shown, print_notes, quiet_option, workers_option
 from vioframe.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -42,7 +42,7 @@ class _Suites(LazyGroup):
         if args and not args[0].startswith("-") and self.get_command(ctx, args[0]) is None:
             from vioframe.bench.suites.suite import find
 
-            find(args[0])
+            find(args[0], _COMMANDS)
         return super().resolve_command(ctx, args)
 
 
@@ -51,7 +51,7 @@ def bench() -> None:
     """Compare parts with one another: by a question to detectors, or by a suite.
 
     A suite is a YAML file of detectors, back-ends, sequences, conditions and seeds; `vioframe bench my_suite.yaml` runs
-    one of your own. docs/bench.md says what is in it.
+    one of your own.
     """
 
 
@@ -67,8 +67,22 @@ def _suite_command(name: str, summary: str) -> click.Command:
     @click.command(name, short_help=summary, help=_help(name))
     @click.option("--out", type=_FOLDER, metavar="RESULTS", help="Results folder.  [default: results/SUITE]")
     @click.option("--data", type=_FOLDER, multiple=True, metavar="DIR", help="Where recordings are. Repeatable.")
-    @click.option("--detector", "detectors", metavar="NAME", multiple=True, help="Only these of the suite's detectors.")
-    @click.option("--backend", "backends", metavar="NAME", multiple=True, help="Only these of its back-ends.")
+    @click.option(
+        "--detector",
+        "detectors",
+        metavar="NAME",
+        type=PartName("DETECTOR"),
+        multiple=True,
+        help="Only these of the suite's detectors.",
+    )
+    @click.option(
+        "--backend",
+        "backends",
+        metavar="NAME",
+        type=PartName("BACKEND"),
+        multiple=True,
+        help="Only these of its back-ends.",
+    )
     @click.option("--sequence", "sequences", metavar="NAME", multiple=True, help="Only these of its sequences.")
     @click.option("--seeds", type=click.IntRange(1), metavar="N", help="Repetitions.  [default: the suite's]")
     @workers_option
@@ -98,7 +112,8 @@ def _suite_command(name: str, summary: str) -> click.Command:
         given = {"data": data, "scheduler": scheduler, "workers": workers, "recordings": recordings}
         _check_used(whole, **given, seeds=narrowing["seeds"])
         suite = suites.narrowed(whole, **narrowing)
-        tasks = plan(suite, data, registry.load())
+        with compiling_shown(quiet=quiet):
+            tasks = plan(suite, data, registry.load())
         store = Store.at(out or Path("results") / suite.name, recordings)
         store.begin(suite, overwrite=overwrite)
         with store.alone():
@@ -115,13 +130,14 @@ def _suite_command(name: str, summary: str) -> click.Command:
 
                 sweep.run(workers=workers or suite.workers, scheduler=scheduler, on_progress=on_progress)
         failures = f", {len(sweep.failed)} failed" if sweep.failed else ""
-        click.echo(f"{sweep.done} tasks done{reused}{failures}; results in {store.path}")
+        if not quiet:
+            click.echo(f"{sweep.done} tasks done{reused}{failures}; results in {store.path}")
         for key, error in sweep.failed.items():
             click.echo(f"failed: {key}: {error}", err=True)
         if not no_report:
             from vioframe.cli.show import write_and_say
 
-            write_and_say(store.path)
+            write_and_say(store.path, quiet=quiet)
         if sweep.failed:
             click.get_current_context().exit(EXIT_FAILED)
 

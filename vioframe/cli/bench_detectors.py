@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from vioframe.cli.common import FILE, Bar, print_notes, quiet_option, workers_option
+from vioframe.cli.common import FILE, Bar, PartName, print_notes, quiet_option, workers_option
 from vioframe.errors import ConfigError, DatasetError
 
 if TYPE_CHECKING:
@@ -34,7 +34,12 @@ _Answer = tuple["pd.DataFrame", dict[str, Any], str]
 @click.option("--quality", is_flag=True, help="Find places again, instead of speed.")
 @click.option("--frontend", is_flag=True, help="Tracks of the front-end along DATASET, instead of speed.")
 @click.option(
-    "--detector", "detectors", metavar="NAME[:KEY=VALUE,...]", multiple=True, help="Detector.  [default: all]"
+    "--detector",
+    "detectors",
+    metavar="NAME[:KEY=VALUE,...]",
+    type=PartName("DETECTOR"),
+    multiple=True,
+    help="Detector.  [default: all]",
 )
 @click.option("-o", "--option", "options", metavar="NAME.KEY=VALUE", multiple=True, help="Set a detector's option.")
 @click.option("--images", type=FILE, metavar="DIR", help="Photographs.  [default for speed: drawn surfaces]")
@@ -70,8 +75,6 @@ def detectors(
                 itself (--hpatches DIR), as they are and degraded
     --frontend  how long and how truly the front-end follows what was detected
                 along DATASET, as it is and degraded
-
-    docs/bench_detectors.md says what the figures mean.
     """
     if quality and frontend:
         raise ConfigError("--quality and --frontend are two questions; ask one at a time")
@@ -106,7 +109,8 @@ def detectors(
         rows += [{"detector": label, "absent": reason} for label, reason in absent.items()]
         taking_part = {entrant.called: entrant.options for entrant, _ in lined_up().ready}
         record(keep, rows, {"question": question, "seed": seed, **settings, "detectors": taking_part})
-        click.echo(f"written to {keep}")
+        if not quiet:
+            click.echo(f"written to {keep}")
 
 
 def _given(question: str, specific: dict[str, Any]) -> dict[str, Any]:

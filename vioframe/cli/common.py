@@ -2,18 +2,50 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import logging
+from collections.abc import Iterable, Iterator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Self
 
 import click
+from click.shell_completion import CompletionItem
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    SpinnerColumn,
+    TaskProgressColumn,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
 
 if TYPE_CHECKING:
     from rich.table import Table
 
 FILE = click.Path(path_type=Path)
+
+
+class PartName(click.types.StringParamType):
+    """The name of an installed part of ``kinds``, constants of :mod:`vioframe.parts.registry`, or of any; the shell
+    completes it."""
+
+    name = "name"
+
+    def __init__(self, *kinds: str) -> None:
+        self._kinds = kinds
+
+    def shell_complete(self, ctx: click.Context, param: click.Parameter, incomplete: str) -> list[CompletionItem]:
+        from vioframe.parts import registry
+
+        # What is wrong with a plug-in is for the command itself to say.
+        logging.getLogger("vioframe").addHandler(logging.NullHandler())
+        installed = registry.load()
+        asked = [getattr(registry, kind) for kind in self._kinds] or registry.KINDS
+        known = sorted({name for kind in asked for name in installed.names(kind)})
+        return [CompletionItem(name) for name in known if name.startswith(incomplete)]
 
 
 def _without_other_folders(context: click.Context, parameter: click.Parameter, paths: tuple[Path, ...]) -> list[Path]:
@@ -33,7 +65,7 @@ runs_argument = click.argument(
 ground_truth_option = click.option(
     "--ground-truth", type=FILE, help="TUM or EuRoC csv; a run folder's own is the default."
 )
-quiet_option = click.option("--quiet", is_flag=True, help="No progress bar.")
+quiet_option = click.option("--quiet", is_flag=True, help="No progress bar and no summary.")
 workers_option = click.option(
     "--workers", type=click.IntRange(1), metavar="N", help="Processes.  [default: one a core]"
 )
@@ -55,11 +87,48 @@ def print_notes(notes: Iterable[str]) -> None:
         click.echo(f"note: {note}", err=True)
 
 
+_COMPILING = "compiling kernels (once after installation)"
+
+
+@contextmanager
+def compiling_shown(*, quiet: bool = False) -> Iterator[None]:
+    """Say so while kernels are compiled, which is half a minute of silence else; nothing where all are cached."""
+    from vioframe.jit import heard
+
+    console = Console(stderr=True)
+    columns = (SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn())
+    progress = Progress(*columns, console=console, transient=True)
+    task = progress.add_task(_COMPILING)
+
+    said = False
+
+    def on_kernel(name: str) -> None:
+        nonlocal said
+        if not said and not console.is_terminal:
+            click.echo(f"vioframe: {_COMPILING} ...", err=True)
+        elif not said:
+            progress.reset(task)
+            progress.start()
+        said = True
+        progress.update(task, description=f"{_COMPILING}: {name}")
+
+    if quiet:
+        yield
+        return
+    try:
+        with heard(on_kernel):
+            yield
+    finally:
+        if progress.live.is_started:
+            progress.stop()
+
+
 class Bar:
     """A progress bar on standard error: what is done, ``figures``, and the time that is left; a context manager.
 
     ``total`` None is unknown. Where it is ``late`` it appears when first something is done: an error ahead of that is
-    then one line and nothing else. In ``percent`` it counts no things but an amount of work.
+    then one line and nothing else, and the compiling of kernels is shown. In ``percent`` it counts no things but an
+    amount of work.
     """
 
     def __init__(
@@ -74,14 +143,18 @@ class Bar:
             disable=quiet,
         )
         self._id = self.progress.add_task("", total=total, figures=figures)
-        self._figures, self._late, self._shown = figures, late, False
+        self._figures, self._late, self._shown, self._quiet = figures, late, False, quiet
+        self._before = ExitStack()
 
     def __enter__(self) -> Self:
-        if not self._late:
+        if self._late:
+            self._before.enter_context(compiling_shown(quiet=self._quiet))
+        else:
             self._show()
         return self
 
     def __exit__(self, *_: object) -> None:
+        self._before.close()
         if self._shown:
             self.progress.stop()
 
@@ -103,5 +176,6 @@ class Bar:
     def _show(self) -> None:
         if not self._shown:
             self._shown = True
+            self._before.close()
             self.progress.reset(self._id)
             self.progress.start()

@@ -7,7 +7,16 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from vioframe.cli.common import FILE, Bar, print_notes, print_table, quiet_option, workers_option
+from vioframe.cli.common import (
+    FILE,
+    Bar,
+    PartName,
+    compiling_shown,
+    print_notes,
+    print_table,
+    quiet_option,
+    workers_option,
+)
 
 if TYPE_CHECKING:
     from vioframe.evaluation.consistency import Trial
@@ -22,6 +31,7 @@ FILES = (MARKER, "nees.csv", "*trials.png")
     "--backend",
     "backends",
     metavar="NAME[:KEY=VALUE,...]",
+    type=PartName("BACKEND"),
     multiple=True,
     default=("msckf",),
     show_default=True,
@@ -30,7 +40,7 @@ FILES = (MARKER, "nees.csv", "*trials.png")
 @click.option(
     "--flight",
     "flights",
-    metavar="NAME",
+    type=PartName("FLIGHT"),
     multiple=True,
     default=("figure_eight",),
     show_default=True,
@@ -64,7 +74,7 @@ def montecarlo(
     """Fly simulated flights that differ by their noise alone, and compare errors with what back-ends say of them.
 
     Landmarks instead of images, EuRoC's camera and IMU noise, true calibration, the back-end's own initialisation. A
-    trial that fails counts and is shown. docs/montecarlo.md says how to read the table and the plots.
+    trial that fails counts and is shown.
     """
     from vioframe.bench.processes import map_in_processes, usable_cores
     from vioframe.bench.results import record
@@ -95,7 +105,8 @@ def montecarlo(
     tasks = []
     for flight in dict.fromkeys(flights):
         tree = {"name": flight, "title": flight, **grid, "setup": {"flight": flight, **sensors}}
-        planned = plan(validate(Suite, tree, "command line"), (), installed)
+        with compiling_shown(quiet=quiet):
+            planned = plan(validate(Suite, tree, "command line"), (), installed)
         tasks += [task for task in planned if isinstance(task, TrialTask)]
     with Bar(len(tasks), "first trials under way", quiet=quiet) as bar:
         failed = 0
@@ -129,5 +140,7 @@ def montecarlo(
         by_seed = [trial.to_dict() for _, trial in of_case]
         cases.append({"name": task.about["backend"], **about, **over_trials(own), "nees": averages, "by_seed": by_seed})
     record(folder / MARKER, cases, {"backends": backends, "flights": flights, "seeds": seeds, **sensors})
+    if quiet:
+        return
     written = sorted(path.name for pattern in FILES for path in folder.glob(pattern))
     click.echo(f"written to {folder}: {', '.join(written)}")

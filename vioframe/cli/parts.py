@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from vioframe.cli.common import FILE
+from vioframe.cli.common import FILE, PartName, print_notes
 from vioframe.errors import PluginError
 from vioframe.parts import config as configuration
 from vioframe.parts import registry
@@ -19,7 +19,7 @@ from vioframe.parts.options import REQUIRED, did_you_mean, summary_of
 
 
 @click.command("plugins")
-@click.argument("name", required=False)
+@click.argument("name", required=False, type=PartName())
 def plugins(name: str | None) -> None:
     """List every part: detectors, back-ends, loop closers, data-set readers, flights, worlds, metrics and trainers.
 
@@ -40,8 +40,9 @@ def plugins(name: str | None) -> None:
                 for each in installed.failures
             ]
             console.print(_table(("failed to load", "distribution", "version", "why"), failed))
+        print_notes(map(str, installed.clashes))
         return
-    parts = [part for _, part in every if part.name == name]
+    parts = [part for _, part in every if name in (part.name, part.name.partition("@")[0])]
     if not parts:
         known = sorted({part.name for _, part in every})
         raise PluginError(f"no part is called {name!r}{did_you_mean(name, known)}; installed: {', '.join(known)}")
@@ -65,8 +66,8 @@ def _table(columns: Iterable[str], rows: Iterable[Iterable[str]]) -> Table:
 
 
 @click.command("config")
-@click.option("--detector", help="Show this detector's options.")
-@click.option("--backend", help="Show this back-end's options.")
+@click.option("--detector", type=PartName("DETECTOR"), help="Show this detector's options.")
+@click.option("--backend", type=PartName("BACKEND"), help="Show this back-end's options.")
 @click.option("--check", "file", type=FILE, help="Check FILE instead: every key and value.")
 def config(file: Path | None, **parts: str | None) -> None:
     """Print the complete default configuration with comments, or check a configuration file."""

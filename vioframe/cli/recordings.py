@@ -10,7 +10,7 @@ from typing import Any
 
 import click
 
-from vioframe.cli.common import FILE, Bar, calibration_option
+from vioframe.cli.common import FILE, Bar, PartName, calibration_option, print_notes, quiet_option
 from vioframe.errors import DatasetError
 from vioframe.io.convert import FORMATS, format_of
 from vioframe.io.convert import convert as write_converted
@@ -30,11 +30,16 @@ _COMPRESSIONS = sorted({name for format in FORMATS.values() for name in format.c
 @click.command("simulate")
 @click.argument("destinations", metavar="DST...", type=FILE, nargs=-1)
 @click.option("--list", "only_list", is_flag=True, help="List flights, worlds and conditions.")
-@click.option("--flight", metavar="NAME|FILE", help="Flight by name, or a trajectory file (TUM, EuRoC) to fly along.")
+@click.option(
+    "--flight",
+    metavar="NAME|FILE",
+    type=PartName("FLIGHT"),
+    help="Flight by name, or a trajectory file (TUM, EuRoC) to fly along.",
+)
 @click.option(
     "--imu", "recorded", type=FILE, metavar="SEQ", help="EuRoC sequence, or its imu0/data.csv: its real IMU, motion."
 )
-@click.option("--world", metavar="NAME", help="World to fly through.  [default: hall]")
+@click.option("--world", type=PartName("WORLD"), help="World to fly through.  [default: hall]")
 @click.option("-c", "--condition", "conditions", metavar="NAME=LEVEL", multiple=True, help="Hard condition, 0 to 1.")
 @click.option("-o", "--option", "options", metavar="KEY=VALUE", multiple=True, help="Option of flight, world or IMU.")
 @click.option("--start", "start_s", type=float, metavar="S", help="Skip the first S seconds of a file or sequence.")
@@ -56,7 +61,7 @@ _COMPRESSIONS = sorted({name for format in FORMATS.values() for name in format.c
 @click.option("--compression", type=click.Choice(["bz2", "lz4", "zstd"]), help="Compress bags.  [default: no]")
 @click.option("--workers", type=click.IntRange(1), help="Processes that render.  [default: the number of cores]")
 @click.option("--overwrite", is_flag=True, help="Replace a simulated recording of the same name.")
-@click.option("--quiet", is_flag=True, help="No progress bar and no summary.")
+@quiet_option
 def simulate(
     destinations: tuple[Path, ...],
     only_list: bool,
@@ -147,7 +152,8 @@ def _list_simulations(installed: registry.Registry) -> None:
 )
 @click.option("-o", "--option", "options", metavar="KEY=VALUE", multiple=True, help="Set an option of the reader.")
 @calibration_option
-@click.option("--reader", metavar="NAME", help="Data-set reader, where several accept SRC.")
+@click.option("--reader", type=PartName("DATASET"), help="Data-set reader, where several accept SRC.")
+@quiet_option
 def convert(
     source: Path,
     destination: Path,
@@ -156,6 +162,7 @@ def convert(
     options: tuple[str, ...],
     calibration: tuple[Path, ...],
     reader: str | None,
+    quiet: bool,
 ) -> None:
     """Write the recording SRC, whatever a reader opens, to DST in another format.
 
@@ -175,7 +182,7 @@ def convert(
     if calibration:
         chosen["calibration"] = list(calibration)
     dataset = installed.open_dataset(source, part.name, chosen)
-    with Bar(dataset.frame_count, dataset.name, late=True) as bar:
+    with Bar(dataset.frame_count, dataset.name, quiet=quiet, late=True) as bar:
 
         def watched() -> Iterator[Measurement]:
             for measurement in dataset.measurements():
@@ -186,11 +193,13 @@ def convert(
         done = write_converted(
             watched(), dataset.calibration, destination, truth=truth, format=format, compression=compression
         )
+    if done.unreadable:
+        print_notes([f"left out: {done.unreadable} frames or samples of {source} that could not be read"])
+    if quiet:
+        return
     cameras = len(dataset.calibration.cameras)
     of_cameras = f" of {cameras} cameras" if cameras > 1 else ""
     click.echo(
         f"{destination}: {FORMATS[format].description}, {done.frames} frames{of_cameras}, "
         f"{done.imu_samples} IMU samples, {done.true_poses or 'no'} true poses"
     )
-    if done.unreadable:
-        click.echo(f"left out: {done.unreadable} frames or samples of {source} that could not be read")

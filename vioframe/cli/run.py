@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from math import inf
 from pathlib import Path
 from typing import Any
 
 import click
 
-from vioframe.cli.common import FILE, Bar, calibration_option
+from vioframe.cli.common import FILE, Bar, PartName, calibration_option, quiet_option
 from vioframe.errors import DatasetError, TrajectoryError
 from vioframe.evaluation import evaluate
 from vioframe.geometry.trajectory import Trajectory
 from vioframe.parts import config as configuration
 from vioframe.parts import registry
 from vioframe.parts.config import Config
-from vioframe.pipeline import prepare, record
+from vioframe.pipeline import Experiment, prepare, record
 from vioframe.runs.folder import RunFolder
 from vioframe.runs.recorder import check_run_folder, free_run_folder
 from vioframe.types import NS_PER_S, Step
@@ -23,19 +24,23 @@ from vioframe.types import NS_PER_S, Step
 
 @click.command("run")
 @click.argument("data", type=FILE, required=False)
-@click.option("--detector", metavar="NAME", help="Keypoint detector.  [default: shi_tomasi]")
-@click.option("--backend", metavar="NAME", help="Estimator.  [default: msckf]")
-@click.option("--loop-closure", metavar="NAME", help="Loop closer, such as pose_graph.  [default: none]")
+@click.option("--detector", type=PartName("DETECTOR"), help="Keypoint detector.  [default: shi_tomasi]")
+@click.option("--backend", type=PartName("BACKEND"), help="Estimator.  [default: msckf]")
+@click.option(
+    "--loop-closure",
+    type=PartName("LOOP_CLOSER"),
+    help="Loop closer, such as pose_graph.  [default: none]",
+)
 @click.option("-o", "--option", "options", metavar="KEY=VALUE", multiple=True, help="Set an option of a part.")
 @click.option("--config", "file", type=FILE, help="Configuration file; the other options override it.")
 @click.option("--ground-truth", type=FILE, help="Trajectory to compare with: TUM or EuRoC csv.")
 @calibration_option
-@click.option("--reader", metavar="NAME", help="Data-set reader, where several accept DATA.")
+@click.option("--reader", type=PartName("DATASET"), help="Data-set reader, where several accept DATA.")
 @click.option("--start", "start_s", type=float, metavar="S", help="Skip the first S seconds.")
 @click.option("--duration", "duration_s", type=float, metavar="S", help="Stop after S seconds.")
 @click.option("--out", type=FILE, help="Run folder.  [default: runs/DATASET_DETECTOR_BACKEND]")
 @click.option("--overwrite", is_flag=True, help="Replace the run that is in --out.")
-@click.option("--quiet", is_flag=True, help="No progress bar and no summary.")
+@quiet_option
 def run(out: Path | None, overwrite: bool, quiet: bool, **choices: Any) -> None:
     """Estimate the motion along DATA, a bag or an ASL folder, and write a run folder.
 
@@ -45,12 +50,15 @@ def run(out: Path | None, overwrite: bool, quiet: bool, **choices: Any) -> None:
     if out is not None:
         check_run_folder(out, overwrite=overwrite)
     installed = registry.load()
-    experiment = prepare(_configure(installed, **choices), installed)
-    folder = out or free_run_folder(Path("runs"), experiment.name)
-    whole = experiment.config.start_s == 0.0 and experiment.config.duration_s is None
-    with Bar(experiment.dataset.frame_count if whole else None, quiet=quiet, late=True) as bar:
-        summary = record(experiment, folder, overwrite=overwrite, on_step=_watched(bar))
+    config = _configure(installed, **choices)
+    with Bar(None, quiet=quiet, late=True) as bar:
+        experiment = prepare(config, installed)
+        folder = out or free_run_folder(Path("runs"), experiment.name)
+        summary = record(experiment, folder, overwrite=overwrite, on_step=_watched(bar, experiment))
     if not quiet:
+        if others := experiment.left_aside:
+            used = experiment.dataset.calibration.cameras[0].name
+            click.echo(f"camera {used} is used, {', '.join(others)} left aside; -o cameras={others[0]} takes another")
         _report(folder, summary)
 
 
@@ -73,9 +81,22 @@ def _configure(
     return configuration.override(configuration.parse(tree, "command line"), installed, options)
 
 
-def _watched(bar: Bar) -> Callable[[Step], None]:
+def _watched(bar: Bar, experiment: Experiment) -> Callable[[Step], None]:
     """Has ``bar`` show frame rate, real-time factor, tracked points and what the back-end says."""
+    config, frame_count = experiment.config, experiment.dataset.frame_count
     first_t_ns: int | None = None
+
+    def expected(data_s: float) -> float | None:
+        """Frames to come through, judged by those of the first ``data_s`` seconds where a part is played."""
+        if config.start_s == 0.0 and config.duration_s is None:
+            return frame_count
+        if data_s == 0.0:
+            return None
+        rate_hz = bar.completed / data_s
+        left = inf if frame_count is None else frame_count - round(config.start_s * rate_hz)
+        wanted = inf if config.duration_s is None else round(config.duration_s * rate_hz)
+        total = max(min(left, wanted), bar.completed + 1)
+        return None if total == inf else total
 
     def on_step(step: Step) -> None:
         nonlocal first_t_ns
@@ -83,7 +104,8 @@ def _watched(bar: Bar) -> Callable[[Step], None]:
         data_s = (step.frames.t_ns - first_t_ns) / NS_PER_S
         bar(
             f"{(bar.completed + 1) / bar.elapsed_s:.1f} frames/s, {data_s / bar.elapsed_s:.2f}x real time, "
-            f"{len(step.tracks.ids)} points, {step.estimate.status}"
+            f"{len(step.tracks.ids)} points, {step.estimate.status}",
+            total=expected(data_s),
         )
 
     return on_step

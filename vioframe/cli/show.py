@@ -8,7 +8,7 @@ from pathlib import Path
 
 import click
 
-from vioframe.cli.common import FILE, ground_truth_option, print_notes, print_table, runs_argument
+from vioframe.cli.common import FILE, PartName, ground_truth_option, print_notes, print_table, runs_argument
 
 
 def _alignment_option(what: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
@@ -30,6 +30,7 @@ def _alignment_option(what: str) -> Callable[[Callable[..., None]], Callable[...
     "--metric",
     "metrics",
     metavar="NAME[:KEY=VALUE,...]",
+    type=PartName("METRIC"),
     multiple=True,
     help="Measure this as well; repeatable. `vioframe plugins` lists them.",
 )
@@ -158,16 +159,18 @@ def report(results: Path, out: Path | None, no_page: bool) -> None:
     write_and_say(results, out, page=not no_page)
 
 
-def write_and_say(results: Path, out: Path | None = None, *, page: bool = True) -> None:
+def write_and_say(results: Path, out: Path | None = None, *, page: bool = True, quiet: bool = False) -> None:
     """Write the report, and say what was written."""
     from vioframe.report.suite.report import write_report
     from vioframe.runs.results import load_results
 
     written = write_report(load_results(results), out, page=page)
+    print_notes(written.notes)
+    if quiet:
+        return
     counts = Counter((path.parent.as_posix(), path.suffix[1:]) for path in written.files if path.parent != Path())
     for (folder, ending), count in counts.items():
         click.echo(f"{written.folder / folder}: {count} {ending}")
     for path in written.files:
         if path.parent == Path():
             click.echo(written.folder / path)
-    print_notes(written.notes)

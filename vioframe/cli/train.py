@@ -7,7 +7,7 @@ from pathlib import Path
 
 import click
 
-from vioframe.cli.common import FILE, Bar
+from vioframe.cli.common import FILE, Bar, PartName, quiet_option
 from vioframe.interfaces import Trainer
 from vioframe.parts import config as configuration
 from vioframe.parts import registry
@@ -15,7 +15,7 @@ from vioframe.types import TrainingJob, TrainingStep
 
 
 @click.command("train")
-@click.argument("name")
+@click.argument("name", type=PartName("TRAINER"))
 @click.option("--images", type=FILE, multiple=True, required=True, help="Folder of photographs, or recording; repeat.")
 @click.option("--out", type=FILE, help="Folder for checkpoint, log and weights.  [default: training/NAME]")
 @click.option("--hold-out", metavar="PATTERN", multiple=True, help="Images to validate on, by name; repeat.")
@@ -23,6 +23,7 @@ from vioframe.types import TrainingJob, TrainingStep
 @click.option("--config", "config_file", type=FILE, help="YAML file of options; -o overrides it.")
 @click.option("-o", "--option", "options", metavar="KEY=VALUE", multiple=True, help="Set an option of the trainer.")
 @click.option("--resume", is_flag=True, help="Go on with the training in --out.")
+@quiet_option
 def train(
     name: str,
     images: tuple[Path, ...],
@@ -32,6 +33,7 @@ def train(
     config_file: Path | None,
     options: tuple[str, ...],
     resume: bool,
+    quiet: bool,
 ) -> None:
     """Train NAME, such as keypointnet, on photographs and on the images of recordings.
 
@@ -45,12 +47,13 @@ def train(
     job = TrainingJob(images, out or Path("training") / name, hold_out, start_from, resume)
     trainer: Trainer = part.create(job, options=chosen)
     step: TrainingStep | None = None
-    with Bar(None) as bar:
+    with Bar(None, quiet=quiet) as bar:
         for step in trainer.train():
             bar(_figures(step.losses), advance=step.done - bar.completed, total=step.total)
             if step.epoch is not None:
                 bar.progress.print(_figures(step.epoch))
-    click.echo(f"{name}: {step.done if step else 0} steps; written to {job.out}")
+    if not quiet:
+        click.echo(f"{name}: {step.done if step else 0} steps; written to {job.out}")
 
 
 def _figures(values: Mapping[str, float]) -> str:

@@ -7,33 +7,40 @@ folder, beside any other in the folder ``<name>.calib``. For the truth's topics 
 
 from __future__ import annotations
 
-import shutil
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from vioframe.errors import DatasetError
 from vioframe.geometry.trajectory import Trajectory
-from vioframe.io.calibration import sidecar_folder, write_calibration
+from vioframe.io.calibration import CALIBRATION_FILES, sidecar_folder, write_calibration
+from vioframe.io.replace import appearing
 from vioframe.io.writers import AslWriter, McapWriter, RecordingWriter, Ros1Writer, Ros2Writer
 from vioframe.types import Calibration, FrameSet, ImuSample, Measurement, Unreadable
 
 
 @dataclass(frozen=True, slots=True)
 class Format:
-    """A recording format that can be written: ``open(path, compression, camera_names)`` begins one."""
+    """A recording format that can be written: ``open(path, compression, camera_names)`` begins one.
+
+    ``files`` are patterns of what is in it, where it is a folder.
+    """
 
     description: str
     open: Callable[[Path, str | None, Sequence[str]], RecordingWriter]
     compressions: tuple[str, ...] = ()
+    files: tuple[str, ...] = ()
 
 
 FORMATS = {
-    "asl": Format("ASL folder, as EuRoC's", lambda path, _, camera_names: AslWriter(path, camera_names)),
+    "asl": Format(
+        "ASL folder, as EuRoC's",
+        lambda path, _, camera_names: AslWriter(path, camera_names),
+        files=("mav0/*/data.csv", "mav0/*/data/*.png", "mav0/*/sensor.yaml"),
+    ),
     "ros1": Format("ROS 1 bag", Ros1Writer, ("bz2", "lz4")),
-    "ros2": Format("ROS 2 bag, a folder with sqlite3 storage", Ros2Writer, ("zstd",)),
+    "ros2": Format("ROS 2 bag, a folder with sqlite3 storage", Ros2Writer, ("zstd",), ("metadata.yaml", "*.db3*")),
     "mcap": Format("MCAP file with ROS 2 messages", McapWriter, ("zstd",)),
 }
 
@@ -116,32 +123,10 @@ def write_recording(
     return Conversion(counts[FrameSet], counts[ImuSample], 0 if truth is None else len(truth), counts[Unreadable])
 
 
-@contextmanager
-def appearing(destination: Path, *, replace: bool = False) -> Iterator[Path]:
-    """A place of the same name to write to, moved to ``destination`` if all goes well and removed if not.
-
-    Raises :class:`~vioframe.errors.DatasetError` where it cannot be written, or exists and is not to be replaced.
-    """
-    if destination.exists() and not replace:
-        raise DatasetError(f"{destination} exists already; remove it or choose another name")
-    workspace = destination.with_name(f".{destination.name}.unfinished")
-    try:
-        shutil.rmtree(workspace, ignore_errors=True)
-        workspace.mkdir(parents=True)
-        yield workspace / destination.name
-        if destination.is_dir():
-            shutil.rmtree(destination)
-        (workspace / destination.name).replace(destination)
-    except OSError as err:
-        raise DatasetError(f"cannot write {destination}: {err.strerror or err}") from err
-    finally:
-        shutil.rmtree(workspace, ignore_errors=True)
-
-
 def write_sidecar(calibration: Calibration, recording: Path) -> None:
-    """Calibration files beside ``recording``, in place of any there.
+    """Calibration files beside ``recording``, in place of those that were written there before.
 
     To be written before the recording appears, so that none ever stands without its calibration.
     """
-    with appearing(sidecar_folder(recording), replace=True) as unfinished:
+    with appearing(sidecar_folder(recording), replace=CALIBRATION_FILES) as unfinished:
         write_calibration(calibration, unfinished)

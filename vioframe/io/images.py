@@ -5,7 +5,10 @@ A reader makes a set of each image as it comes (:func:`frame_set`); :func:`gathe
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterable, Iterator
+from io import BytesIO
+from math import inf
 from typing import Any, cast
 
 import numpy as np
@@ -14,17 +17,48 @@ from numpy.typing import NDArray
 from vioframe.errors import DatasetError
 from vioframe.types import Calibration, FrameSet, Image, Measurement
 
+MOST_PIXELS = 1 << 26
+"""Of an image file: eight thousand by eight thousand, or 64 MiB in grey."""
+
+_FORMATS = ("PNG", "JPEG", "TIFF", "BMP", "PPM", "WEBP", "JPEG2000")
+
 # How many measurements may follow an image before those of the other cameras at its instant are no longer waited for:
 # half a second of two cameras at 20 Hz and an IMU at 200 Hz.
 _LOOK_AHEAD = 120
 
 
-def decode_image(data: bytes | NDArray[np.uint8]) -> NDArray[Any] | None:
-    """A PNG, JPEG or other image file as it is, channels in OpenCV's order; None where it is damaged."""
+def decode_image(data: bytes | NDArray[np.uint8], where: str) -> NDArray[Any] | None:
+    """A PNG, JPEG or other image file as it is, channels in OpenCV's order; None where it is damaged.
+
+    A few bytes can decode to gigabytes: :class:`~vioframe.errors.DatasetError`, which begins with ``where``, for an
+    image that says it is beyond :data:`MOST_PIXELS`.
+    """
     import cv2
 
-    buffer = np.frombuffer(data, np.uint8)
-    return cv2.imdecode(buffer, cv2.IMREAD_UNCHANGED) if buffer.size else None
+    pixels = _declared_pixels(data)
+    if pixels is None:
+        return None
+    if pixels > MOST_PIXELS:
+        raise DatasetError(f"{where} says that it has more than {MOST_PIXELS >> 20} million pixels, and is not decoded")
+    try:
+        return cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    except cv2.error:
+        return None
+
+
+def _declared_pixels(data: bytes | NDArray[np.uint8]) -> float | None:
+    """How many by the header of an image file; None where it is damaged or of no format that is decoded."""
+    from PIL import Image as Pillow
+
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", Pillow.DecompressionBombWarning)
+            width, height = Pillow.open(BytesIO(bytes(data)), formats=_FORMATS).size
+    except (Pillow.DecompressionBombError, Pillow.DecompressionBombWarning):
+        return inf
+    except Exception:  # its readers of headers raise whatever they stumble on
+        return None
+    return width * height
 
 
 def to_gray8(image: NDArray[Any], bit_depth: int | None, where: str) -> Image:
@@ -38,9 +72,7 @@ def to_gray8(image: NDArray[Any], bit_depth: int | None, where: str) -> Image:
 
     if image.dtype == np.uint16:
         if bit_depth is None:
-            raise DatasetError(
-                f"{where} has 16-bit images; set the reader's option bit_depth to the bits in use (8-16)"
-            )
+            raise DatasetError(f"{where} has 16-bit images; say how many bits are in use, -o bit_depth=8 to 16")
         image = np.minimum(image >> (bit_depth - 8), 255).astype(np.uint8)
     if image.dtype != np.uint8:
         raise DatasetError(f"{where} has images of {image.dtype}; convert them to 8 or 16 bits")
@@ -71,7 +103,7 @@ def frame_set(
         calibrated = "x".join(map(str, resolution))
         raise DatasetError(
             f"{where} has images of {width}x{height}, but the calibration is for {calibrated}; "
-            "name the right one with the reader's option calibration"
+            "name the right one with --calibration FILE"
         )
     return FrameSet(t_ns, tuple(gray if i == place else None for i in range(len(calibration.cameras))))
 

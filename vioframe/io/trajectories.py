@@ -68,12 +68,14 @@ def load_trajectory(
 ) -> Trajectory:
     """Read a TUM or EuRoC file; which one is told from its contents. EuRoC's is a :class:`TrueTrajectory`.
 
+    Of a folder it is the ground truth that is found in it.
+
     ``complete_lines_only`` ignores a last line without its line end, as an interrupted run leaves behind;
     ``keep_first_of_repeats`` drops lines that repeat the stamp of the line before, else an error. Raises
     :class:`TrajectoryError`, with the line, for anything malformed, and for raw Vicon or Leica recordings: those are
     neither aligned in time nor (Leica) poses, so an evaluation against them would be wrong without looking wrong.
     """
-    path = Path(path)
+    path = _truth_in(Path(path)) if Path(path).is_dir() else Path(path)
     text = _read_text(path)
     if complete_lines_only:
         text = text[: text.rfind("\n") + 1]
@@ -141,6 +143,18 @@ def _tum_line(t_ns: int, p_WB: Float, quat_xyzw: Float) -> str:
     stamp = f"{'-' if t_ns < 0 else ''}{seconds}.{nanoseconds:09d}"
     position = " ".join(f"{x:.9f}" for x in p_WB)
     return f"{stamp} {position} " + " ".join(f"{q:.12f}" for q in quat_xyzw) + "\n"
+
+
+def _truth_in(folder: Path) -> Path:
+    """The file of the ground truth in a sequence in ASL layout, in its folder of it, or in a run folder."""
+    estimate = Path("state_groundtruth_estimate0") / "data.csv"
+    usual = [folder / "mav0" / estimate, folder / estimate, folder / "ground_truth.tum"]
+    usual += [folder / estimate.name] * (folder.resolve().name == estimate.parent.name)
+    if found := next((file for file in usual if file.is_file()), None):
+        return found
+    files = sorted(file.name for file in folder.iterdir() if file.suffix in (".tum", ".csv", ".txt"))
+    hint = f"; name one of its files: {', '.join(files[:5])}" if files else ""
+    raise TrajectoryError(f"{folder}: a folder without {estimate} or ground_truth.tum{hint}")
 
 
 def _read_text(path: Path) -> str:

@@ -11,7 +11,7 @@ import inspect
 import logging
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import astuple, dataclass, field
+from dataclasses import astuple, dataclass, field, replace
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from types import TracebackType
@@ -51,6 +51,14 @@ FLIGHT = Kind("flight", "vioframe_flights", Flight, 2)
 WORLD = Kind("world", "vioframe_worlds", World, 2)
 METRIC = Kind("metric", "vioframe_metrics", Metric, 0)
 TRAINER = Kind("trainer", "vioframe_trainers", Trainer, 1)
+_GIVEN = {
+    LOOP_CLOSER.name: "the calibration",
+    DATASET.name: "the path",
+    FLIGHT.name: "duration_s and R_LB",
+    WORLD.name: "p_WB and rng",
+    TRAINER.name: "the job",
+}
+"""What the framework fills in."""
 KINDS = (DETECTOR, BACKEND, LOOP_CLOSER, DATASET, FLIGHT, WORLD, METRIC, TRAINER)
 
 
@@ -116,11 +124,28 @@ class Failure:
 
 
 @dataclass(frozen=True, slots=True)
+class Clash:
+    """A name that several parts of one kind have, and what to call them by instead."""
+
+    kind: Kind
+    name: str
+    instead: tuple[str, ...]
+
+    def __str__(self) -> str:
+        return f"several plug-ins provide a {self.kind.name} called {self.name!r}; say {' or '.join(self.instead)}"
+
+
+@dataclass(frozen=True, slots=True)
 class Registry:
-    """The tables of all installed parts, by kind and name, and the plug-ins that failed to load."""
+    """The tables of all installed parts, by kind and name, and the plug-ins that failed to load.
+
+    A name that several plug-ins give to parts of one kind is none's alone: each is there as ``NAME@DISTRIBUTION``, and
+    the name is among the ``clashes``.
+    """
 
     parts: Mapping[str, Mapping[str, Part]] = field(default_factory=dict)
     failures: tuple[Failure, ...] = ()
+    clashes: tuple[Clash, ...] = ()
 
     def names(self, kind: Kind) -> list[str]:
         return sorted(self.parts.get(kind.name, {}))
@@ -130,8 +155,11 @@ class Registry:
         table = self.parts.get(kind.name, {})
         if name in table:
             return table[name]
+        if clash := next((each for each in self.clashes if (each.kind, each.name) == (kind, name)), None):
+            raise PluginError(str(clash))
+        what = "reader" if kind is DATASET else kind.name
         raise PluginError(
-            f"no {kind.name} is called {name!r}{did_you_mean(name, table)}; "
+            f"no {what} is called {name!r}{did_you_mean(name, table)}; "
             f"installed: {', '.join(sorted(table)) or 'none'}{self._failure_hint()}"
         )
 
@@ -212,31 +240,43 @@ class Registry:
 
 
 def load(found: Iterable[EntryPoint] | None = None) -> Registry:
-    """Load every plug-in of the ``vioframe`` entry-point group.
-
-    Raises :class:`PluginError` where two plug-ins give the same name to parts of one kind.
-    """
+    """Load every plug-in of the ``vioframe`` entry-point group; one that is not in order is skipped with a warning."""
     manager = pluggy.PluginManager(hookspecs.PROJECT)
     manager.add_hookspecs(hookspecs)
-    parts: dict[str, dict[str, Part]] = {kind.name: {} for kind in KINDS}
+    every: list[Part] = []
     failures = []
     chosen = entry_points(group=hookspecs.PROJECT) if found is None else found
     # One at a time: pluggy's own loader gives up on all of them at the first ImportError.
     for source, entry in sorted(((_source(entry), entry) for entry in chosen), key=lambda pair: astuple(pair[0])):
         try:
-            new = _parts_of(manager, source, entry.load())
+            every += _parts_of(manager, source, entry.load())
         except Exception as error:
-            failures.append(Failure(source, describe(error)))
+            failures.append(Failure(source, str(error) if isinstance(error, PluginError) else describe(error)))
             _LOG.warning("plug-in %s (%s) is skipped: %s", source.entry_point, source, failures[-1].reason)
-            continue
-        for part in new:
-            other = parts[part.kind.name].setdefault(part.name, part)
-            if other is not part:
-                raise PluginError(
-                    f"two plug-ins provide a {part.kind.name} called {part.name!r}: {other.source.entry_point} of "
-                    f"{other.source} and {source.entry_point} of {source}; uninstall one of them"
-                )
-    return Registry(parts, tuple(failures))
+    parts: dict[str, dict[str, Part]] = {kind.name: {} for kind in KINDS}
+    clashes = []
+    for (kind, name), named in _by_name(every).items():
+        for part in named:
+            parts[kind.name][part.name] = part
+        if len(named) > 1:
+            clashes.append(Clash(kind, name, tuple(part.name for part in named)))
+    return Registry(parts, tuple(failures), tuple(clashes))
+
+
+def _by_name(every: Iterable[Part]) -> dict[tuple[Kind, str], list[Part]]:
+    """The parts of each kind and name, those that share one renamed after where they come from."""
+    table: dict[tuple[Kind, str], list[Part]] = {}
+    for part in every:
+        table.setdefault((part.kind, part.name), []).append(part)
+    for named in table.values():
+        if len(named) > 1:
+            distributions = {part.source.distribution for part in named}
+            apart = len(distributions) == len(named)
+            named[:] = [
+                replace(part, name=f"{part.name}@{part.source.distribution if apart else part.source.entry_point}")
+                for part in named
+            ]
+    return table
 
 
 def describe(error: BaseException) -> str:
@@ -257,7 +297,7 @@ def _parts_of(manager: pluggy.PluginManager, source: Source, plugin: Any) -> lis
             Part(kind, name, _checked(kind, name, factory), source)
             for kind in KINDS
             if kind.hook in hooks
-            for name, factory in getattr(plugin, kind.hook)().items()
+            for name, factory in _offered(kind, getattr(plugin, kind.hook)()).items()
         ]
     except pluggy.PluginValidationError as error:
         known = [kind.hook for kind in KINDS]
@@ -269,12 +309,24 @@ def _parts_of(manager: pluggy.PluginManager, source: Source, plugin: Any) -> lis
         manager.unregister(name=identity)
 
 
+def _offered(kind: Kind, answer: Any) -> Mapping[Any, Any]:
+    if not isinstance(answer, Mapping):
+        raise PluginError(f"{kind.hook}() must return a dict, from names to factories, not a {type(answer).__name__}")
+    return answer
+
+
 def _checked(kind: Kind, name: object, factory: Any) -> Any:
     if not isinstance(name, str) or not name or not callable(factory):
         raise PluginError(f"{kind.hook} must map names to callables, got {name!r}: {factory!r}")
     if kind is DATASET and not callable(getattr(factory, "accepts", None)):
         raise PluginError(f"the reader {name!r} has no accepts(path)")
-    inspect.signature(factory)  # raises ValueError for the few callables that have none, hence no options to read
+    # Raises ValueError for the few callables that have none, hence no options to read.
+    parameters = inspect.signature(factory).parameters.values()
+    placed = [p for p in parameters if p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD)]
+    if len(placed) < kind.given and not any(p.kind is p.VAR_POSITIONAL for p in parameters):
+        raise PluginError(f"the factory of the {kind.name} {name!r} must take {_GIVEN[kind.name]} ahead of its options")
+    if kind is BACKEND and any(p.name == "calibration" and p.default is p.empty for p in placed):
+        raise PluginError(f"the factory of the backend {name!r} asks for a calibration, which comes with begin(start)")
     return factory
 
 

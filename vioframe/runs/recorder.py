@@ -19,7 +19,6 @@ from __future__ import annotations
 import json
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from itertools import count
 from pathlib import Path
 from time import perf_counter
@@ -33,6 +32,7 @@ from vioframe.evaluation.landmarks import Landmarks
 from vioframe.geometry import so3
 from vioframe.incidents import Incidents
 from vioframe.io.calibration import write_calibration
+from vioframe.io.replace import remove_written
 from vioframe.io.trajectories import tum_line, write_tum
 from vioframe.types import NS_PER_S, Calibration, CalibrationEstimate, Float, Int, LoopClosure, NavState, Status, Step
 
@@ -85,12 +85,7 @@ def new_run_folder(
     """
     check_run_folder(path, overwrite=overwrite, marker=marker)
     try:
-        for old in [file for pattern in files for file in path.glob(pattern)]:
-            if old.parent.resolve().is_relative_to(path.resolve()):  # not what is behind a link to elsewhere
-                old.unlink()
-                for folder in old.relative_to(path).parents[:-1]:
-                    with suppress(OSError):  # that it holds more
-                        (path / folder).rmdir()
+        remove_written(path, files)
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise RunError(f"cannot create the run folder {path}: {error.strerror}") from error

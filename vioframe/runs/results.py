@@ -31,10 +31,19 @@ from pydantic import Field
 
 from vioframe.errors import RunError
 from vioframe.parts.config import Section, read_tree, validate
-from vioframe.runs.recorder import write_whole
+from vioframe.runs.recorder import RUN_FILES, write_whole
 
 SUITE_FILE, TABLE_FILE, RUNS_FOLDER = "suite.yaml", "results.jsonl", "runs"
 NEES_FILE = "nees.csv"
+TASK_FILES = (*RUN_FILES, NEES_FILE)
+REPORT_FOLDER = "report"
+REPORT_FILES = ("index.html", "tables/*.csv", "tables/*.md", "tables/*.tex", "figures/*.png", "figures/*.svg")
+RESULT_FILES = (
+    *(SUITE_FILE, TABLE_FILE),
+    *(f"{RUNS_FOLDER}/*/{file}" for file in TASK_FILES),
+    *(f"{REPORT_FOLDER}/{file}" for file in REPORT_FILES),
+)
+"""What a results folder holds, as patterns: the files of the tasks, of the report, and all together."""
 
 CLEAR = "clear"
 """The condition without any degradation, at level 0."""

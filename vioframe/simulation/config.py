@@ -18,7 +18,7 @@ from vioframe.parts.registry import FLIGHT, WORLD, Kind, Registry
 from vioframe.simulation.conditions import Conditions
 from vioframe.simulation.imu import ImuErrors
 
-MANIFEST, TRUTH, MESH = "manifest.yaml", "ground_truth.csv", "world.ply"
+MANIFEST, TRUTH, MESH = SIMULATION_FILES = "manifest.yaml", "ground_truth.csv", "world.ply"
 """Files of a simulation's folder: all settings, the exact states in EuRoC's format, and the mesh of the world in W."""
 
 
@@ -51,7 +51,7 @@ class SimulationConfig(Section):
         if self.recorded is not None and (self.imu or self.exact_imu or self.imu_rate_hz is not None):
             raise ValueError("the readings of a recorded sequence are taken as they are; leave the IMU's settings out")
         if self.start_s and self.trajectory is None and self.recorded is None:
-            raise ValueError("start_s is for trajectories and recorded sequences; a flight begins at its beginning")
+            raise ValueError("--start is for trajectories and recorded sequences; a flight begins at its beginning")
         return self
 
 

@@ -203,7 +203,7 @@ def _check_poses(name: str, t_s: Float, poses: Trajectory) -> None:
     if dt[widest] > _LONGEST_GAP_S:
         raise TrajectoryError(
             f"{name} has no pose from {t_s[widest]:.3f} s to {t_s[widest + 1]:.3f} s after its first; "
-            "take a piece without that gap (start_s, duration_s)"
+            "take a piece without that gap (--start, --duration)"
         )
     velocity = np.diff(poses.p_WB, axis=0) / dt[:, None]
     rate = so3.log(np.swapaxes(poses.R_WB[:-1], 1, 2) @ poses.R_WB[1:]) / dt[:, None]

@@ -11,11 +11,12 @@ from pydantic_core import to_jsonable_python
 
 from vioframe.errors import DatasetError
 from vioframe.io.calibration import write_calibration
-from vioframe.io.convert import FORMATS, appearing, format_of, write_recording, write_sidecar
+from vioframe.io.convert import FORMATS, format_of, write_recording, write_sidecar
+from vioframe.io.replace import appearing
 from vioframe.io.trajectories import write_euroc
 from vioframe.parts.config import to_yaml
 from vioframe.runs import machine
-from vioframe.simulation.config import MANIFEST, MESH, TRUTH, simulation_folder
+from vioframe.simulation.config import MANIFEST, MESH, SIMULATION_FILES, TRUTH, simulation_folder
 from vioframe.simulation.recording import SimulatedRecording
 from vioframe.simulation.world import write_mesh
 from vioframe.types import FrameSet, Measurement
@@ -38,7 +39,11 @@ def record(
     check_destinations(destinations, compression, overwrite=overwrite)
     names = [camera.name for camera in recording.calibration.cameras]
     with ExitStack() as stack:
-        begun = [(path, stack.enter_context(appearing(path, replace=overwrite))) for path in destinations]
+        replaced = [_files(path) if overwrite else None for path in destinations]
+        begun = [
+            (path, stack.enter_context(appearing(path, replace=files)))
+            for path, files in zip(destinations, replaced, strict=True)
+        ]
         with ExitStack() as opened:
             writers = [
                 opened.enter_context(FORMATS[format_of(path)].open(unfinished, compression, names))
@@ -50,7 +55,7 @@ def record(
                 write_calibration(recording.calibration, unfinished / "mav0")
                 _describe(recording, simulation_folder(unfinished))
             else:
-                with appearing(simulation_folder(path), replace=True) as folder:
+                with appearing(simulation_folder(path), replace=SIMULATION_FILES) as folder:
                     _describe(recording, folder)
                 write_sidecar(recording.calibration, path)
 
@@ -69,6 +74,12 @@ def check_destinations(destinations: Sequence[Path], compression: str | None, *,
             raise DatasetError(f"{path} was not written by the simulator and is not overwritten; choose another name")
     if len({path.absolute() for path in destinations}) < len(destinations):
         raise DatasetError("a destination is named twice")
+
+
+def _files(path: Path) -> tuple[str, ...]:
+    """What a recording of that name holds, where it is a folder."""
+    own = FORMATS[format_of(path)].files
+    return (*own, *(f"simulation/{name}" for name in SIMULATION_FILES))
 
 
 def _watched(measurements: Iterable[Measurement], on_frame: Callable[[FrameSet], None]) -> Iterator[Measurement]:

@@ -53,7 +53,7 @@ def find_images(folder: Path) -> list[Path]:
 
 def read_image(path: Path) -> NDArray[Any]:
     """An image file as it is, channels in OpenCV's order; raises :class:`DatasetError` where it cannot be decoded."""
-    image = decode_image(path.read_bytes())
+    image = decode_image(path.read_bytes(), str(path))
     if image is None:
         raise DatasetError(f"{path} cannot be decoded; replace it or take it away")
     return image

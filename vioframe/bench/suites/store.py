@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,11 +12,12 @@ from pydantic_core import to_jsonable_python
 
 from vioframe.bench.suites.suite import Suite
 from vioframe.errors import RunError
-from vioframe.io.calibration import sidecar_folder
+from vioframe.io.calibration import CALIBRATION_FILES, sidecar_folder
+from vioframe.io.replace import remove_written
 from vioframe.parts.config import read_tree, to_yaml
 from vioframe.runs.recorder import write_whole
-from vioframe.runs.results import RUNS_FOLDER, SUITE_FILE, Row, read_rows, write_rows
-from vioframe.simulation.config import simulation_folder
+from vioframe.runs.results import RESULT_FILES, RUNS_FOLDER, SUITE_FILE, Row, read_rows, write_rows
+from vioframe.simulation.config import SIMULATION_FILES, simulation_folder
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,6 +37,15 @@ class Store:
         own = path.absolute() / "recordings"
         return cls(path.absolute(), own if recordings is None else recordings.absolute(), recordings is not None)
 
+    @property
+    def _own_recordings(self) -> tuple[str, ...]:
+        """Patterns of what is written among the recordings that are not to be kept."""
+        if self.keep_recordings:
+            return ()
+        beside = (f"*.bag.calib/{file}" for file in CALIBRATION_FILES)
+        made = (f"*.bag.simulation/{file}" for file in SIMULATION_FILES)
+        return tuple(f"{self.recordings.name}/{file}" for file in ("*.bag", ".lock", *beside, *made))
+
     def begin(self, suite: Suite, *, overwrite: bool) -> None:
         """Make the folder that of ``suite``, or go on with it; raises :class:`RunError` where it is another suite's."""
         text, file = to_yaml(suite), self.path / SUITE_FILE
@@ -52,7 +62,7 @@ class Store:
                         f"{self.path} holds another suite's results, which differs in {differing}; choose another "
                         "--out, or --overwrite to begin anew"
                     )
-                shutil.rmtree(self.path)
+                remove_written(self.path, (*RESULT_FILES, *self._own_recordings))
         try:
             for folder in (self.path / RUNS_FOLDER, self.recordings):
                 folder.mkdir(parents=True, exist_ok=True)
@@ -70,13 +80,15 @@ class Store:
             for folder in {self.path, self.recordings}:
                 stack.enter_context(_locked(folder))
             # What a sweep left that was killed.
-            for unfinished in (self.path / RUNS_FOLDER).glob(".*.unfinished"):
-                shutil.rmtree(unfinished, ignore_errors=True)
+            for folder in (self.path / RUNS_FOLDER, self.recordings):
+                for unfinished in folder.glob(".*.unfinished"):
+                    shutil.rmtree(unfinished, ignore_errors=True)
             try:
                 yield
             finally:
                 if not self.keep_recordings:
-                    shutil.rmtree(self.recordings, ignore_errors=True)
+                    with suppress(OSError):
+                        remove_written(self.path, self._own_recordings)
 
     def keep(self, task: str, rows: Sequence[Row]) -> None:
         """Put down the ``rows`` of a task in place of any that it had."""

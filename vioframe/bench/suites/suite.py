@@ -114,14 +114,17 @@ def shipped() -> dict[str, Path]:
     return {path.stem: path for path in sorted(folder.glob("*.yaml"))}
 
 
-def find(name: str) -> Path:
-    """The suite called ``name``, or the file of that name; raises :class:`ConfigError`."""
+def find(name: str, others: Iterable[str] = ()) -> Path:
+    """The suite called ``name``, or the file of that name.
+
+    Raises :class:`ConfigError`; ``others`` are names beside the suites' that may have been meant.
+    """
     suites = shipped()
     if name in suites:
         return suites[name]
     if Path(name).suffix in (".yaml", ".yml"):
         return Path(name)
-    hint = did_you_mean(name, suites)
+    hint = did_you_mean(name, [*suites, *others])
     raise ConfigError(f"no suite is called {name!r}{hint}; there are {', '.join(suites)}; or name a YAML file")
 
 

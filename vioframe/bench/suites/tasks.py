@@ -23,13 +23,13 @@ from vioframe.bench.suites.store import Store
 from vioframe.errors import RunError, TrajectoryError
 from vioframe.evaluation import TrajectoryErrors
 from vioframe.evaluation.consistency import Trial
-from vioframe.io.convert import appearing
+from vioframe.io.replace import appearing
 from vioframe.parts.config import Config, LabelledPart, PartConfig
 from vioframe.parts.registry import describe
 from vioframe.runs import machine
 from vioframe.runs.evaluated import create_metrics, evaluate_paths, measure_runs, write_matched_truth
 from vioframe.runs.folder import RunFolder
-from vioframe.runs.results import NEES_FILE, RUNS_FOLDER
+from vioframe.runs.results import NEES_FILE, RUNS_FOLDER, TASK_FILES
 from vioframe.simulation.config import SimulationConfig
 from vioframe.simulation.record import record
 from vioframe.simulation.recording import SimulatedRecording
@@ -96,7 +96,7 @@ def perform(task: AnyTask, store: Store, attempt: int) -> list[Figures]:
     if isinstance(task, SpeedTask):
         rows = speed(task)  # on the whole machine
     else:
-        with single_threaded(), appearing(store.run_folder(task.name), replace=True) as folder:
+        with single_threaded(), appearing(store.run_folder(task.name), replace=TASK_FILES) as folder:
             try:
                 rows = [_trial(task, folder) if isinstance(task, TrialTask) else _flight(task, store, folder)]
             except OSError as error:

@@ -79,6 +79,10 @@ def match_cameras(
     return _rig([part for part, _ in pairs], imu), tuple(source for _, source in pairs)
 
 
+CALIBRATION_FILES = ("*/sensor.yaml",)
+"""What :func:`write_calibration` writes, as patterns."""
+
+
 def sidecar_folder(recording: Path) -> Path:
     """Where the calibration of a recording that cannot hold one is kept: ``flight.bag.calib`` beside ``flight.bag``."""
     recording = recording.absolute()
@@ -154,5 +158,5 @@ def _source_of(part: CameraPart, sources: Sequence[str]) -> str | None:
 def _no_images(camera: str, sources: Sequence[str]) -> CalibrationError:
     return CalibrationError(
         f"it is not clear which images are those of {camera}: there are {', '.join(sources)}; "
-        f"say so with the reader's option cameras, as in cameras={camera}:{sources[0]}"
+        f"say so, as in -o cameras={camera}:{sources[0]}"
     )

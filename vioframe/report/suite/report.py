@@ -8,10 +8,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from vioframe.errors import PluginError, RunError
-from vioframe.io.convert import appearing
-from vioframe.runs.results import Results, task_count
+from vioframe.io.replace import appearing
+from vioframe.runs.results import REPORT_FILES, REPORT_FOLDER, Results, task_count
 
-REPORT_FOLDER = "report"
 MARKERS = ("index.html", "tables/provenance.csv")
 """Either tells a report from other folders."""
 
@@ -26,7 +25,7 @@ class Written:
 
 
 def write_report(results: Results, out: Path | None = None, *, page: bool = True) -> Written:
-    """Write everything to ``out``, by default ``report`` in the results; what was there before is replaced as a whole.
+    """Write everything to ``out``, by default ``report`` in the results; an older report there is replaced.
 
     Without ``page`` it is tables and figures alone. Raises :class:`RunError` where ``out`` is some other folder,
     :class:`DatasetError` where it cannot be written, and :class:`PluginError` where the extra that it needs is missing.
@@ -48,7 +47,7 @@ def write_report(results: Results, out: Path | None = None, *, page: bool = True
     made, drawn = tables(study), figures(study)
     quoted = {name: figure.file for name, figure in results.reference.figures.items()}
     # Written beside ``out``, so that links out of it hold as they are.
-    with appearing(out, replace=True) as folder:
+    with appearing(out, replace=REPORT_FILES) as folder:
         files = write_tables(made, folder / "tables", f"../{to_results}")
         files += write_figures(drawn, folder / "figures", formats=("png", "svg"), names=quoted)
         if page:
