@@ -75,7 +75,7 @@ class EurocDataset:
         if not file.is_file():
             there = ", ".join(sorted(file.parent.name for file in self._mav0.glob("*/data.csv")))
             remedy = f"choose cameras and imu among: {there}" if there else "no sensor is there; copy it again"
-            raise DatasetError(f"{file} is missing; {remedy}")
+            raise DatasetError(f"{file} is {'no ordinary file' if file.exists() else 'missing'}; {remedy}")
         return file
 
     @staticmethod

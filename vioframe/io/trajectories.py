@@ -39,8 +39,8 @@ _EUROC_HEADING = (
 )
 _QUAT_NORM_TOLERANCE = 0.01
 _INT64_MAX = 2**63 - 1
-# Unpacked, two million poses; a few hundred kilobytes can be made to unpack to more than any memory holds.
-_MOST_BYTES = 2**28
+# Some three million poses; a few hundred kilobytes can be made to unpack to more than any memory holds.
+_MOST_BYTES = 2**29
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,12 +149,13 @@ def _tum_line(t_ns: int, p_WB: Float, quat_xyzw: Float) -> str:
 
 def _read_text(path: Path) -> str:
     try:
-        data = path.read_bytes()
+        with path.open("rb") as file:
+            data = file.read(_MOST_BYTES + 1)
         if data.startswith(_GZIP_MAGIC):
-            with gzip.open(BytesIO(data)) as file:
-                data = file.read(_MOST_BYTES + 1)
-            if len(data) > _MOST_BYTES:
-                raise TrajectoryError(f"{path}: unpacks to more than {_MOST_BYTES >> 20} MiB; no trajectory is so long")
+            with gzip.open(BytesIO(data)) as unpacked:
+                data = unpacked.read(_MOST_BYTES + 1)
+        if len(data) > _MOST_BYTES:
+            raise TrajectoryError(f"{path}: holds more than {_MOST_BYTES >> 20} MiB; no trajectory is so long")
         return data.decode("utf-8-sig")
     except FileNotFoundError:
         raise TrajectoryError(f"{path}: no such trajectory file; check the path") from None
