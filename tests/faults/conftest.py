@@ -5,8 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from faults.command_line import vioframe_
 from rendered_flight import RenderedFlight, rendered_flight
+
+from faults.command_line import vioframe_
 
 
 @pytest.fixture(scope="session")

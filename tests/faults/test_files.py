@@ -10,10 +10,10 @@ from shutil import copy
 
 import numpy as np
 import pytest
-from faults.command_line import error_line, vioframe_
 from recordings import Message, image_message, imu_message, write_bag
 from rendered_flight import RenderedFlight
 
+from faults.command_line import error_line, vioframe_
 from vioframe.runs.folder import RunFolder
 from vioframe.types import FrameSet, ImuSample
 
@@ -327,8 +327,6 @@ def test_ground_truth_of_another_flight_does_not_spoil_a_run(here):
     assert "no comparison with the ground truth: no stamps in common" in done.stdout
 
 
-
-
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may read everything")
 @pytest.mark.parametrize("name", ["bad.bag", "c.yaml", "truth2.tum"])
 def test_what_may_not_be_read_is_named(here, name):
@@ -368,7 +366,10 @@ SURVIVED = {
     "image of the folder above": (named("../../secret.png"), {"frame_unreadable": 1}),
     "image of somewhere else": (named("/etc/passwd"), {"frame_unreadable": 1}),
     "image missing": (image(8, lambda file, data: None), {"frame_unreadable": 1}),
-    "image cut in half": (image(8, lambda file, data: file.write_bytes(data[: len(data) // 2])), {"frame_unreadable": 1}),
+    "image cut in half": (
+        image(8, lambda file, data: file.write_bytes(data[: len(data) // 2])),
+        {"frame_unreadable": 1},
+    ),
     "image of no byte": (image(8, lambda file, data: file.touch()), {"frame_unreadable": 1}),
     "image of text": (image(8, lambda file, data: file.write_text("GIF89a")), {"frame_unreadable": 1}),
     "image is a folder": (image(8, lambda file, data: file.mkdir()), {"frame_unreadable": 1}),

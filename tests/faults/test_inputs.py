@@ -13,8 +13,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from faults.command_line import vioframe_
 
+from faults.command_line import vioframe_
 from vioframe.errors import DatasetError
 from vioframe.evaluation import evaluate
 from vioframe.odometry import Odometry

@@ -5,9 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from faults.command_line import error_line, vioframe_
 from plugin_helpers import install
 
+from faults.command_line import error_line, vioframe_
 from vioframe.evaluation import evaluate
 from vioframe.runs.folder import RunFolder
 
@@ -225,7 +225,9 @@ def test_a_loop_closer_that_fails_is_named_and_the_run_is_kept(fails, says):
 
 
 def test_a_plugin_that_fails_to_load_does_not_stop_the_others(here, monkeypatch):
-    install(here / "broken", monkeypatch, distribution="broken", module="broken_parts", code="raise ValueError('a\\nb')")
+    install(
+        here / "broken", monkeypatch, distribution="broken", module="broken_parts", code="raise ValueError('a\\nb')"
+    )
     done = vioframe_(*RUN, "--detector", "prints", "--duration", 1, "--quiet")
     assert done.exit_code == 0
     assert done.stderr == "vioframe: warning: plug-in broken_parts (broken 1.0) is skipped: ValueError: a b\n"
