@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 
-from vioframe.errors import DatasetError
+from vioframe.errors import DatasetError, shortened, shown
 from vioframe.interfaces import DatasetFactory
 from vioframe.io.calibration import match_cameras
 from vioframe.io.images import check_bit_depth, decode_image, frame_set, gathered
@@ -27,6 +27,8 @@ _LARGEST_IMAGE = 1 << 28
 """Bytes of an image file."""
 # An IMU row counts as due when one of it and the next few rows is: a single wild stamp must not hold up all the rest.
 _ROWS_AHEAD = 5
+# Half of what 64 bits hold: the time between any two stamps fits as well.
+_LATEST_NS = 2**62
 
 
 class EurocDataset:
@@ -76,7 +78,7 @@ class EurocDataset:
             there = ", ".join(sorted(file.parent.name for file in self._mav0.glob("*/data.csv")))
             choice = f"choose by -o cameras=NAME and -o imu=NAME among: {there}"
             remedy = choice if there else "no sensor is there; copy it again"
-            raise DatasetError(f"{file} is missing; {remedy}")
+            raise DatasetError(f"{file} is {'no ordinary file' if file.exists() else 'missing'}; {remedy}")
         return file
 
     @staticmethod
@@ -122,15 +124,16 @@ class EurocDataset:
         # A recording from elsewhere may name any file of this machine, or a pipe that nobody writes to.
         named = PurePath(file)
         if named.is_absolute() or ".." in named.parts:
-            return Unreadable(t_ns, "frame_unreadable", f"{file} leads out of {folder.name}/data")
-        if not path.is_file() and path.exists():
-            return Unreadable(t_ns, "frame_unreadable", f"{path.name} is no ordinary file")
+            return Unreadable(t_ns, "frame_unreadable", f"{shortened(file)} leads out of {folder.name}/data")
         try:
+            if not path.is_file() and path.exists():
+                return Unreadable(t_ns, "frame_unreadable", f"{path.name} is no ordinary file")
             if path.is_file() and path.stat().st_size > _LARGEST_IMAGE:
                 return Unreadable(t_ns, "frame_unreadable", f"{path.name} is larger than {_LARGEST_IMAGE >> 20} MiB")
             image = decode_image(path.read_bytes(), str(path))
-        except OSError as err:
-            return Unreadable(t_ns, "frame_unreadable", f"{path.name}: {err.strerror}")
+        except (OSError, ValueError) as err:  # no file can have a name with a zero byte in it
+            reason = err.strerror if isinstance(err, OSError) else err
+            return Unreadable(t_ns, "frame_unreadable", f"{shortened(path.name)}: {reason}")
         if image is None:
             return Unreadable(t_ns, "frame_unreadable", f"{path.name} is damaged")
         return frame_set(t_ns, image, place, self.calibration, self._bit_depth, str(folder))
@@ -164,10 +167,10 @@ def _frame_rows(file: Path) -> Iterator[tuple[int, str]]:
     """Stamp and image file of each frame."""
     for row in _csv_rows(file):
         try:
-            t_ns = int(row[0])
+            t_ns = _stamp_ns(row[0])
         except ValueError:
             raise DatasetError(
-                f"{file}: {','.join(row)!r} does not begin with a stamp in integer nanoseconds"
+                f"{file}: {shown(','.join(row))} does not begin with a stamp in integer nanoseconds"
             ) from None
         yield t_ns, row[1].strip() if len(row) > 1 else f"{t_ns}.png"
 
@@ -178,11 +181,20 @@ def _imu_rows(file: Path) -> Iterator[ImuSample | Unreadable]:
     for row in _csv_rows(file):
         try:
             wx, wy, wz, ax, ay, az = map(float, row[1:7])
-            t_ns = int(row[0])
+            t_ns = _stamp_ns(row[0])
         except ValueError:
-            yield Unreadable(t_ns, "imu_unreadable", f"{file.name}: {','.join(row)!r} is no stamp with six readings")
+            problem = f"{file.name}: {shown(','.join(row))} is no stamp with six readings"
+            yield Unreadable(t_ns, "imu_unreadable", problem)
         else:
             yield ImuSample(t_ns, np.array([wx, wy, wz]), np.array([ax, ay, az]))
+
+
+def _stamp_ns(text: str) -> int:
+    """Raises :class:`ValueError` where ``text`` is no integer, or none that a stamp can be."""
+    t_ns = int(text)
+    if abs(t_ns) > _LATEST_NS:
+        raise ValueError("it is centuries away")
+    return t_ns
 
 
 def _rows_due(imu_t_ns: list[int], frame_t_ns: list[int]) -> list[int]:

@@ -185,6 +185,8 @@ def _opened(path: Path) -> Iterator[AnyReader]:
 
     if not path.exists():
         raise DatasetError(f"{path} does not exist")
+    if not (path.is_file() or path.is_dir()):
+        raise DatasetError(f"{path} is no ordinary file: a recording is read more than once")
     _bound_decompression()
     try:
         for file in path.glob("*.db3") if path.is_dir() else [path]:

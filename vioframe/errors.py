@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from reprlib import Repr
 
 
 class VioframeError(Exception):
@@ -34,6 +35,23 @@ class DivergedError(VioframeError):
 
 class RunError(VioframeError):
     """A run folder exists already, is incomplete, or cannot be written."""
+
+
+_MOST_SHOWN = 200
+_repr = Repr()
+_repr.maxstring = _repr.maxother = 100
+_repr.maxlist = _repr.maxdict = 10
+
+
+def shown(value: object) -> str:
+    """``value`` as it is shown in a message, which is a line however long or deep the value."""
+    return shortened(_repr.repr(value))
+
+
+def shortened(text: object) -> str:
+    """Some text in one line, cut off where that grows long."""
+    line = " ".join(str(text).split())
+    return line if len(line) <= _MOST_SHOWN else f"{line[:_MOST_SHOWN]}..."
 
 
 @contextmanager

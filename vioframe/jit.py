@@ -14,7 +14,6 @@ import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from functools import cache
-from getpass import getuser
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
@@ -66,10 +65,13 @@ def _folder(chosen: str) -> Path:
     """Where caches go: what the user told numba, or the user's cache folder, or a temporary one that can be written."""
     if chosen:
         return Path(chosen)
-    home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "vioframe" / "kernels"
-    with suppress(OSError):
+    # In a container that does not know its user there is no home to be found: a RuntimeError.
+    with suppress(OSError, RuntimeError):
+        home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "vioframe" / "kernels"
         home.mkdir(parents=True, exist_ok=True)
-    return home if os.access(home, os.W_OK) else _temporary_folder()
+        if os.access(home, os.W_OK):
+            return home
+    return _temporary_folder()
 
 
 @cache
@@ -78,7 +80,7 @@ def _temporary_folder() -> Path:
 
     What lies in a cache is run: from a folder that others can fill it would be their code.
     """
-    folder = Path(tempfile.gettempdir()) / f"vioframe-kernels-{getuser()}"
+    folder = Path(tempfile.gettempdir()) / f"vioframe-kernels-{os.getuid()}"
     with suppress(OSError):
         folder.mkdir(mode=0o700, exist_ok=True)
         found = folder.lstat()

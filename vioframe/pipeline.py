@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from vioframe.errors import DatasetError, RunError
+from vioframe.errors import DatasetError, PluginError, RunError
 from vioframe.geometry.trajectory import Trajectory
 from vioframe.incidents import Incidents
 from vioframe.interfaces import Dataset, LoopCloser
@@ -80,7 +80,12 @@ class Experiment:
         if self.loop_closer is None:
             return None
         with limited_threads(), self.registry.blaming():
-            return self.loop_closer.finish()
+            closure = self.loop_closer.finish()
+        if not isinstance(closure, LoopClosure):
+            assert self.config.loop_closure is not None
+            part = self.registry.find(LOOP_CLOSER, self.config.loop_closure.name)
+            raise PluginError(f"{part} returned a {type(closure).__name__}, not a LoopClosure; repair the plug-in")
+        return closure
 
 
 def prepare(config: Config, registry: Registry) -> Experiment:

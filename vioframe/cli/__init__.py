@@ -5,7 +5,10 @@ from __future__ import annotations
 import errno
 import logging
 import re
-from collections.abc import Mapping
+import signal
+import threading
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from importlib import import_module
 from typing import Any
 
@@ -38,6 +41,7 @@ _MODULES = {
 
 EXIT_BAD_INPUT = 2
 EXIT_INTERRUPTED = 130
+EXIT_TERMINATED = 143
 
 
 class LazyGroup(click.Group):
@@ -75,12 +79,34 @@ class LazyGroup(click.Group):
             formatter.write_dl(list(self._summaries.items()))
 
 
+class _Terminated(KeyboardInterrupt):
+    """A batch system or container asks to end: what is under way is completed as after Ctrl-C."""
+
+
+@contextmanager
+def _terminable() -> Iterator[None]:
+    """Within it SIGTERM raises :class:`_Terminated`; only the main thread of a process can see to that."""
+
+    def end(*_: object) -> None:
+        raise _Terminated
+
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGTERM, end)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
 class _Main(LazyGroup):
     """Turns errors into one line and an exit code."""
 
     def invoke(self, ctx: click.Context) -> object:
         try:
-            return super().invoke(ctx)
+            with _terminable():
+                return super().invoke(ctx)
         except VioframeError as error:
             if ctx.params["debug"]:
                 raise
@@ -93,6 +119,14 @@ class _Main(LazyGroup):
             what = f"{error.filename or 'the output'}: {error.strerror or error}"
             _say(f"error: cannot read or write {what}; check permissions and free space", error)
             ctx.exit(EXIT_BAD_INPUT)
+        except MemoryError as error:
+            if ctx.params["debug"]:
+                raise
+            _say("error: out of memory; give it less at a time, or a larger machine", error)
+            ctx.exit(EXIT_BAD_INPUT)
+        except _Terminated as error:
+            _say("terminated", error)
+            ctx.exit(EXIT_TERMINATED)
         except KeyboardInterrupt as error:
             _say("interrupted", error)
             ctx.exit(EXIT_INTERRUPTED)

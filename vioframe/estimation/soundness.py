@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 
 from vioframe.types import CalibrationEstimate, Estimate, NavState, Status
@@ -24,7 +26,12 @@ def defect_of(estimate: object, t_ns: int) -> str | None:
         return "landmark_ids repeat"
     if (defect := _defect_of_array("p_WF", estimate.p_WF, (len(ids), 3))) is not None:
         return defect
-    if any(seconds < 0.0 for seconds in estimate.stage_seconds.values()):
+    if not isinstance(estimate.events, tuple) or not all(isinstance(event, str) for event in estimate.events):
+        return "its events are not a tuple of texts"
+    spent = estimate.stage_seconds
+    if not isinstance(spent, Mapping) or not all(isinstance(seconds, float | int) for seconds in spent.values()):
+        return "stage_seconds are not seconds by stage"
+    if any(seconds < 0.0 for seconds in spent.values()):
         return "stage_seconds are negative"
     if not isinstance(estimate.calibration, CalibrationEstimate | None):
         return f"its calibration is a {type(estimate.calibration).__name__}, not a CalibrationEstimate"

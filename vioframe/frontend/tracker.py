@@ -9,7 +9,7 @@ from vioframe.frontend.candidates import CandidateSource
 from vioframe.frontend.flow import camera_rotation, equalise, follow, predict
 from vioframe.frontend.options import FrontendOptions
 from vioframe.frontend.refill import spread, thin
-from vioframe.geometry import two_view
+from vioframe.geometry import so3, two_view
 from vioframe.geometry.cameras import Camera
 from vioframe.incidents import Incidents
 from vioframe.interfaces import Detector
@@ -18,6 +18,8 @@ from vioframe.types import Calibration, Float, FrameSet, FrameTracks, Image, Imu
 
 # Standard deviation, in grey levels, below which an image (black, saturated, lens covered) shows nothing but noise.
 _FEATURELESS = 3.0
+# Turned by so much, a camera shows another image.
+_FROZEN_PX = 1.0
 # Points closer than this to the edge of the image are dropped: their patches reach beyond it.
 _BORDER_PX = 5.0
 # A point tracked forth and back must return to within this of where it was.
@@ -72,6 +74,7 @@ class Frontend:
         else:
             (on_body,) = calibration.cameras
             R_C2C1 = camera_rotation(imu, on_body.R_BC) if on_body.rotation_known else None
+            self._watch_for_frozen(image, R_C2C1, frames.t_ns)
             xy_normalised_before = self._follow(image, R_C2C1)
             watch.lap("klt")
             self._reject(xy_normalised_before, R_C2C1)
@@ -98,6 +101,14 @@ class Frontend:
                 f"image is {got}, but the calibration is for {width}x{height} grey uint8; "
                 "use the calibration of this camera, or convert the images"
             )
+
+    def _watch_for_frozen(self, image: Image, R_C2C1: Float | None, t_ns: int) -> None:
+        """Count an image that is the one before it to the last bit, though the camera turned: it was not taken anew."""
+        if R_C2C1 is None or self._image is None or not np.array_equal(image[::16, ::16], self._image[::16, ::16]):
+            return
+        turned_px = self._camera.focal_px * float(np.linalg.norm(so3.log(R_C2C1)))
+        if turned_px > _FROZEN_PX and np.array_equal(image, self._image):
+            self._incidents.add("frozen_image", t_ns)
 
     def _follow(self, image: Image, R_C2C1: Float | None) -> Float:
         """Move all tracks into ``image``, dropping the lost; returns (N, 2) where the others were, normalised."""

@@ -18,6 +18,9 @@ from vioframe.errors import CalibrationError
 
 DistortionModel = Literal["radtan", "equidistant"]
 
+# Of an image a side; it is what OpenCV can address.
+_MOST_PX = 32_767
+
 
 @dataclass(frozen=True)
 class Camera:
@@ -37,6 +40,8 @@ class Camera:
         numbers = [self.fx, self.fy, self.cx, self.cy, *self.distortion]
         if len(self.distortion) != 4 or not np.all(np.isfinite(numbers)) or self.fx <= 0.0 or self.fy <= 0.0:
             raise CalibrationError(f"camera needs fx, fy > 0 and four finite distortion coefficients, got {numbers}")
+        if len(self.resolution) != 2 or not all(1 <= size <= _MOST_PX for size in self.resolution):
+            raise CalibrationError(f"camera needs a resolution of (width, height) px, got {self.resolution}")
 
     @property
     def K(self) -> Float:

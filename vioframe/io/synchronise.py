@@ -12,7 +12,7 @@ from collections import deque
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from itertools import pairwise
-from math import inf, isfinite
+from math import hypot, inf, isfinite
 from statistics import median
 from typing import Generic, TypeVar
 
@@ -20,7 +20,7 @@ import numpy as np
 
 from vioframe.errors import ConfigError
 from vioframe.incidents import Incidents
-from vioframe.types import NS_PER_S, FrameSet, ImuSample, ImuSegment, Measurement
+from vioframe.types import GRAVITY_M_S2, NS_PER_S, FrameSet, ImuSample, ImuSegment, Measurement
 
 Packet = tuple[ImuSegment, FrameSet]
 T = TypeVar("T")
@@ -30,6 +30,13 @@ NS_PER_MS = 1_000_000
 _MAX_WAITING_FRAMES = 200
 # Beyond the range of any IMU that flies or is worn (4000 deg/s, 200 g): a fault of the sensor or of its bus.
 _MAX_RATE_RAD_S, _MAX_FORCE_M_S2 = 100.0, 2000.0
+# What repeats to the last bit for so long, and so often, is no measurement: a reading has noise. Slow sensors are
+# sometimes handed on at a higher rate than their own, so it must be longer than the period of one.
+_STUCK_NS, _STUCK_READINGS = 20 * NS_PER_MS, 4
+# An axis that is stuck beyond these is at the end of its range, and ranges begin at 125 deg/s and 2 g. All axes that are
+# stuck within them are those of a sensor or bus that has died, unless they are what a body at rest would read.
+_LEAST_RANGE_RAD_S, _LEAST_RANGE_M_S2 = 2.0, 19.0
+_REST_RAD_S, _REST_M_S2 = 0.1, 0.5
 _IMU_GAP_PERIODS = 5.0
 _CAMERA_GAP_PERIODS = 2.5
 _PERIOD_SAMPLES = 51
@@ -50,8 +57,8 @@ class Synchroniser:
     a later stamp, and still find its place. Of those two must have come, so that a single stamp from the far future
     does no harm. With 0 the first reading at or behind the frame lets it go: the least latency, for a stream in order.
 
-    ``incidents`` counts ``imu_nan``, ``imu_out_of_range``, ``imu_duplicate``, ``imu_out_of_order``, ``imu_gap``,
-    ``frame_duplicate``, ``frame_out_of_order``, ``frame_before_imu``, ``frame_after_imu``, ``frame_without_imu`` and
+    ``incidents`` counts ``imu_nan``, ``imu_out_of_range``, ``imu_saturated``, ``imu_frozen``, ``imu_duplicate``,
+    ``imu_out_of_order``, ``imu_gap``, ``frame_duplicate``, ``frame_out_of_order``, ``frame_before_imu``, ``frame_after_imu``, ``frame_without_imu`` and
     ``camera_gap``.
     """
 
@@ -189,6 +196,13 @@ class _Ordered(Generic[T]):
         self.t_ns.insert(place, t_ns)
         self.items.insert(place, item)
 
+    def drop(self, begin_ns: int, end_ns: int) -> int:
+        """Leave out what lies from ``begin_ns`` to ``end_ns``; how many they were."""
+        places = slice(bisect_left(self.t_ns, begin_ns), bisect_right(self.t_ns, end_ns))
+        count = len(self.t_ns[places])
+        del self.t_ns[places], self.items[places]
+        return count
+
     def take(self, count: int) -> tuple[list[int], list[T]]:
         """The ``count`` oldest, with their stamps, which are used up by that."""
         t_ns, items = self.t_ns[:count], self.items[:count]
@@ -196,6 +210,39 @@ class _Ordered(Generic[T]):
         if t_ns:
             self.last_used_ns = t_ns[-1]
         return t_ns, items
+
+
+class _Axes:
+    """Watches each of the six axes of an IMU for readings that repeat to the last bit."""
+
+    def __init__(self) -> None:
+        self._last: list[float] = []
+        # Of each axis: when the value that it has now was read first, and how often it was since.
+        self._since_ns, self._count = [0] * 6, [0] * 6
+
+    def add(self, t_ns: int, gyro_B: list[float], accel_B: list[float]) -> tuple[str, int] | None:
+        """Take in a reading; where the sensor is stuck the kind of incident, and since when."""
+        values = [*gyro_B, *accel_B]
+        if values != self._last:
+            for axis, (value, last) in enumerate(zip(values, self._last or [None] * 6, strict=True)):
+                if value != last:
+                    self._since_ns[axis], self._count[axis] = t_ns, 0
+            self._last = values
+        self._count = [count + 1 for count in self._count]
+        if max(self._count) < _STUCK_READINGS:
+            return None
+        stuck = [
+            axis
+            for axis, (since_ns, count) in enumerate(zip(self._since_ns, self._count, strict=True))
+            if count >= _STUCK_READINGS and t_ns - since_ns >= _STUCK_NS
+        ]
+        ends = [axis for axis in stuck if abs(values[axis]) > (_LEAST_RANGE_RAD_S if axis < 3 else _LEAST_RANGE_M_S2)]
+        if ends:
+            return "imu_saturated", min(self._since_ns[axis] for axis in ends)
+        moves = max(map(abs, gyro_B)) > _REST_RAD_S or abs(hypot(*accel_B) - GRAVITY_M_S2) > _REST_M_S2
+        if len(stuck) == 6 and moves:
+            return "imu_frozen", max(self._since_ns)
+        return None
 
 
 class _ImuBuffer(_Ordered[ImuSample]):
@@ -209,6 +256,7 @@ class _ImuBuffer(_Ordered[ImuSample]):
         self._gap_limit_ns: float | None = None
         self._last_gap_ns: int | None = None
         self._used: deque[tuple[int, ImuSample]] = deque(maxlen=_READINGS_KEPT)
+        self._axes = _Axes()
 
     def retime(self, offset_ns: int, frame_ns: int | None) -> None:
         """Move all stamps to the new offset; readings after the last frame's new time are there once more."""
@@ -240,6 +288,10 @@ class _ImuBuffer(_Ordered[ImuSample]):
             self._incidents.add("imu_nan", t_ns, "dropped: a reading is not finite")
         elif max(map(abs, gyro)) > _MAX_RATE_RAD_S or max(map(abs, accel)) > _MAX_FORCE_M_S2:
             self._incidents.add("imu_out_of_range", t_ns, "dropped: no IMU can measure such a reading")
+        elif (stuck := self._axes.add(t_ns, gyro, accel)) is not None:
+            kind, since_ns = stuck
+            for _ in range(1 + self.drop(since_ns, t_ns)):
+                self._incidents.add(kind, t_ns, "dropped: it reads the same to the last bit for 20 ms and more")
         else:
             self.put(t_ns, sample, None if self._end is None else self._end.t_ns)
 

@@ -10,16 +10,18 @@ from __future__ import annotations
 
 import gzip
 import re
+import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from decimal import Decimal, InvalidOperation
+from io import BytesIO
 from math import hypot, isfinite
 from pathlib import Path
 from typing import Self
 
 import numpy as np
 
-from vioframe.errors import TrajectoryError
+from vioframe.errors import TrajectoryError, shortened
 from vioframe.geometry import so3
 from vioframe.geometry.trajectory import Trajectory
 from vioframe.types import NS_PER_S, Float, Int
@@ -37,6 +39,8 @@ _EUROC_HEADING = (
 )
 _QUAT_NORM_TOLERANCE = 0.01
 _INT64_MAX = 2**63 - 1
+# Some three million poses; a few hundred kilobytes can be made to unpack to more than any memory holds.
+_MOST_BYTES = 2**29
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,7 +105,7 @@ def load_trajectory(
                 kind = "repeats" if stamp_ns == t_ns[-1] else "is before"
                 raise ValueError(f"the stamp {fields[0]} {kind} that of line {before[0]}; sort or drop such lines")
         except ValueError as problem:
-            raise TrajectoryError(f"{path.name}, line {number}: {problem}") from None
+            raise TrajectoryError(f"{path.name}, line {number}: {shortened(problem)}") from None
         t_ns.append(stamp_ns)
         rows.append(row)
         before = number, fields[0]
@@ -159,16 +163,22 @@ def _truth_in(folder: Path) -> Path:
 
 def _read_text(path: Path) -> str:
     try:
-        data = path.read_bytes()
+        with path.open("rb") as file:
+            data = file.read(_MOST_BYTES + 1)
         if data.startswith(_GZIP_MAGIC):
-            data = gzip.decompress(data)
+            with gzip.open(BytesIO(data)) as unpacked:
+                data = unpacked.read(_MOST_BYTES + 1)
+        if len(data) > _MOST_BYTES:
+            raise TrajectoryError(f"{path}: holds more than {_MOST_BYTES >> 20} MiB; no trajectory is so long")
         return data.decode("utf-8-sig")
     except FileNotFoundError:
         raise TrajectoryError(f"{path}: no such trajectory file; check the path") from None
     except UnicodeDecodeError:
         raise TrajectoryError(f"{path}: not a text file; give a TUM or EuRoC trajectory") from None
-    except (OSError, EOFError) as error:
-        raise TrajectoryError(f"{path}: cannot be read ({error}); give a TUM or EuRoC trajectory") from None
+    except (OSError, EOFError, zlib.error) as error:
+        raise TrajectoryError(
+            f"{path}: cannot be read ({getattr(error, 'strerror', None) or error}); give a TUM or EuRoC trajectory"
+        ) from None
 
 
 def _split(text: str) -> tuple[str, bool, list[tuple[int, list[str]]]]:

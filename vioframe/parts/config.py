@@ -17,11 +17,11 @@ from typing import Any, TypeVar, get_args
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 from pydantic_core import to_jsonable_python
 from ruamel.yaml import YAML
-from ruamel.yaml.error import YAMLError
 
-from vioframe.errors import ConfigError
+from vioframe.errors import ConfigError, shortened, shown
 from vioframe.estimation.options import EstimationOptions
 from vioframe.frontend import FrontendOptions
+from vioframe.io.yaml import parse_yaml, read_yaml_text
 from vioframe.parts.options import Option, did_you_mean, options_of, validate_options
 from vioframe.parts.registry import BACKEND, DETECTOR, LOOP_CLOSER, Kind, Part, Registry
 
@@ -111,11 +111,14 @@ def read(path: str | Path) -> Config:
 def read_tree(path: str | Path) -> dict[str, Any]:
     """The keys and values of a YAML file; raises :class:`ConfigError` where it holds none."""
     try:
-        tree = YAML(typ="safe", pure=True).load(Path(path).read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"cannot read the configuration {path}: {error}") from error
-    except YAMLError as error:
-        raise ConfigError(f"{path} is not valid YAML: {' '.join(str(error).split())}") from error
+        text = read_yaml_text(Path(path))
+    except (OSError, ValueError) as error:
+        reason = error.strerror if isinstance(error, OSError) else error
+        raise ConfigError(f"cannot read the configuration {path}: {reason}") from error
+    try:
+        tree = parse_yaml(text)
+    except ValueError as error:
+        raise ConfigError(f"{path} is not valid YAML: {error}") from error
     if not isinstance(tree, dict | None):
         raise ConfigError(f"{path} must hold keys and values; `vioframe config` prints an example")
     return tree or {}
@@ -133,7 +136,7 @@ def validate(model: type[SectionT], tree: Mapping[str, Any], origin: str) -> Sec
     except ValidationError as error:
         # A misspelt key first: what is missing because of it is found when that is put right.
         first = min(error.errors(), key=lambda one: one["type"] != "extra_forbidden")
-        where = ".".join(map(str, first["loc"]))
+        where = shortened(".".join(map(str, first["loc"])))
         if first["type"] == "extra_forbidden":
             known = _keys_beside(model, first["loc"])
             hint = did_you_mean(str(first["loc"][-1]), known)
@@ -141,7 +144,7 @@ def validate(model: type[SectionT], tree: Mapping[str, Any], origin: str) -> Sec
         problem = first["msg"].removeprefix("Value error, ")
         if not first["loc"]:  # values that do not go together
             raise ConfigError(f"{origin}: {problem}") from error
-        raise ConfigError(f"{origin}: {where}: {problem}, got {first['input']!r}") from error
+        raise ConfigError(f"{origin}: {where}: {problem}, got {shown(first['input'])}") from error
 
 
 def to_yaml(section: Section) -> str:
@@ -277,8 +280,8 @@ def _parse_value(option: Option, text: str) -> Any:
     Where neither suits it is as YAML, which says better what is wrong with it.
     """
     try:
-        parsed = YAML(typ="safe", pure=True).load(text)
-    except YAMLError:
+        parsed = parse_yaml(text)
+    except ValueError:
         return text
     for value in (parsed, text):
         try:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
-from vioframe.errors import CalibrationError
+from vioframe.errors import CalibrationError, shown
 from vioframe.io.calibration.formats import (
     CameraPart,
     Document,
@@ -123,7 +123,9 @@ def _documents(paths: Iterable[Path]) -> Iterator[tuple[Document, Path]]:
             for key in ("relative_config_imucam", "relative_config_imu"):
                 if key not in document:
                     raise CalibrationError(f"{path}: {key!r} is missing")
-                file = path.parent / str(document[key])
+                if not isinstance(document[key], str):
+                    raise CalibrationError(f"{path}: {key!r} should be a file's name, not {shown(document[key])}")
+                file = path.parent / document[key]
                 yield read_yaml(file), file
         elif is_calibration(document):
             yield document, path
@@ -133,7 +135,8 @@ def _documents(paths: Iterable[Path]) -> Iterator[tuple[Document, Path]]:
 
 def _files_in(folder: Path) -> list[Path]:
     for pattern in ("mav0/*/sensor.yaml", "*/sensor.yaml", "*.y*ml"):
-        if files := sorted(folder.glob(pattern)):
+        # A pipe that nobody writes to would be waited for without end.
+        if files := sorted(file for file in folder.glob(pattern) if file.is_file()):
             return files
     raise CalibrationError(f"there is no calibration file (sensor.yaml, *.yaml) in the folder {folder}")
 

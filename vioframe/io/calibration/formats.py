@@ -19,19 +19,20 @@ from __future__ import annotations
 
 import logging
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from math import sqrt
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
 import numpy as np
-from pydantic import AliasChoices, BaseModel, Field, FiniteFloat, PlainValidator, PositiveFloat, PositiveInt
+from pydantic import AliasChoices, BaseModel, Field, FiniteFloat, PlainValidator, PositiveInt
 from pydantic import ValidationError as InvalidError
 
-from vioframe.errors import CalibrationError
+from vioframe.errors import CalibrationError, shown
 from vioframe.geometry import so3
-from vioframe.geometry.cameras import Camera
+from vioframe.geometry.cameras import Camera, DistortionModel
+from vioframe.io.yaml import parse_yaml, read_yaml_text
 from vioframe.types import NS_PER_S, Calibration, CameraOnBody, Float, ImuNoise
 
 _log = logging.getLogger("vioframe.io.calibration")
@@ -45,6 +46,11 @@ _OPENCV_DIALECT = re.compile(r"^%YAML.*$|!!opencv-[\w-]+", re.MULTILINE)
 # Projection moves the last bits of any rotation: one that is exact but for these is kept, so as to read back equal.
 _ROUNDING = 1e-14
 _CHAIN_CAMERA = re.compile(r"cam\d+")
+# Beyond any number in these files: what is larger is damage, and would overflow on the way.
+_LARGEST = 1e30
+_LONGEST_SHIFT_S = 9e9  # an integer of nanoseconds holds no more
+_Positive = Annotated[float, Field(gt=0.0, lt=_LARGEST)]
+_Shift = Annotated[float, Field(gt=-_LONGEST_SHIFT_S, lt=_LONGEST_SHIFT_S)]
 # VINS-Mono's file does not state the rate its noise parameters belong to; this is the one they were tuned for.
 _VINS_MONO_RATE_HZ = 200.0
 
@@ -80,18 +86,15 @@ class ImuPart:
 
 def read_yaml(path: Path) -> Document:
     """The top level of a YAML file, OpenCV's dialect included."""
-    from ruamel.yaml import YAML
-    from ruamel.yaml.error import YAMLError
-
     try:
-        text = path.read_text(encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError) as err:
-        reason = err.strerror if isinstance(err, OSError) else "not a text file"
+        text = read_yaml_text(path)
+    except (OSError, ValueError) as err:
+        reason = err.strerror if isinstance(err, OSError) else err
         raise CalibrationError(f"cannot read the calibration {path}: {reason}") from None
     try:
-        values = YAML(typ="safe", pure=True).load(_OPENCV_DIALECT.sub("", text))
-    except YAMLError as err:
-        raise CalibrationError(f"{path} is not valid YAML: {' '.join(str(err).split())}") from None
+        values = parse_yaml(_OPENCV_DIALECT.sub("", text))
+    except ValueError as err:
+        raise CalibrationError(f"{path} is not valid YAML: {err}") from None
     if not isinstance(values, Mapping):
         raise CalibrationError(f"{path} holds no calibration: expected 'key: value' lines")
     return {str(key): value for key, value in values.items()}
@@ -188,9 +191,9 @@ def _numbers(*counts: int) -> PlainValidator:
     def read(value: Any) -> Float:
         try:
             array = np.asarray(value["data"] if isinstance(value, Mapping) else value, dtype=np.float64).ravel()
-        except (TypeError, ValueError, KeyError):
+        except (TypeError, ValueError, KeyError, OverflowError):
             raise ValueError(f"should be {expected} numbers") from None
-        if array.size not in counts or not np.isfinite(array).all():
+        if array.size not in counts or not (np.abs(array) < _LARGEST).all():
             raise ValueError(f"should be {expected} finite numbers")
         return array
 
@@ -207,7 +210,7 @@ class _PinholeCamera(BaseModel):
         np.zeros(0), validation_alias=AliasChoices("distortion_coefficients", "distortion_coeffs")
     )
     resolution: Annotated[Float, _numbers(2)]
-    timeshift_cam_imu: FiniteFloat = 0.0
+    timeshift_cam_imu: _Shift = 0.0
     camera_rotation: Literal["known", "unknown"] = "known"
     rostopic: str | None = None
     T_BS: Annotated[Float | None, _numbers(16)] = None
@@ -218,11 +221,11 @@ class _PinholeCamera(BaseModel):
 class _Imu(BaseModel):
     """EuRoC's or Kalibr's IMU: continuous-time densities, SI units; and OpenVINS' scale and misalignment matrices."""
 
-    gyroscope_noise_density: PositiveFloat
-    accelerometer_noise_density: PositiveFloat
-    gyroscope_random_walk: PositiveFloat
-    accelerometer_random_walk: PositiveFloat
-    rate_hz: PositiveFloat = Field(validation_alias=AliasChoices("rate_hz", "update_rate"))
+    gyroscope_noise_density: _Positive
+    accelerometer_noise_density: _Positive
+    gyroscope_random_walk: _Positive
+    accelerometer_random_walk: _Positive
+    rate_hz: _Positive = Field(validation_alias=AliasChoices("rate_hz", "update_rate"))
     T_BS: Annotated[Float | None, _numbers(16)] = None
     Tw: Annotated[Float | None, _numbers(9)] = None
     Ta: Annotated[Float | None, _numbers(9)] = None
@@ -241,12 +244,12 @@ class _VinsMono(BaseModel):
     estimate_extrinsic: int = 0
     extrinsicRotation: Annotated[Float | None, _numbers(9)] = None
     extrinsicTranslation: Annotated[Float | None, _numbers(3)] = None
-    td: FiniteFloat = 0.0
+    td: _Shift = 0.0
     image_topic: str | None = None
-    gyr_n: PositiveFloat
-    acc_n: PositiveFloat
-    gyr_w: PositiveFloat
-    acc_w: PositiveFloat
+    gyr_n: _Positive
+    acc_n: _Positive
+    gyr_w: _Positive
+    acc_w: _Positive
 
 
 def _parsed(model: type[ModelT], document: object, where: str) -> ModelT:
@@ -263,7 +266,7 @@ def _parsed(model: type[ModelT], document: object, where: str) -> ModelT:
         names = next((a.choices for a in aliases if isinstance(a, AliasChoices) and key in a.choices), [key])
         raise CalibrationError(f"{where}: {' or '.join(map(repr, names))} is missing")
     problem = error["msg"].removeprefix("Value error, ").replace("Input should", "should")
-    raise CalibrationError(f"{where}: {key!r} {problem}, not {error['input']!r}")
+    raise CalibrationError(f"{where}: {key!r} {problem}, not {shown(error['input'])}")
 
 
 def _camera(document: object, where: str, name: str) -> CameraPart:
@@ -276,9 +279,18 @@ def _camera(document: object, where: str, name: str) -> CameraPart:
     width, height = said.resolution.tolist()
     resolution = int(width), int(height)
     is_fisheye = said.distortion_model in ("equidistant", "equi")
-    model = Camera(fx, fy, cx, cy, (k1, k2, k3, k4), resolution, "equidistant" if is_fisheye else "radtan")
+    model = _model((fx, fy, cx, cy, k1, k2, k3, k4), resolution, "equidistant" if is_fisheye else "radtan", where)
     known, offset_ns = said.camera_rotation == "known", _nanoseconds(said.timeshift_cam_imu)
     return CameraPart(name, model, _T_BC(said, known, where), offset_ns, known, said.rostopic)
+
+
+def _model(numbers: Sequence[float], resolution: tuple[int, int], kind: DistortionModel, where: str) -> Camera:
+    """From fx fy cx cy and the four coefficients of distortion."""
+    fx, fy, cx, cy, d1, d2, d3, d4 = numbers
+    try:
+        return Camera(fx, fy, cx, cy, (d1, d2, d3, d4), resolution, kind)
+    except CalibrationError as error:
+        raise CalibrationError(f"{where}: {error}") from None
 
 
 def _T_BC(said: _PinholeCamera, known: bool, where: str) -> Float:
@@ -325,9 +337,9 @@ def _vins_mono(document: Document, where: str) -> tuple[CameraPart, ImuPart]:
     parameters = said.distortion_parameters | said.projection_parameters
     if missing := [key for key in keys.split() if key not in parameters]:
         raise CalibrationError(f"{where}: {missing[0]!r} is missing")
-    fx, fy, cx, cy, k1, k2, k3, k4 = (parameters[key] for key in keys.split())
     resolution = said.image_width, said.image_height
-    model = Camera(fx, fy, cx, cy, (k1, k2, k3, k4), resolution, "radtan" if is_pinhole else "equidistant")
+    numbers = [parameters[key] for key in keys.split()]
+    model = _model(numbers, resolution, "radtan" if is_pinhole else "equidistant", where)
 
     known, R_BC, p_BC = said.estimate_extrinsic != 2, np.eye(3), said.extrinsicTranslation
     if known and (said.extrinsicRotation is None or p_BC is None):
@@ -353,7 +365,7 @@ def _rigid_transform(values: Float, key: str, where: str) -> Float:
 def _rotation(R: Float, key: str, where: str) -> Float:
     """The rotation nearest to ``R`` (3, 3), which must be close to one; ``R`` itself where it is one already."""
     off = np.abs(R @ R.T - np.eye(3)).max()
-    if off > 1e-3 or np.linalg.det(R) < 0.0:
+    if not off <= 1e-3 or np.linalg.det(R) < 0.0:
         raise CalibrationError(f"{where}: {key!r} holds no rotation: its rows are not orthonormal and right-handed")
     return R if off < _ROUNDING else so3.project(R)
 
