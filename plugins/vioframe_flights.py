@@ -16,7 +16,8 @@ if TYPE_CHECKING:
     from vioframe.interfaces import FlightFactory
     from vioframe.simulation.flights import Shape, ShapedFlight
 
-_CONTROL_INTERVAL_S = 0.25
+# Between the control points of a path; of one that shakes with every step.
+_CONTROL_INTERVAL_S, _STEP_INTERVAL_S = 0.25, 0.08
 
 Size = Annotated[float, Field(gt=0.0, le=10.0, description="how many times as large the path is")]
 Speed = Annotated[float, Field(gt=0.0, le=10.0, description="how many times as fast everything happens")]
@@ -106,6 +107,15 @@ def tour(
     return _scaled(duration_s, R_LB, position, attitude, 1.0, 1.0)
 
 
+def walk(duration_s: float, R_LB: Float, *, size: Size = 1.0, speed: Speed = 1.0) -> ShapedFlight:
+    """A camera carried in the hand round a room: steps that shake it twice a second, looks to either side."""
+    steps = (1, 0.012, 1.06, 0.1), (2, 0.022, 0.53, 0.0)
+    position = _waves((0, 2.0, 17.0, 0.0), (1, 1.5, 11.0, 0.2), (2, 0.08, 5.1, 0.4), *steps)
+    shake = (0, 0.012, 1.06, 0.3), (1, 0.015, 0.53, 0.2), (2, 0.012, 1.06, 0.6)
+    attitude = _waves((0, 0.7, 8.0, 0.0), (0, 0.2, 2.7, 0.4), (1, 0.12, 3.3, 0.1), (2, 0.08, 2.9, 0.7), *shake)
+    return _scaled(duration_s, R_LB, position, attitude, size, speed, _STEP_INTERVAL_S)
+
+
 def pure_rotation(duration_s: float, R_LB: Float, *, speed: Speed = 1.0) -> ShapedFlight:
     """Turning on the spot, without any translation of the body."""
     attitude = _waves((0, 0.8, 6.0, 0.0), (1, 0.3, 3.7, 0.0), (2, 0.3, 4.3, 0.0))
@@ -153,7 +163,13 @@ def _smooth(x: Float) -> Float:
 
 
 def _scaled(
-    duration_s: float, R_LB: Float, position: Shape, attitude: Shape, size: float, speed: float
+    duration_s: float,
+    R_LB: Float,
+    position: Shape,
+    attitude: Shape,
+    size: float,
+    speed: float,
+    interval_s: float = _CONTROL_INTERVAL_S,
 ) -> ShapedFlight:
     """The same path ``size`` times as large, and the same motion ``speed`` times as fast."""
     from vioframe.simulation.flights import ShapedFlight
@@ -163,7 +179,7 @@ def _scaled(
         lambda t_s: size * position(speed * t_s),
         lambda t_s: attitude(speed * t_s),
         R_LB,
-        _CONTROL_INTERVAL_S / speed,
+        interval_s / speed,
     )
 
 
@@ -192,5 +208,5 @@ def _stop_and_go(shape: Shape) -> Shape:
 
 @hookimpl
 def vioframe_flights() -> Mapping[str, FlightFactory]:
-    flights = (standstill, hover, figure_eight, aggressive, stop_and_go, inspection, tour)
+    flights = (standstill, hover, figure_eight, aggressive, stop_and_go, inspection, tour, walk)
     return {flight.__name__: flight for flight in (*flights, pure_rotation, constant_velocity)}
