@@ -17,6 +17,7 @@ import pandas as pd
 
 from vioframe.bench.detectors.degradations import Degradation
 from vioframe.bench.detectors.tables import by_degradation
+from vioframe.report.units import length
 
 HERE = Path(__file__).resolve().parent
 ROOT = HERE.parent
@@ -59,7 +60,7 @@ def real_images() -> str:
             "initialised after": f"{row.initialised_s:.2f} s",
             "completion": f"{100.0 * row.completion:.1f} %",
             "resets": f"{row.resets}",
-            "ATE": f"{row.ate_mm:.1f} mm",
+            "ATE": length(1e-3 * row.ate_mm),
         }
         for row in rows.itertuples()
     ]
@@ -142,7 +143,7 @@ def april() -> str:
             "path": f"{row.path_m:.1f} m",
             "initialised after": f"{row.initialised_s:.2f} s",
             "resets": f"{row.resets}",
-            "ATE": f"{1e3 * row.ate_m:.1f} mm",
+            "ATE": length(row.ate_m),
             "ms a frame, tracks given": f"{row.cpu_ms:.1f}",
         }
         for row in rows.itertuples()
@@ -385,10 +386,8 @@ def _ate(rows: pd.DataFrame) -> str:
 def _spread(ate_m: Iterable[float]) -> str:
     """Mean and sample standard deviation, and of how many; of a single one just the value."""
     values = pd.Series(list(ate_m), dtype=float)
-    scale, spec, unit = (1.0, ".3f", "m") if values.mean() >= 0.1 else (1e3, ".1f", "mm")
-    if len(values) == 1:
-        return f"{scale * values[0]:{spec}} {unit}"
-    return f"{scale * values.mean():{spec}} ± {scale * values.std():{spec}} {unit} (n = {len(values)})"
+    of_many = f" (n = {len(values)})" if len(values) > 1 else ""
+    return f"{length(values.mean(), values.std())}{of_many}"
 
 
 def _range(values: pd.Series, spec: str, unit: str) -> str:

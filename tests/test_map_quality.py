@@ -111,7 +111,7 @@ def test_the_table_and_the_json_hold_the_map(tmp_path):
     other = recorded(tmp_path / "other", config=tmp_path / "real.bag")
     table = evaluate(run, other).stdout
     rows = {line.split("│")[0].strip(): line.split("│")[1:] for line in table.splitlines() if "│" in line}
-    assert [cell.strip() for cell in rows["90 % are within"]] == ["0.3000", "–"]
+    assert [cell.strip() for cell in rows["90 % are within"]] == ["0.300 m", "–"]
     assert [cell.strip() for cell in rows["within 5, 10, 20 cm"]] == ["40.0%, 60.0%, 80.0%", "–"]
     figures = json.loads(evaluate(run, "--format", "json").stdout)[0]["map"]
     assert figures["landmarks"] == 5
@@ -146,7 +146,7 @@ def test_what_has_no_map_says_so(tmp_path):
     # Beside a run that has one it is a note.
     result = evaluate(run, tmp_path / "file.tum", "--world", world, "--ground-truth", truth)
     assert "note: file: its map is not compared with the world: no landmarks" in result.stderr
-    assert "0.3000" in result.stdout
+    assert "0.300 m" in result.stdout
     truth.unlink()
     assert "pass --ground-truth" in evaluate(run, "--world", world, code=2).stderr
 

@@ -138,6 +138,42 @@ def test_no_line_is_drawn_across_a_gap():
     assert np.flatnonzero(np.isnan(line.get_ydata())).tolist() == [100]
 
 
+def test_a_run_that_is_lost_does_not_flatten_the_others(runs):
+    truth = flight()
+    away_m = 1e3 * np.linspace(0.0, 1.0, len(truth))[:, None] ** 3
+    lost = replace(evaluate_run(Trajectory(truth.t_ns, truth.R_WB, truth.p_WB + away_m), truth), name="lost")
+    for name in ("translation_error_per_axis", "relative_error", "comparison", "top_view"):
+        alone, beside = (drawn(each, name) for each in (runs, [*runs, lost]))
+        assert "lost leaves the picture" in " ".join(beside.get_supxlabel().split())
+        for ax, before in zip(beside.axes, alone.axes, strict=True):
+            assert np.ptp(ax.get_ylim()) == pytest.approx(np.ptp(before.get_ylim()), rel=0.3)
+
+
+def test_errors_of_millimetres_are_drawn_in_millimetres():
+    truth = flight()
+    run = evaluate_run(disturbed(truth, 1e-3, 1e-3), truth)
+    ax = drawn([run], "translation_error_per_axis").axes[0]
+    assert ax.get_ylabel() == "x [mm]"
+    expected = (1e3 * run.errors.position_m[:, 0]).astype(np.float32)
+    np.testing.assert_array_equal(ax.get_lines()[0].get_ydata(), expected)
+
+
+@pytest.mark.parametrize(("overconfident", "inside"), [(1.0, "100 % inside"), (30.0, "10 % inside")])
+def test_errors_are_drawn_within_what_is_said_of_them(overconfident, inside):
+    truth = flight()
+    shift_m = np.linspace(0.0, 0.03, len(truth))[:, None] * [1.0, 0.0, 0.0]
+    sigma = np.array([*[1e-3] * 3, *[0.01 / overconfident] * 3])
+    cov = np.tile(np.diag(sigma**2), (len(truth), 1, 1))
+    estimate = Trajectory(truth.t_ns, truth.R_WB, truth.p_WB + shift_m, cov)
+    canvas = drawn([evaluate_run(estimate, truth)], "translation_error_bounds")
+    ax = canvas.axes[0]
+    (band,) = ax.patches
+    assert np.abs(band.get_xy()[:, 1]).max() == pytest.approx(30.0 / overconfident)
+    share = float(ax.get_legend().get_texts()[0].get_text().split()[0])
+    assert share == pytest.approx(float(inside.split()[0]), abs=8.0)
+    assert "rotation_error_bounds" in {figure.name for figure in figures_of_runs([evaluate_run(estimate, truth)])}
+
+
 def evaluate_run(estimate, truth):
     return Evaluated("holed", None, estimate, truth, evaluate(estimate, truth))
 
@@ -187,7 +223,7 @@ def test_stages_stand_as_a_frame_goes_through_them():
     stages = ["loop_closure", "backend.update", "klt", "backend.other", "detect"]
     traces, _ = stage_bars(pd.DataFrame([[1.0] * 5], ["run"], stages), [])
     assert [trace["meta"]["series"] for trace in traces] == [
-        *("klt", "detect", "backend.update", "backend.other", "loop_closure")
+        *("klt", "detect", "update", "rest of back-end", "loop closure")
     ]
     assert len({trace["marker"]["color"] for trace in traces}) == 5
 

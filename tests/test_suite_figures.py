@@ -22,6 +22,7 @@ from vioframe.report.style import RC
 from vioframe.report.suite.figures import figures
 from vioframe.report.suite.report import write_report
 from vioframe.report.suite.statistics import Study, records
+from vioframe.report.units import length
 from vioframe.runs.results import Data
 
 PNG = b"\x89PNG\r\n\x1a\n"
@@ -136,7 +137,7 @@ def test_the_comparison_has_the_root_mean_squares_of_the_evaluation(compared):
     }
     for row in records(compared.flights[compared.flights["evaluated"]].groupby(["detector", "backend"]).tail(1)):
         key = row["detector"], row["backend"]
-        assert said[*key, "y"] == f"RMSE {row['ate_m']:.3g} m"
+        assert said[*key, "y"] == f"RMSE {length(row['ate_m'])}"
         assert said[*key, "y2"] == f"RMSE {row['orientation_deg']:.3g} deg"
 
 
@@ -258,10 +259,12 @@ def test_a_report_replaces_the_one_before_and_tells_of_an_unfinished_sweep(tmp_p
         "1 of 2 tasks failed; tables/failures.md has their errors",
     )
     assert all((first.folder / file).is_file() for file in first.files)
-    stale = first.folder / "stale.txt"
-    stale.touch()
+    stale, theirs = first.folder / "figures" / "stale.png", first.folder / "notes.txt"
+    for file in (stale, theirs):
+        file.touch()
     write_report(results, page=False)
     assert not stale.exists()
+    assert theirs.exists()
     assert sorted(path.name for path in (tmp_path / "results").iterdir()) == [
         "report",
         "results.jsonl",

@@ -90,6 +90,7 @@ def montecarlo(
     from vioframe.report.suite.statistics import Study, groups
     from vioframe.report.suite.tables import nees_of_trials
     from vioframe.report.tables import to_rich
+    from vioframe.report.units import length
     from vioframe.runs.recorder import check_run_folder, free_run_folder, new_run_folder
     from vioframe.runs.results import Reference, Results
 
@@ -114,7 +115,7 @@ def montecarlo(
         def on_trial(trial: Trial) -> None:
             nonlocal failed
             failed += trial.failure is not None
-            went = trial.failure or f"{trial.figures['ate_m']:.3f} m, {trial.figures['orientation_deg']:.2f} deg"
+            went = trial.failure or f"{length(trial.figures['ate_m'])}, {trial.figures['orientation_deg']:.2f} deg"
             bar(f"{failed} failed, seed {trial.seed}: {went}")
 
         trials = map_in_processes(fly_trial, tasks, workers or usable_cores(), on_trial)

@@ -17,6 +17,7 @@ from vioframe.parts import config as configuration
 from vioframe.parts import registry
 from vioframe.parts.config import Config
 from vioframe.pipeline import Experiment, prepare, record
+from vioframe.report.units import length
 from vioframe.runs.folder import RunFolder
 from vioframe.runs.recorder import check_run_folder, free_run_folder
 from vioframe.types import NS_PER_S, Step
@@ -140,6 +141,6 @@ def _accuracy(estimate: Trajectory, truth: Trajectory) -> str:
     except TrajectoryError as error:
         return f"no comparison with the ground truth: {error}"
     return (
-        f"ATE {1e3 * errors.ate_m.rmse:.1f} mm (position and yaw aligned) over {errors.truth.path_length_m:.1f} m, "
+        f"ATE {length(errors.ate_m.rmse)} (position and yaw aligned) over {errors.truth.path_length_m:.1f} m, "
         f"orientation {errors.orientation_deg.rmse:.2f} deg"
     )

@@ -9,8 +9,8 @@ those a point, where the points of a trace have several. ``note`` is a figure of
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -21,14 +21,19 @@ from vioframe.evaluation.consistency import PARTS
 from vioframe.evaluation.metrics import rotation_error_deg
 from vioframe.evaluation.nees import band
 from vioframe.report.style import TRUTH_COLOUR, looks
+from vioframe.report.units import length, length_unit
 from vioframe.runs.evaluated import Evaluated
-from vioframe.types import NS_PER_S, Float, Int
+from vioframe.types import DP, DTHETA, NS_PER_S, Float, Int
 
 BAND_COLOUR = "#009e73"
 """Of the range that errors are meant to stay in: no run's, as it is only ever drawn as an area."""
 ROW, FRAME = 34, 90
 """Heights, px: of a row of bars, and of what is around them."""
 POINTS = 2000
+_FAR, _FAR_PART = 10.0, 0.2
+_SIGMAS = 3.0
+_VISIBLE = 0.02
+"""Of the longest bar."""
 # Lightness tells the stages apart, the hue front-end from back-end.
 _FRONT_END = ("#24415e", "#3f6a94", "#6f9bc4", "#a9c8e4", "#d3e3f2")
 _BACK_END = (
@@ -94,8 +99,11 @@ class Line:
 
     def seconds(self, t_ns: Int) -> Float:
         """Stamps (N,) as they are shown, since the ground truth begins, or the estimate where there is none."""
+        return self.shown(t_ns, self.since_begin(t_ns))
+
+    def since_begin(self, t_ns: Int) -> Float:
         begin_ns = (self.run.ground_truth.t_ns if self.run.ground_truth else t_ns)[0]
-        return self.shown(t_ns, (t_ns - begin_ns) / NS_PER_S)
+        return np.asarray((t_ns - begin_ns) / NS_PER_S)
 
 
 @dataclass(frozen=True)
@@ -122,7 +130,15 @@ def figures_of_runs(runs: Sequence[Evaluated], half_width_m: float = 0.0) -> lis
         Line(run, {"series": run.name}, colour, dash, f"{colour}bf", [run.errors] if run.errors else [])
         for run, (colour, dash) in zip(runs, looks(runs), strict=True)
     ]
-    found = [*figures_of_courses([Course("all", lines)], half_width_m), _timing(lines), _tracks(lines)]
+    course = Course("all", lines)
+    axes_m, angles = [f"{axis} [{{}}]" for axis in ("x", "y", "z (up)")], ("roll [deg]", "pitch [deg]", "yaw [deg]")
+    found = [
+        *figures_of_courses([course], half_width_m),
+        _within_bounds(course, "translation_error_bounds", "Translation error within its bounds", axes_m, DP),
+        _within_bounds(course, "rotation_error_bounds", "Rotation error within its bounds", angles, DTHETA),
+        _timing(lines),
+        _tracks(lines),
+    ]
     return [figure for figure in found if figure.cases]
 
 
@@ -151,21 +167,43 @@ def trajectories(courses: Sequence[Course]) -> Figure:
         traces = [
             {**_path(_thinned(truth.p_WB, [])), **grey, "meta": {"series": "ground truth"}} for truth in truths.values()
         ]
+        far, p_near = _far_off(course), [truth.p_WB for truth in truths.values()]
+        p_near += [estimate.p_WB for line, estimate in drawn if line.series not in far]
+        box = _box(np.concatenate(p_near)) if far else None
         for line, estimate in drawn:
             hover = f"(%{{x:.2f}}, %{{y:.2f}}, %{{z:.2f}}) m at %{{customdata:.1f}} s<extra>{line.series}</extra>"
-            path = {**_path(line.shown(estimate.t_ns, estimate.p_WB)), "line": line.style(4), "meta": line.meta}
+            path = {
+                **_path(_within(line.shown(estimate.t_ns, estimate.p_WB), box)),
+                "line": line.style(4),
+                "meta": line.meta,
+            }
             traces.append({**path, "customdata": line.seconds(estimate.t_ns), "hovertemplate": hover})
         for line, estimate in drawn:
             dot = {"mode": "markers", "marker": {"size": 5, "color": line.colour}, "hoverinfo": "skip"}
-            traces.append({**_path(estimate.p_WB[:1]), **dot, "meta": line.meta})
+            traces.append({**_path(_within(estimate.p_WB[:1], box)), **dot, "meta": line.meta})
         scene = {"aspectmode": "data", **{f"{axis}axis": {"title": {"text": f"{axis} [m]"}} for axis in "xyz"}}
         layout = {"scene": scene, "margin": {"l": 0, "r": 0, "t": 0, "b": 0}}
         if drawn:
-            cases[course.label] = course.case(traces, layout, of_many=True)
+            cases[course.label] = _noted(course, far).case(traces, layout, of_many=True)
     how = _aligned_by(courses)
     about = f"Each estimate is aligned with the ground truth by {how}" if how else "Each estimate in its own frame"
     heights: dict[str, Any] = {"height": 560, "narrow_height": 400}
     return Figure("trajectories_3d", "Trajectories", cases, f"{about}. Dots mark the starts.", views=True, **heights)
+
+
+def _box(p_W: Float) -> tuple[Float, Float]:
+    """Corners (3,) of what is shown around the points (N, 3) m."""
+    low, high = p_W.min(axis=0), p_W.max(axis=0)
+    margin = 0.1 * (high - low).max()
+    return low - margin, high + margin
+
+
+def _within(p_W: Float, box: tuple[Float, Float] | None) -> Float:
+    """Points (N, 3) m, NaN where they are out of the box."""
+    if box is None:
+        return p_W
+    inside = np.asarray((p_W >= box[0]) & (p_W <= box[1])).all(axis=1, keepdims=True)
+    return np.where(inside, p_W, np.nan)
 
 
 def _path(p_W: Float) -> Trace:
@@ -182,24 +220,69 @@ def _over_time(
     panel_titles: Sequence[str],
     series: _Series,
     bands: Sequence[tuple[float, float]] = (),
-    **y: Any,
 ) -> dict[str, Case]:
-    """What there is of each run over time, a panel each, with its band shaded; ``y`` is for every panel's axis."""
+    """What there is of each run over time, a panel each, with its band shaded.
+
+    A title with ``{}`` is of a length, in metres: its unit is chosen by what there is to show.
+    """
     cases = {}
     for course in courses:
+        far, edge_m = _far_off(course), 1.2 * max((high for _, high in bands), default=0.0)
+        scale, unit = length_unit(max(_largest_m(course, far), edge_m))
+        scales = [scale if "{}" in title else 1.0 for title in panel_titles]
         traces: list[Trace] = []
+        near: list[list[Float]] = [[] for _ in panel_titles]
         for line, errors in course.with_errors:
             for k, (t_ns, values, note) in enumerate(series(errors)):
                 said = f"%{{y:.3f}} at %{{x:.1f}} s{f', {note}' if note else ''}<extra>{line.series}</extra>"
                 time_s, meta = None if k else line.seconds(t_ns), {**line.meta, "note": note, "x_back": k}
-                shown = line.shown(t_ns, values)
+                shown = line.shown(t_ns, scales[k] * values)
                 traces.append(scatter(time_s, shown, meta, k, line=line.style(), hovertemplate=said))
-        layout = panels(panel_titles, "time since the ground truth begins [s]", **y)
-        if bands:
-            layout["shapes"] = [_shaded(k, *ends) for k, ends in enumerate(bands)]
+                if line.series not in far:
+                    near[k].append(shown)
+        layout = panels([title.format(unit) for title in panel_titles], "time since the ground truth begins [s]")
+        for k, (low, high) in enumerate(bands):
+            layout.setdefault("shapes", []).append(_shaded(k, scales[k] * low, scales[k] * high))
+        for k, kept in enumerate(near):
+            # The band's edges are in sight, however small the errors are.
+            edges = [1.2 * scales[k] * end for end in bands[k]] if bands and "{}" in panel_titles[k] else []
+            if far and kept:
+                layout[axis_name("y", k)] |= {"range": _around(np.concatenate([*kept, edges]))}
+            elif edges:
+                layout[axis_name("y", k)] |= {"autorangeoptions": {"include": edges}}
         if traces:
-            cases[course.label] = course.case(traces, layout, of_many=name == "translation_error_per_axis")
+            noted = _noted(course, far)
+            cases[course.label] = noted.case(traces, layout, of_many=name == "translation_error_per_axis")
     return cases
+
+
+def _far_off(course: Course) -> dict[str, float]:
+    """The runs, and how many metres, that would flatten all others: ten times as far from the truth as the next, and
+    farther than a fifth of what the flight extends over."""
+    worst = sorted((float(np.abs(errors.position_m).max()), line.series) for line, errors in course.with_errors)
+    extent_m = max((float(np.ptp(errors.truth.p_WB, axis=0).max()) for _, errors in course.with_errors), default=0.0)
+    for k in range(1, len(worst)):
+        if worst[k][0] > max(_FAR * worst[k - 1][0], _FAR_PART * extent_m):
+            return {series: error_m for error_m, series in worst[k:]}
+    return {}
+
+
+def _largest_m(course: Course, far: Collection[str]) -> float:
+    near = [errors.position_m for line, errors in course.with_errors if line.series not in far]
+    return max((float(np.abs(position_m).max()) for position_m in near), default=0.0)
+
+
+def _noted(course: Course, far: Mapping[str, float]) -> Course:
+    """It says who leaves the picture."""
+    left = [f"{series} leaves the picture: it gets {length(error_m)} off." for series, error_m in far.items()]
+    return replace(course, note=" ".join([*[course.note] * bool(course.note), *left]))
+
+
+def _around(values: Float) -> list[float]:
+    """An axis' range for them."""
+    low, high = float(np.nanmin(values)), float(np.nanmax(values))
+    margin = 0.05 * (high - low)
+    return [low - margin, high + margin]
 
 
 def translation_error(courses: Sequence[Course], half_width_m: float = 0.0) -> Figure:
@@ -210,11 +293,9 @@ def translation_error(courses: Sequence[Course], half_width_m: float = 0.0) -> F
         notes = [f"{share[axis]:.1f} % inside" if half_width_m else "" for axis in "xyz"]
         return [(errors.estimate.t_ns, errors.position_m[:, k], notes[k]) for k in range(3)]
 
-    name, titles = "translation_error_per_axis", [f"{axis} [m]" for axis in ("x", "y", "z (up)")]
+    name, titles = "translation_error_per_axis", [f"{axis} [{{}}]" for axis in ("x", "y", "z (up)")]
     bands = [(-half_width_m, half_width_m)] * 3 if half_width_m else []
-    # The band's edges are in sight, however small the errors are.
-    least = {"autorangeoptions": {"include": [-1.2 * half_width_m, 1.2 * half_width_m]}} if half_width_m else {}
-    cases = _over_time(courses, name, titles, series, bands, **least)
+    cases = _over_time(courses, name, titles, series, bands)
     shaded = f" Shaded: ±{100 * half_width_m:g} cm, beside how much of the estimated time is inside."
     about = f"Estimate minus ground truth in the world's axes, aligned by {_aligned_by(courses)} over the whole path."
     about += shaded if half_width_m else ""
@@ -230,14 +311,67 @@ def _rotation_error(courses: Sequence[Course]) -> Figure:
     return Figure("rotation_error", "Rotation error", cases, about, height=560, narrow_height=520)
 
 
+def _within_bounds(course: Course, name: str, title: str, titles: Sequence[str], part: slice) -> Figure:
+    """Errors along three axes and the three standard deviations that the estimate states of them."""
+    far = _far_off(course)
+    # Stamps (N,), errors and bounds (N, 3) of the stretches of each run that states any.
+    stated: list[tuple[Line, list[tuple[Int, Float, Float]]]] = []
+    for line in course.lines:
+        stretches = [bounded for errors in line.run.errors_by_stretch() if (bounded := _bounded(errors, part))]
+        stated += [(line, stretches)] * bool(stretches)
+    near = [each for line, own in stated if line.series not in far for each in own]
+    scale, unit = (
+        length_unit(max((float(np.abs(e).max()) for _, e, _ in near), default=0.0)) if part == DP else (1.0, "")
+    )
+    areas, lines = [], []
+    for line, own in stated:
+        inside = np.mean(np.concatenate([np.abs(values) <= bound for _, values, bound in own]), axis=0)
+        for k in range(3):
+            for number, (t_ns, values, bound) in enumerate(own):
+                edge, time_s = _thinned(scale * bound[:, k], []), _thinned(line.since_begin(t_ns), [])
+                areas.append(area(time_s, -edge, edge, line.meta, k, line.colour, 0.15))
+                meta = {**line.meta, "note": "" if number else f"{100.0 * inside[k]:.0f} % inside"}
+                drawn = line.shown(t_ns, scale * values[:, k])
+                lines.append(scatter(line.seconds(t_ns), drawn, meta, k, line=line.style()))
+    layout = panels([each.format(unit) for each in titles], "time since the ground truth begins [s]")
+    for k in range(3) if near else ():
+        error = scale * max(float(np.abs(values[:, k]).max()) for _, values, _ in near)
+        widest = scale * max(float(bound[:, k].max()) for _, _, bound in near)
+        # Bounds far beyond all errors, as right after a start, leave the picture.
+        half = 1.05 * max(error, min(widest, _SIGMAS * error))
+        layout[axis_name("y", k)] |= {"range": [-half, half]} if half else {}
+    about = (
+        "Position and yaw fixed at the first pose of each stretch, from where an estimate counts its covariance. "
+        "Shaded: ±3 sigma as it says, beside how much of the time the error is inside: 99.7 % if that is honest."
+    )
+    case = _noted(course, far).case([*areas, *lines], layout)
+    return Figure(name, title, {"all": case} if lines else {}, about)
+
+
+def _bounded(errors: TrajectoryErrors, part: slice) -> tuple[Int, Float, Float] | None:
+    """Stamps (N,), errors and bounds (N, 3) where the covariance is known; m, or deg about the world's axes."""
+    if errors.estimate.cov_pose is None:
+        return None
+    cov, values = errors.estimate.cov_pose[:, part, part], errors.position_m
+    if part == DTHETA:
+        # R <- R Exp(dtheta) is along the body's axes: about the world's it is R P R^T.
+        R_WB, values = errors.estimate.R_WB, errors.rotation_rpy_deg
+        cov = np.degrees(np.degrees(R_WB @ cov @ R_WB.transpose(0, 2, 1)))
+    variance = np.diagonal(cov, axis1=1, axis2=2)
+    known = np.isfinite(variance).all(axis=1)
+    if not known.any():
+        return None
+    return errors.estimate.t_ns[known], values[known], _SIGMAS * np.sqrt(np.maximum(variance[known], 0.0))
+
+
 def _comparison(courses: Sequence[Course]) -> Figure:
     def series(errors: TrajectoryErrors) -> list[tuple[Int, Float, str]]:
         t_ns, metres = errors.estimate.t_ns, np.asarray(np.linalg.norm(errors.position_m, axis=1))
         degrees = rotation_error_deg(errors.estimate, errors.truth)
-        sizes = ((metres, errors.ate_m.rmse, "m"), (degrees, errors.orientation_deg.rmse, "deg"))
-        return [(t_ns, values, f"RMSE {rmse:.3g} {unit}") for values, rmse, unit in sizes]
+        sizes = ((metres, length(errors.ate_m.rmse)), (degrees, f"{errors.orientation_deg.rmse:.3g} deg"))
+        return [(t_ns, values, f"RMSE {rmse}") for values, rmse in sizes]
 
-    cases = _over_time(courses, "comparison", ("translation error [m]", "rotation error [deg]"), series)
+    cases = _over_time(courses, "comparison", ("translation error [{}]", "rotation error [deg]"), series)
     about = f"Distance from the truth and angle to it, aligned by {_aligned_by(courses)} over the whole path."
     return Figure("comparison", "Size of the errors", cases, about, height=380, narrow_height=520)
 
@@ -293,7 +427,8 @@ def relative_error(courses: Sequence[Course]) -> Figure:
         layout = panels(titles, f"length of the stretch [{'% of the path' if of_path else 'm'}]", rangemode="tozero")
         for k in range(2):
             layout[axis_name("x", k)] |= category(list(names.values()))
-        traces = []
+        traces, far = [], _far_off(course)
+        tops: list[list[float]] = [[], []]
         for number, own in stretches.groupby("line"):
             line = course.lines[int(str(number))]
             for k, column in enumerate(("translation_percent", "yaw_deg")):
@@ -304,8 +439,13 @@ def relative_error(courses: Sequence[Course]) -> Figure:
                 box |= dict(zip(keys, five.to_numpy().T, strict=True)) | {"fillcolor": line.fill}
                 box |= {"name": line.series, "offsetgroup": line.series, "hoverinfo": "y+name"}
                 traces.append({**box, "meta": line.meta, **axes(k)})
+                if line.series not in far:
+                    tops[k] += five[0.95].tolist()
+        for k, top in enumerate(tops):
+            if far and top:
+                layout[axis_name("y", k)] |= {"range": [0.0, 1.1 * max(top)]}
         layout |= {"boxmode": "group", "boxgap": 0.25, "boxgroupgap": 0.3}
-        cases[course.label] = course.case(traces, layout, of_many=True)
+        cases[course.label] = _noted(course, far).case(traces, layout, of_many=True)
     about = (
         "Every pose of every run starts a stretch, aligned at its first pose; stretches overlap. Boxes: quartiles and "
         "median; whiskers: 5 to 95 %."
@@ -352,6 +492,16 @@ def stage_bars(means: pd.DataFrame, owners: Sequence[Mapping[str, str]]) -> tupl
     def part(stage: str) -> str:
         return stage.partition(".")[0]
 
+    def called(stage: str) -> str:
+        """Whose it is, the colour says."""
+        return {"backend.other": "rest of back-end"}.get(stage, stage.removeprefix("backend.").replace("_", " "))
+
+    # Those of the back-end that nobody could see go into its rest.
+    least_ms, rest = _VISIBLE * means.sum(axis=1).max(), "backend.other"
+    small = [stage for stage in map(str, means) if part(stage) == "backend" and (means[stage] < least_ms).all()]
+    if set(small) - {rest}:
+        merged = [*small, *[rest] * (rest in means and rest not in small)]
+        means = means.drop(columns=merged).assign(**{rest: means[merged].sum(axis=1)})
     # As a frame goes through them: the front-end's, of which the order knows nothing, are the first.
     stages = sorted(means.columns, key=lambda stage: order.index(part(stage)) if part(stage) in order else -1)
     traces = [
@@ -361,12 +511,12 @@ def stage_bars(means: pd.DataFrame, owners: Sequence[Mapping[str, str]]) -> tupl
             "x": means[stage].tolist(),
             "y": list(means.index),
             "marker": {"color": next(shades.get(part(stage), front_end))},
-            "text": [stage.removeprefix("backend.").replace("_", " ")] * len(means),
+            "text": [called(stage)] * len(means),
             "textposition": "inside",
             "insidetextanchor": "middle",
             "textangle": 0,
             "hovertemplate": "%{y}: %{x:.2f} ms" + f"<extra>{stage}</extra>",
-            "meta": {"series": stage, "owners": owners},
+            "meta": {"series": called(stage), "owners": owners},
         }
         for stage in stages
     ]

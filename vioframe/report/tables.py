@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
+from string import Formatter
 from typing import TYPE_CHECKING, Any
 
 from vioframe.evaluation import ALIGNED_BY
 from vioframe.evaluation.landmarks import WITHIN_CM
 from vioframe.report.table import UNKNOWN, markdown
+from vioframe.report.units import length
 from vioframe.runs.evaluated import Evaluated
 
 if TYPE_CHECKING:
@@ -17,7 +19,7 @@ if TYPE_CHECKING:
 
 _STYLES = {"consistent": "green", "overconfident": "red", "pessimistic": "yellow"}
 
-# Cells by section and label, as formats of what `Evaluated.to_dict` holds.
+# Cells by section and label, as formats of what `Evaluated.to_dict` holds; `!m` is a length.
 _RUN = {
     "detector": "{detector}",
     "back-end": "{backend}",
@@ -30,12 +32,12 @@ _RUN = {
     "path length [m]": "{path_length_m:.2f}",
 }
 _POSITION = {
-    "RMSE": "{ate_m[rmse]:.4f}",
-    "mean": "{ate_m[mean]:.4f}",
-    "median": "{ate_m[median]:.4f}",
-    "max": "{ate_m[max]:.4f}",
-    "max |x|, |y|, |z|": "{max_position_m[x]:.3f}, {max_position_m[y]:.3f}, {max_position_m[z]:.3f}",
-    "RMSE after SE(3) alignment": "{ate_se3_m:.4f}",
+    "RMSE": "{ate_m[rmse]!m}",
+    "mean": "{ate_m[mean]!m}",
+    "median": "{ate_m[median]!m}",
+    "max": "{ate_m[max]!m}",
+    "max |x|, |y|, |z|": "{max_position_m[x]!m}, {max_position_m[y]!m}, {max_position_m[z]!m}",
+    "RMSE after SE(3) alignment": "{ate_se3_m!m}",
     "scale by Sim(3) [1]": "{scale:.4f}",
 }
 _ORIENTATION = {
@@ -51,9 +53,9 @@ _NEES = {
 }
 _MAP = {
     "landmarks": "{map[landmarks]:d}",
-    "median": "{map[median_m]:.4f}",
-    "90 % are within": "{map[q90_m]:.4f}",
-    "RMSE": "{map[rmse_m]:.4f}",
+    "median": "{map[median_m]!m}",
+    "90 % are within": "{map[q90_m]!m}",
+    "RMSE": "{map[rmse_m]!m}",
     f"within {', '.join(map(str, WITHIN_CM))} cm": ", ".join(f"{{map[within][{limit}cm]:.1%}}" for limit in WITHIN_CM),
 }
 
@@ -75,11 +77,11 @@ def figures(runs: Sequence[Evaluated]) -> pd.DataFrame:
     }
     sections: dict[str, Mapping[str, str]] = {
         "Run": _RUN,
-        f"Position error, {how} aligned [m]": _POSITION,
+        f"Position error, {how} aligned": _POSITION,
         f"Orientation error, {how} aligned [deg]": _ORIENTATION,
         "Relative error, mean: translation [%] / yaw [deg] / rotation [deg]": relative,
         "NEES, mean (inside the 95 % band)": _NEES,
-        "Landmarks, distance from the simulated world's surfaces [m]": _MAP,
+        "Landmarks, distance from the simulated world's surfaces": _MAP,
     }
     rows = {
         (title, label): [_cell(template, each) for each in found]
@@ -157,10 +159,17 @@ def notes(runs: Sequence[Evaluated]) -> Iterator[str]:
             yield from (f"{run.name}: metric {label}: {why}" for label, why in run.measured.left_out.items())
 
 
+class _Cell(Formatter):
+    """With ``!m`` for lengths in metres."""
+
+    def convert_field(self, value: Any, conversion: str | None) -> Any:
+        return length(value) if conversion == "m" else value
+
+
 def _cell(template: str, found: Mapping[str, Any]) -> str:
     """``template`` filled in; unknown where any of its values is."""
     try:
-        return template.format_map(found)
+        return _Cell().vformat(template, (), found)
     except (KeyError, TypeError):
         return UNKNOWN
 

@@ -9,14 +9,12 @@ import os
 import sys
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from vioframe.errors import RunError, VioframeError, needs
-from vioframe.evaluation import evaluate
 from vioframe.geometry.meshes import read_mesh
 from vioframe.report.style import TRUTH_COLOUR, looks
 from vioframe.runs.evaluated import Evaluated
@@ -153,15 +151,7 @@ class _Shown:
     def _errors(self) -> None:
         """Errors within their bounds, each stretch between resets in the gauge of its own first pose: there the
         covariance that a filter states is meant. ``evaluate`` speaks of errors that are aligned over the whole path."""
-        estimate, truth = self.run.estimate, self.run.ground_truth
-        if estimate is None or truth is None or self.run.errors is None:
-            return
-        starts = np.searchsorted(estimate.t_ns, np.array(self.run.segment_starts_ns, np.int64))
-        for first, last in pairwise([0, *starts.tolist(), len(estimate)]):
-            try:
-                errors = evaluate(estimate.select(slice(first, last)), truth, alignment="first")
-            except VioframeError:
-                continue  # a stretch without ground truth
+        for errors in self.run.errors_by_stretch() if self.run.errors else ():
             cov = errors.estimate.cov_pose
             sigma = np.full((len(errors.estimate), 6), np.nan)
             if cov is not None:

@@ -10,7 +10,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from numbers import Real
 from pathlib import Path
 from typing import Any
@@ -115,6 +117,16 @@ class Evaluated:
         after_reset = np.searchsorted(t_ns, np.array(self.segment_starts_ns, np.int64))
         every = np.union1d(after_gap, after_reset)
         return np.asarray(every[(every > 0) & (every < len(t_ns))])
+
+    def errors_by_stretch(self) -> Iterator[TrajectoryErrors]:
+        """Errors of each stretch between resets in the gauge of its own first pose, in which a filter's covariance is
+        meant; those of stretches without ground truth are left out."""
+        if self.estimate is None or self.ground_truth is None:
+            return
+        starts = np.searchsorted(self.estimate.t_ns, np.array(self.segment_starts_ns, np.int64))
+        for first, last in pairwise([0, *starts.tolist(), len(self.estimate)]):
+            with suppress(VioframeError):
+                yield evaluate(self.estimate.select(slice(first, last)), self.ground_truth, alignment="first")
 
     def stage_ms(self) -> dict[str, float]:
         """Mean milliseconds a frame by stage; the stages add up to the whole."""

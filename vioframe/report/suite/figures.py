@@ -48,6 +48,7 @@ from vioframe.report.suite.statistics import (
     stage_means,
 )
 from vioframe.report.suite.tables import speed_caption
+from vioframe.report.units import length
 from vioframe.runs.results import CLEAR
 from vioframe.types import NS_PER_S
 
@@ -213,22 +214,27 @@ def _curve(curve: pd.DataFrame, contender: tuple[str, str], look: Look) -> list[
     detector, backend = contender
     percent = curve.assign(**{c: 100.0 * curve[c] for c in ("success", "success_low", "success_high")})
     columns = (
-        ("ate_m", "low", "high", "ATE {:.3f} m"),
-        ("success", "success_low", "success_high", "{:.0f} % succeeded"),
+        ("ate_m", "low", "high"),
+        ("success", "success_low", "success_high"),
     )
     colour, meta, traces = look.colour(detector, backend), look.meta(detector, backend), []
-    for k, (value, low, high, says) in enumerate(columns):
+    for k, (value, low, high) in enumerate(columns):
         known = percent[percent[value].notna()]
         banded = known[known[low].notna()]
         if len(banded) > 1:
             faint = min(0.14, 0.4 / (len(look.detectors) * len(look.backends)))
             traces.append(area(banded["level"], banded[low], banded[high], meta, k, colour, faint))
         hollow = ["circle" if k or own["complete"].all() else "circle-open" for own in known["flights"]]
-        points = zip(known[value], known["flights"], strict=True)
+        says = [
+            f"{f'{told:.0f} % succeeded' if k else f'ATE {length(told)}'}, seeds: {seeds_text(own)}"
+            for told, own in zip(known[value], known["flights"], strict=True)
+        ]
         more = {
             "line": look.line(detector, backend, width=2.2),
             "marker": {"size": 7, "color": colour, "symbol": hollow},
-            "customdata": [f"{says.format(v)}, seeds: {seeds_text(own)}" for v, own in points],
+            "customdata": [
+                f"{said}, seeds: {seeds_text(own)}" for said, own in zip(says, known["flights"], strict=True)
+            ],
             "hovertemplate": f"level %{{x:g}}: %{{customdata}}<extra>{look.name(detector, backend)}</extra>",
         }
         traces.append(scatter(known["level"].tolist(), known[value].tolist(), meta, k, "lines+markers", **more))

@@ -29,6 +29,7 @@ from vioframe.report.suite.statistics import (
     seeds_text,
 )
 from vioframe.report.table import Table, TableRow
+from vioframe.report.units import length
 from vioframe.runs.results import CLEAR, Data
 
 DARK = {
@@ -221,7 +222,7 @@ def _one_flight(study: Study) -> Iterator[str]:
         whole = own["complete"].all()
         verb = "the lowest here; next is" if whole else "the lowest of a whole flight is that of"
         verb = "the lowest here is that of" if ate_m[rival] < ate_m[first] else verb
-        more += f", {verb} {_named(study, *rival[4:])}, {ate_m[rival]:.3f} m"
+        more += f", {verb} {_named(study, *rival[4:])}, {length(ate_m[rival])}"
     yield f"{more}."
 
 
@@ -275,7 +276,7 @@ def facts(study: Study) -> dict[str, str]:
 
 def _spread(values: pd.Series, over: str = "seeds") -> str:
     std, n = values.std(), values.count()
-    return f"{values.mean():.3f} m" if pd.isna(std) else f"{values.mean():.3f} ± {std:.3f} m over {n} {over}"
+    return length(values.mean(), std) + ("" if pd.isna(std) else f" over {n} {over}")
 
 
 def _named(study: Study, detector: str, backend: str) -> str:
