@@ -199,9 +199,10 @@ def _stamp_ns(text: str) -> int:
 
 def _rows_due(imu_t_ns: list[int], frame_t_ns: list[int]) -> list[int]:
     """For each frame, how many IMU rows come before it in time, wild stamps overlooked."""
-    due_ns = np.array(imu_t_ns, dtype=np.int64)
+    stamps = np.array(imu_t_ns, dtype=np.int64)
+    due_ns = stamps.copy()
     for ahead in range(1, _ROWS_AHEAD + 1):
-        np.minimum(due_ns[:-ahead], imu_t_ns[ahead:], out=due_ns[:-ahead])
+        np.minimum(due_ns[:-ahead], stamps[ahead:], out=due_ns[:-ahead])
     counts: list[int] = np.searchsorted(np.maximum.accumulate(due_ns), frame_t_ns, side="right").tolist()
     return counts
 

@@ -1,4 +1,4 @@
-"""Files mutated at random: whatever is in them, there comes a result or a :class:`VioframeError`, soon and in bounds."""
+"""Files mutated at random: whatever is in them, it gives a result or a :class:`VioframeError`, soon and in bounds."""
 
 from __future__ import annotations
 
@@ -211,9 +211,9 @@ YAML_BOMBS = {
     "laughs as a mapping": LAUGHS + "KEY: {data: *a9}\n",
     "in itself": "KEY: &a [*a, *a]\n",
     "mapping in itself": "KEY: &a {data: *a}\n",
-    "deep": "KEY: " + "[" * 1200 + "]" * 1200 + "\n",
-    "deep blocks": "KEY:\n" + "".join(" " * k + "- \n" for k in range(1, 800)),
-    "deep flow, open": "KEY: " + "[" * 1200,
+    "deep": "KEY: " + "[" * 500 + "]" * 500 + "\n",
+    "deep blocks": "KEY:\n" + "".join(" " * k + "- \n" for k in range(1, 400)),
+    "deep flow, open": "KEY: " + "[" * 500,
     "merged": "b: &b {x: 1}\nKEY: {<<: *b, <<: *b}\n",
     "no date": "KEY: 2001-99-99\n",
     "number of many digits": f"KEY: {'9' * 5000}\n",

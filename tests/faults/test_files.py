@@ -1,5 +1,7 @@
-"""Files that are missing, broken, foreign or hostile, through the real command line: one line that says what to do, or a
-run that goes on and counts what it met."""
+"""Files that are missing, broken, foreign or hostile, through the real command line.
+
+There comes one line that says what to do, or a run that goes on and counts what it met.
+"""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
 """What sensors and clocks do wrong in mid-flight: the flight survives it, the incident is counted under its name, and
 the error is at most twice that of the clean flight.
 
-A fault is planted at an instant in flight; ``s`` are seconds since then. The flight is a short one with rendered images;
-where there is time, the same faults are planted in a real recording.
+A fault is planted at an instant in flight; ``s`` are seconds since then. The flight is a short one with rendered
+images; where there is time, the same faults are planted in a real recording.
 """
 
 from __future__ import annotations
@@ -84,6 +84,18 @@ def frozen(kind: type, end: float) -> Disturbance:
     return change
 
 
+def held_in_between(timed: Timed) -> list[Measurement]:
+    """Of three readings of the accelerometer the first, thrice: it is slower, not stuck."""
+    out: list[Measurement] = []
+    place, accel = 0, np.zeros(3)
+    for _, m in timed:
+        if isinstance(m, IMU):
+            accel = m.accel_B if place % 3 == 0 else accel
+            m, place = ImuSample(m.t_ns, m.gyro_B, accel), place + 1
+        out.append(m)
+    return out
+
+
 def shuffled(kind: type, group: int) -> Disturbance:
     """What comes within a second in groups, the order within each at random."""
 
@@ -140,6 +152,7 @@ SURVIVED = {
     "gyroscope saturated": Survived(reads(0.05, gyro=[None, 34.9, None]), {"imu_saturated": 10, "imu_gap": 1}),
     "accelerometer saturated": Survived(reads(0.05, accel=[-156.9, None, None]), {"imu_saturated": 10, "imu_gap": 1}),
     "imu frozen": Survived(frozen(IMU, 0.2), {"imu_frozen": 40, "imu_gap": 1}),
+    "accelerometer slower than the gyroscope": Survived(held_in_between, {}),
     "imu twice": Survived(twice(IMU), {"imu_duplicate": 200}),
     "imu out of order": Survived(shuffled(IMU, 4), {"imu_out_of_order": 0}),
     "imu a second late": Survived(held_up, {"imu_out_of_order": 20, "imu_gap": 1}),

@@ -41,7 +41,6 @@ SIGNALS = {
     signal.SIGTERM: (143, "vioframe: terminated"),
     signal.SIGKILL: (-signal.SIGKILL, ""),
 }
-HOW = pytest.mark.parametrize("how", SIGNALS, ids=lambda how: how.name)
 
 
 def kill(how: signal.Signals, ready: Callable[[], bool], *arguments: object, **options: object) -> None:
@@ -60,7 +59,11 @@ def kill(how: signal.Signals, ready: Callable[[], bool], *arguments: object, **o
     assert stderr.count("\n") == (1 if says else 0)
 
 
-@HOW
+@pytest.mark.parametrize(
+    # Ctrl-C is tried by the command line's own tests as well.
+    "how",
+    [signal.SIGTERM, signal.SIGKILL, pytest.param(signal.SIGINT, marks=pytest.mark.very_slow)],
+)
 def test_a_run_that_is_ended_can_be_evaluated_and_drawn(here, monkeypatch, how):
     install(here / "site", monkeypatch, distribution="slow", module="slow_detector", code=SLOW)
     trajectory = Path("out/trajectory.tum")
@@ -87,13 +90,16 @@ def test_a_run_that_is_ended_can_be_evaluated_and_drawn(here, monkeypatch, how):
     assert RunFolder.open("out").summary["finished"] is True
 
 
-@pytest.mark.parametrize("how", [signal.SIGTERM, *(pytest.param(s, marks=pytest.mark.very_slow) for s in (2, 9))])
+@pytest.mark.parametrize(
+    "how",
+    [signal.SIGKILL, *(pytest.param(s, marks=pytest.mark.very_slow) for s in (signal.SIGINT, signal.SIGTERM))],
+)
 def test_a_simulation_that_is_ended_leaves_nothing_under_its_name(here, how):
     before = set(os.listdir())
     command = ("--flight", "hover", "--rate", 2, "--workers", 1, "--quiet")
     begun = Path(".made.bag.unfinished/made.bag")
     kill(
-        signal.Signals(how),
+        how,
         lambda: begun.is_file() and begun.stat().st_size > 10_000,
         *("simulate", "made.bag", "--duration", 100, *command),
     )

@@ -1,4 +1,4 @@
-"""Plug-ins that fail: the one to blame is named, what was estimated until then is kept, and nobody else is taken down."""
+"""Plug-ins that fail: the one to blame is named, what was estimated until then is kept, and no other is taken down."""
 
 from __future__ import annotations
 

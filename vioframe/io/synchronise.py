@@ -12,7 +12,7 @@ from collections import deque
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from itertools import pairwise
-from math import hypot, inf, isfinite
+from math import hypot, inf, isfinite, nan
 from statistics import median
 from typing import Generic, TypeVar
 
@@ -33,8 +33,8 @@ _MAX_RATE_RAD_S, _MAX_FORCE_M_S2 = 100.0, 2000.0
 # What repeats to the last bit for so long, and so often, is no measurement: a reading has noise. Slow sensors are
 # sometimes handed on at a higher rate than their own, so it must be longer than the period of one.
 _STUCK_NS, _STUCK_READINGS = 20 * NS_PER_MS, 4
-# An axis that is stuck beyond these is at the end of its range, and ranges begin at 125 deg/s and 2 g. All axes that are
-# stuck within them are those of a sensor or bus that has died, unless they are what a body at rest would read.
+# An axis that is stuck beyond these is at the end of its range: ranges begin at 125 deg/s and 2 g. Where all axes are
+# stuck the sensor or its bus has died, unless they read what a body at rest would.
 _LEAST_RANGE_RAD_S, _LEAST_RANGE_M_S2 = 2.0, 19.0
 _REST_RAD_S, _REST_M_S2 = 0.1, 0.5
 _IMU_GAP_PERIODS = 5.0
@@ -58,8 +58,8 @@ class Synchroniser:
     does no harm. With 0 the first reading at or behind the frame lets it go: the least latency, for a stream in order.
 
     ``incidents`` counts ``imu_nan``, ``imu_out_of_range``, ``imu_saturated``, ``imu_frozen``, ``imu_duplicate``,
-    ``imu_out_of_order``, ``imu_gap``, ``frame_duplicate``, ``frame_out_of_order``, ``frame_before_imu``, ``frame_after_imu``, ``frame_without_imu`` and
-    ``camera_gap``.
+    ``imu_out_of_order``, ``imu_gap``, ``frame_duplicate``, ``frame_out_of_order``, ``frame_before_imu``,
+    ``frame_after_imu``, ``frame_without_imu`` and ``camera_gap``.
     """
 
     def __init__(self, incidents: Incidents, *, time_offset_ns: int = 0, wait_ms: float = 50.0) -> None:
@@ -216,7 +216,7 @@ class _Axes:
     """Watches each of the six axes of an IMU for readings that repeat to the last bit."""
 
     def __init__(self) -> None:
-        self._last: list[float] = []
+        self._last = [nan] * 6
         # Of each axis: when the value that it has now was read first, and how often it was since.
         self._since_ns, self._count = [0] * 6, [0] * 6
 
@@ -224,7 +224,7 @@ class _Axes:
         """Take in a reading; where the sensor is stuck the kind of incident, and since when."""
         values = [*gyro_B, *accel_B]
         if values != self._last:
-            for axis, (value, last) in enumerate(zip(values, self._last or [None] * 6, strict=True)):
+            for axis, (value, last) in enumerate(zip(values, self._last, strict=True)):
                 if value != last:
                     self._since_ns[axis], self._count[axis] = t_ns, 0
             self._last = values
