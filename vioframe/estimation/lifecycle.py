@@ -34,8 +34,10 @@ from vioframe.types import (
     g_W,
 )
 
-# How well a calibration is known (rad, m, s, px, distortion), as published for OpenVINS on EuRoC.
+# How well a calibration is known (rad, m, s, px, distortion), as published for OpenVINS on EuRoC. Of a readout that is
+# to be estimated hardly more is known than that it is shorter than a frame, s.
 _SIGMA_ROTATION, _SIGMA_POSITION, _SIGMA_OFFSET, _SIGMA_PIXELS, _SIGMA_DISTORTION = 0.005, 0.015, 0.01, 1.0, 0.005
+_SIGMA_READOUT = 0.02
 
 # The flight that compiles everything: frames, and how far the camera moves between two.
 _WARM_UP_FRAMES, _WARM_UP_PERIOD_NS, _WARM_UP_STEP_M = 30, NS_PER_S // 10, 0.2
@@ -157,7 +159,7 @@ def _prior(rotation_cov: Float | None) -> CameraSigma:
     """How well a camera's calibration is known to begin with, its rotation as it was found, if it was."""
     rotation = np.full(3, _SIGMA_ROTATION) if rotation_cov is None else np.sqrt(np.diag(rotation_cov))
     intrinsics = np.repeat([_SIGMA_PIXELS, _SIGMA_DISTORTION], 4)
-    return CameraSigma(rotation, np.full(3, _SIGMA_POSITION), _SIGMA_OFFSET, intrinsics)
+    return CameraSigma(rotation, np.full(3, _SIGMA_POSITION), _SIGMA_OFFSET, intrinsics, _SIGMA_READOUT)
 
 
 def warm_up(backend: Backend, calibration: Calibration) -> None:
