@@ -100,7 +100,7 @@ def scene(
     seen = (p_C[..., 2] > 0.3) & (np.abs(xy) < [0.8, 0.5]).all(axis=2)
     xy = np.where(seen[..., None], xy + rng.normal(0.0, pixels * PIXEL, xy.shape), np.nan)
     keep = seen.sum(axis=0) >= 4
-    window = Window(frames_ns, segments, np.arange(60), xy, seen).only(keep)
+    window = Window(frames_ns, segments, np.arange(60), xy, seen, np.zeros_like(xy)).only(keep)
     return Scene(window, truth, p_WF[keep])
 
 
@@ -111,7 +111,7 @@ def problem_of(s: Scene) -> tuple[Problem, Variables]:
     host = s.window.seen.argmax(axis=0)
     p_C = np.einsum("lji,lj->li", R_WC[host], s.p_WF - p_WC[host])
     truth = Variables(s.truth, camera, np.column_stack([p_C[:, :2] / p_C[:, 2:], 1.0 / p_C[:, 2]]))
-    return adjustment(s.window, s.imu(), truth, CAMERA.model.focal_px, camera, CALIBRATION_SIGMA), truth
+    return adjustment(s.window, s.imu(), truth, CAMERA, CALIBRATION_SIGMA), truth
 
 
 class TestGyroBias:
@@ -237,7 +237,7 @@ class TestBundleAdjustment:
         start = s.truth.retract(rng.normal(0.0, sigma, (11, 15)))
         points = truth.landmarks + rng.normal(0.0, [0.01, 0.01, 0.05], truth.landmarks.shape)
         start = replace(truth, states=start, landmarks=points)
-        problem = adjustment(s.window, s.imu(), start, CAMERA.model.focal_px, truth.camera, CALIBRATION_SIGMA)
+        problem = adjustment(s.window, s.imu(), start, CAMERA, CALIBRATION_SIGMA)
         solution = adjusted(problem, start)
         states = solution.variables.states
         assert solution.converged

@@ -14,11 +14,11 @@ from vioframe.arrays import Float
 from vioframe.estimation.factors.inertial import ImuFactors, StateArrays
 from vioframe.estimation.factors.landmarks import image_velocities
 from vioframe.estimation.factors.problem import STATE_SIZE, Prior, Problem, Variables
-from vioframe.estimation.factors.reprojection import CALIBRATION_SIZE, Calibrated, Sightings
+from vioframe.estimation.factors.reprojection import CALIBRATION_SIZE, GLOBAL_SHUTTER, Calibrated, Shutter, Sightings
 from vioframe.estimation.factors.solver import Solution, solve, solve_positive
 from vioframe.estimation.inertial.preintegration import Preintegrated
 from vioframe.estimation.initialization.window import BIAS_ACCEL_SIGMA, BIAS_GYRO_SIGMA, PIXEL_SIGMA, Window
-from vioframe.types import DBA, DBG, DP, DTHETA
+from vioframe.types import DBA, DBG, DP, DTHETA, CameraOnBody
 
 _CAUCHY = 2.0  # standard deviations
 _MAX_ITERATIONS = 20
@@ -28,20 +28,31 @@ _RELATIVE_DECREASE = 1e-5
 _HELD, _FIXED = 1e4, 1e8
 
 
-def adjustment(
-    window: Window, imu: list[Preintegrated], x: Variables, focal_px: float, given: Calibrated, sigma: Float
-) -> Problem:
+def adjustment(window: Window, imu: list[Preintegrated], x: Variables, camera: CameraOnBody, sigma: Float) -> Problem:
     """All factors of ``window``, whose readings are ``imu``, about the values ``x``; the first state is held.
 
-    ``sigma`` (7,) is how well the calibration ``given`` is known.
+    ``sigma`` (7,) is how well the pose of ``camera`` on the body and its time offset are known.
     """
     seen = np.ascontiguousarray(window.seen.T)
     xy = np.ascontiguousarray(np.where(seen[..., None], np.swapaxes(window.xy, 0, 1), 0.0))
-    to_px = np.tile(focal_px * np.eye(2), (*seen.shape, 1, 1))
+    to_px = np.tile(camera.model.focal_px * np.eye(2), (*seen.shape, 1, 1))
     gyro_B = np.stack([imu[0].imu.gyro_B[0], *(m.imu.gyro_B[-1] for m in imu)])
     velocity = image_velocities(x.states, x.camera, gyro_B, seen.argmax(axis=1), x.landmarks)
-    sightings = Sightings(seen, xy, velocity, to_px, PIXEL_SIGMA, _CAUCHY)
-    return Problem(_prior(x, 0, _HELD, given, sigma), ImuFactors.stack(imu), {}, sightings, first_estimates=False)
+    shutter = GLOBAL_SHUTTER
+    if camera.readout_s:
+        row = camera.row(np.ascontiguousarray(window.xy_px[..., 1].T))
+        velocity_B = np.einsum("kji,kj->ki", x.states.R_WB, x.states.v_WB)
+        shutter = Shutter(row, gyro_B - x.states.bias_gyro_B, velocity_B)
+    sightings = Sightings(seen, xy, velocity, to_px, PIXEL_SIGMA, _CAUCHY, shutter=shutter)
+    return Problem(
+        _prior(x, 0, _HELD, calibrated(camera), sigma), ImuFactors.stack(imu), {}, sightings, first_estimates=False
+    )
+
+
+def calibrated(camera: CameraOnBody) -> Calibrated:
+    """``camera`` as it is given, where the adjustment begins."""
+    # Contiguous, as what the solver makes of it is: kernels are compiled for each layout that they meet.
+    return Calibrated(np.ascontiguousarray(camera.R_BC), np.ascontiguousarray(camera.p_BC), 0.0, camera.readout_s)
 
 
 def adjusted(problem: Problem, x: Variables) -> Solution:

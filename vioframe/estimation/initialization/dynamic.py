@@ -19,7 +19,7 @@ from vioframe.estimation.factors.problem import Problem, Variables
 from vioframe.estimation.factors.reprojection import CALIBRATION_SIZE, Calibrated
 from vioframe.estimation.factors.solver import Solution
 from vioframe.estimation.inertial.preintegration import Preintegrated, preintegrate
-from vioframe.estimation.initialization.bundle_adjustment import adjusted, adjustment, covariance
+from vioframe.estimation.initialization.bundle_adjustment import adjusted, adjustment, calibrated, covariance
 from vioframe.estimation.initialization.closed_form import (
     Alignment,
     Structure,
@@ -146,20 +146,14 @@ def _start_of_adjustment(
     host = window.seen.argmax(axis=0)
     inverse_depth = 1.0 / (alignment.scale * structure.depth[host, track])
     landmarks = np.column_stack([window.xy[host, track], inverse_depth])
-    return Variables(states, _camera(calibration), landmarks)
-
-
-def _camera(calibration: Calibration) -> Calibrated:
-    # Contiguous, as what the solver makes of it is: kernels are compiled for each layout that they meet.
-    camera = calibration.cameras[0]
-    return Calibrated(np.ascontiguousarray(camera.R_BC), np.ascontiguousarray(camera.p_BC))
+    return Variables(states, calibrated(calibration.cameras[0]), landmarks)
 
 
 def _adjusted(window: Window, x: Variables, calibration: Calibration, sigma: Float) -> tuple[Problem, Solution]:
     """The adjustment of ``window`` from ``x``, its readings integrated at the biases there."""
     biases = zip(x.states.bias_gyro_B[:-1], x.states.bias_accel_B[:-1], strict=True)
     imu = [preintegrate(segment, *bias, calibration.imu) for segment, bias in zip(window.segments, biases, strict=True)]
-    problem = adjustment(window, imu, x, calibration.cameras[0].model.focal_px, _camera(calibration), sigma)
+    problem = adjustment(window, imu, x, calibration.cameras[0], sigma)
     return problem, adjusted(problem, x)
 
 
@@ -283,8 +277,10 @@ def warm_up(calibration: Calibration) -> None:
     t_ns, half_ns = np.arange(4) * 100_000_000, np.arange(3) * 50_000_000
     xy = np.tile(np.random.default_rng(0).uniform(-0.3, 0.3, (20, 2)), (4, 1, 1))
     segments = tuple(ImuSegment(t + half_ns, np.zeros((3, 3)), np.tile(-g_W, (3, 1))) for t in t_ns[:-1])
-    window = Window(t_ns, segments, np.arange(20), xy, np.ones((4, 20), bool))
+    window = Window(t_ns, segments, np.arange(20), xy, np.ones((4, 20), bool), np.zeros((4, 20, 2)))
     state = NavState(0, np.eye(3), *np.zeros((4, 3)))
-    x = Variables(StateArrays.stack([state] * 4), _camera(calibration), np.column_stack([xy[0], np.full(20, 0.2)]))
+    x = Variables(
+        StateArrays.stack([state] * 4), calibrated(calibration.cameras[0]), np.column_stack([xy[0], np.full(20, 0.2)])
+    )
     problem, solution = _adjusted(window, x, calibration, np.full(CALIBRATION_SIZE, 0.01))
     _explained(problem, solution.variables)

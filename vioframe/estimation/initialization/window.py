@@ -58,7 +58,7 @@ class Window:
     """K keyframes, the readings between them, and L tracks.
 
     ``t_ns`` (K,), ``segments`` K - 1, ``ids`` (L,). ``xy`` (K, L, 2) are points on the z = 1 plane, NaN where ``seen``
-    (K, L) is False.
+    (K, L) is False; ``xy_px`` (K, L, 2) the pixels.
     """
 
     t_ns: Int
@@ -66,14 +66,17 @@ class Window:
     ids: Int
     xy: Float
     seen: Bool
+    xy_px: Float
 
     def only(self, keep: Bool) -> Window:
         """The same window with the tracks ``keep`` (L,)."""
-        return Window(self.t_ns, self.segments, self.ids[keep], self.xy[:, keep], self.seen[:, keep])
+        return Window(
+            self.t_ns, self.segments, self.ids[keep], self.xy[:, keep], self.seen[:, keep], self.xy_px[:, keep]
+        )
 
     def without_last(self) -> Window:
         """The same tracks without the newest keyframe."""
-        return Window(self.t_ns[:-1], self.segments[:-1], self.ids, self.xy[:-1], self.seen[:-1])
+        return Window(self.t_ns[:-1], self.segments[:-1], self.ids, self.xy[:-1], self.seen[:-1], self.xy_px[:-1])
 
 
 def build_window(packets: Sequence[Packet], chosen: Sequence[int], min_views: int, max_landmarks: int) -> Window:
@@ -89,7 +92,8 @@ def build_window(packets: Sequence[Packet], chosen: Sequence[int], min_views: in
     rows = np.sort(order[views[order] >= min_views][:max_landmarks])
     seen = table.seen[rows].T
     xy = np.where(seen[..., None], np.swapaxes(table.xy_normalised[rows], 0, 1), np.nan)
-    return Window(np.array([t.t_ns for t in tracks]), segments, table.ids[rows], xy, seen)
+    xy_px = np.swapaxes(table.xy[rows], 0, 1)
+    return Window(np.array([t.t_ns for t in tracks]), segments, table.ids[rows], xy, seen, xy_px)
 
 
 def spread_indices(t_ns: Int, count: int) -> list[int]:
