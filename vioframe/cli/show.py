@@ -94,8 +94,9 @@ def plot(
 ) -> None:
     """Draw each RUN, a run folder or a trajectory file, into the same figures.
 
-    Paths in 3-D, from above and from the side; translation and rotation errors and NEES over time; relative errors;
-    time by stage; features over time: as far as the runs have what it takes.
+    Paths in 3-D, from above and from the side; translation and rotation errors over time, aligned over the whole path,
+    and within the ±3 sigma that the estimate states; NEES; relative errors; time by stage; features over time: as far
+    as the runs have what it takes.
     """
     from vioframe.report.drawing import write_figures
     from vioframe.report.figures import figures_of_runs

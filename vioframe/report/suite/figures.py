@@ -232,9 +232,7 @@ def _curve(curve: pd.DataFrame, contender: tuple[str, str], look: Look) -> list[
         more = {
             "line": look.line(detector, backend, width=2.2),
             "marker": {"size": 7, "color": colour, "symbol": hollow},
-            "customdata": [
-                f"{said}, seeds: {seeds_text(own)}" for said, own in zip(says, known["flights"], strict=True)
-            ],
+            "customdata": says,
             "hovertemplate": f"level %{{x:g}}: %{{customdata}}<extra>{look.name(detector, backend)}</extra>",
         }
         traces.append(scatter(known["level"].tolist(), known[value].tolist(), meta, k, "lines+markers", **more))
