@@ -13,7 +13,7 @@ import re
 import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from decimal import Decimal, InvalidOperation
+from decimal import Decimal, DecimalException
 from io import BytesIO
 from math import hypot, isfinite
 from pathlib import Path
@@ -211,8 +211,8 @@ def _pose(fields: Sequence[str], is_euroc: bool) -> tuple[int, list[float]]:
     stamp = fields[0]
     try:
         t_ns = Decimal(stamp) * (1 if is_euroc else NS_PER_S)
-    except InvalidOperation:
-        raise ValueError(f"the stamp {stamp!r} is not a number") from None
+    except DecimalException:  # no number, or one of more digits than it can have
+        raise ValueError(f"the stamp {stamp!r} is not a number that a time can be") from None
     if not t_ns.is_finite() or abs(t_ns) > _INT64_MAX:
         hint = " ns" if is_euroc else " seconds; are the stamps nanoseconds? separate EuRoC columns by commas"
         raise ValueError(f"the stamp {stamp} is not a time in{hint}")

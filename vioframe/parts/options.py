@@ -19,7 +19,7 @@ from typing import Annotated, Any, TypeVar, get_args, get_origin
 
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 
-from vioframe.errors import ConfigError
+from vioframe.errors import ConfigError, shown
 
 PartT = TypeVar("PartT")
 
@@ -71,23 +71,23 @@ def validate_options(
     Raises :class:`ConfigError`, showing the options there are, for an unknown, missing or unsuitable one.
     """
     table = {option.name: option for option in options_of(factory, given)}
-    shown = f"its options: {', '.join(map(str, table.values()))}" if table else "it has no options"
+    offered = f"its options: {', '.join(map(str, table.values()))}" if table else "it has no options"
     for name in values:
         if name not in table:
-            raise ConfigError(f"{owner} has no option {name!r}{did_you_mean(name, table)}; {shown}")
+            raise ConfigError(f"{owner} has no option {shown(name)}{did_you_mean(name, table)}; {offered}")
     complete = {}
     for name, option in table.items():
         if name not in values:
             if option.default is REQUIRED:
                 meaning = f" ({option.doc})" if option.doc else ""
-                raise ConfigError(f"{owner} needs the option {name!r}{meaning}: pass -o {name}=...; {shown}")
+                raise ConfigError(f"{owner} needs the option {name!r}{meaning}: pass -o {name}=...; {offered}")
             complete[name] = option.default
             continue
         try:
             complete[name] = option.coerce(values[name])
         except ValidationError as error:
             reason = error.errors()[0]["msg"]
-            raise ConfigError(f"{owner}: {name}={values[name]!r}: {reason}; {shown}") from error
+            raise ConfigError(f"{owner}: {name}={shown(values[name])}: {reason}; {offered}") from error
     options_type = getattr(factory, "options_type", None)
     if options_type is not None:
         try:

@@ -20,7 +20,7 @@ from typing import Any, cast
 import numpy as np
 import pluggy
 
-from vioframe.errors import DatasetError, PluginError, VioframeError
+from vioframe.errors import DatasetError, PluginError, VioframeError, shown
 from vioframe.interfaces import Backend, Dataset, Detector, Flight, LoopCloser, Metric, Trainer, World
 from vioframe.parts import hooks as hookspecs
 from vioframe.parts.options import Option, did_you_mean, options_of, plugin_factory, validate_options
@@ -159,7 +159,7 @@ class Registry:
             raise PluginError(str(clash))
         what = "reader" if kind is DATASET else kind.name
         raise PluginError(
-            f"no {what} is called {name!r}{did_you_mean(name, table)}; "
+            f"no {what} is called {shown(name)}{did_you_mean(name, table)}; "
             f"installed: {', '.join(sorted(table)) or 'none'}{self._failure_hint()}"
         )
 
