@@ -30,7 +30,7 @@ _BETTER, _BETTER_BY = 1.3, 15.0
 _NEAR: dict[Part, float] = {"offset": 0.008, "rotation": np.deg2rad(3.0)}
 # Standard deviations with which a part can be taken over, s, rad and relative.
 _NAMES: dict[Part, str] = {"offset": "the time offset", "rotation": "the camera's rotation on the body"}
-_SURE: dict[Part, float] = {"offset": 0.006, "rotation": np.deg2rad(1.5)}
+_SURE: dict[Part, float] = {"offset": 0.012, "rotation": np.deg2rad(1.5)}
 # What distortion, rolling shutter and creeping patches cost beyond the scatter of the turns.
 _SYSTEMATIC: dict[Part, float] = {"offset": 0.003, "rotation": np.deg2rad(0.5)}
 # Turns are taken every so often and overlap.
