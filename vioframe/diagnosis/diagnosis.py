@@ -7,11 +7,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from vioframe.diagnosis.findings import Finding, Severity, ranked
+from vioframe.diagnosis.geometry import look_at_geometry
 from vioframe.diagnosis.images import look_at_images
 from vioframe.diagnosis.inertial import look_at_imu, smoothed
 from vioframe.diagnosis.motion import look_at_motion, moving_windows
 from vioframe.diagnosis.recording import Recording
+from vioframe.diagnosis.self_calibration import OFFSET, ROTATION, Calibrated
 from vioframe.diagnosis.stamps import look_at_stamps, overlap_s, rate_hz, span_s
+from vioframe.geometry import so3
+from vioframe.types import NS_PER_S, CameraOnBody
 
 # Without these there is nothing to compare camera and IMU by.
 _HOPELESS = {"imu_missing", "images_missing", "stamps_zero", "stamp_units", "clocks_apart"}
@@ -32,17 +36,23 @@ class Diagnosis:
 
 def diagnose(recording: Recording) -> Diagnosis:
     """Look at all there is; of a recording without ``stretches`` all but the geometry, within milliseconds."""
-    findings = [*look_at_stamps(recording), *look_at_imu(recording), *look_at_images(recording)]
-    if not _HOPELESS & {finding.kind for finding in findings}:
+    findings = [*look_at_imu(recording), *look_at_images(recording)]
+    if recording.wrong_size is None:  # a reader stops at the first such image
+        findings += look_at_stamps(recording)
+    found = None
+    if recording.wrong_size is None and not _HOPELESS & {finding.kind for finding in findings}:
         findings += look_at_motion(recording)
+        geometry = look_at_geometry(recording)
+        found = geometry.found
+        findings += geometry.findings
     # The same by two ways: what is more certain stays.
     unique: dict[str, Finding] = {}
     for finding in ranked(findings):
         unique.setdefault(finding.kind, finding)
-    return Diagnosis(tuple(unique.values()), _facts(recording))
+    return Diagnosis(tuple(unique.values()), _facts(recording, found))
 
 
-def _facts(recording: Recording) -> dict[str, str]:
+def _facts(recording: Recording, found: Calibrated | None) -> dict[str, str]:
     imu, look, camera = recording.imu.sorted(), recording.look, recording.calibration.cameras[0]
     facts = {}
     if len(imu.t_ns) > 2 and span_s(imu.t_ns) > 0.0:
@@ -61,4 +71,15 @@ def _facts(recording: Recording) -> dict[str, str]:
     t_s, moving = moving_windows(recording)
     if np.any(moving):
         facts["motion"] = f"from {t_s[int(np.argmax(moving))]:.1f} s on, in {np.mean(moving):.0%} of the time"
+    if found is not None:
+        facts["camera to IMU"] = _measured(found, camera)
     return facts
+
+
+def _measured(found: Calibrated, camera: CameraOnBody) -> str:
+    offset = f"time offset {1e3 * found.offset_s:.1f} +- {1e3 * found.sigma(OFFSET):.1f} ms"
+    offset += f" (given {1e3 * camera.time_offset_ns / NS_PER_S:.1f})"
+    if not camera.rotation_known:
+        return offset
+    off = np.rad2deg(np.linalg.norm(so3.log(found.R_BC.T @ camera.R_BC)))
+    return f"{offset}, rotation {off:.1f} +- {np.rad2deg(found.sigma(ROTATION)):.1f} deg from the one given"

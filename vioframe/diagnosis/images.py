@@ -14,7 +14,7 @@ from vioframe.geometry.cameras import Camera
 from vioframe.types import NS_PER_S
 
 _DARK, _DARK_CONTRAST, _MOSTLY_BRIGHT = 20.0, 12.0, 0.5
-_BLURRED, _MOST_REPEATED = 0.12, 0.03
+_BLURRED, _MOST_REPEATED = 0.2, 0.03
 _FEWEST_TRACKS = 30
 _MOVING_RATE = 0.05  # rad/s
 _MOST_UNREADABLE, _SAME_SHAPE = 0.02, 0.02
@@ -100,13 +100,14 @@ def _blur(recording: Recording) -> Iterator[Finding]:
         return
     blurred = look.sharpness[with_edges] < _BLURRED
     if (share := float(blurred.mean())) > 0.2:
+        sharpness = float(np.median(look.sharpness[with_edges]))
         yield Finding(
             "images_blurred",
-            f"{share:.0%} of the images are blurred: their edges are {np.median(look.sharpness[with_edges]):.2f} times "
-            "as steep as in a quarter of the size",
+            f"{share:.0%} of the images are blurred: fine detail has {sharpness:.2f} of the contrast that it has at a "
+            "quarter of the size",
             "focus the lens, or shorten the exposure",
             certainty=Certainty.LIKELY,
-            figures={"share": share, "sharpness": float(np.median(look.sharpness[with_edges]))},
+            figures={"share": share, "sharpness": sharpness},
         )
 
 

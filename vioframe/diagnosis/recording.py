@@ -38,6 +38,8 @@ _STRETCH_S, _MOST_STRETCHES, _MOST_FRAMES_A_STRETCH = 2.0, 16, 64
 # A stretch takes the place of the poorest that is kept where it turns by so many times as much.
 _WORTH_IT = 1.3
 _POINTS = 120
+# A close look takes as long as following points; what ails images ails many.
+_LOOK_EVERY = 3
 _SATURATED = 250
 
 
@@ -153,7 +155,7 @@ class Gatherer:
 def gather(measurements: Iterable[Measurement], calibration: Calibration) -> Recording:
     """Read ``measurements`` to their end, and follow points through the stretches in which the body turns most."""
     calibration = Calibration(calibration.cameras[:1], calibration.imu)
-    gatherer = Gatherer(calibration)
+    gatherer = Gatherer(calibration, _LOOK_EVERY)
     kept: list[tuple[float, tuple[FrameTracks, ...]]] = []
     frames: list[FrameSet] = []
     begun = 0
@@ -189,15 +191,21 @@ def _by_turning(stretch: tuple[float, tuple[FrameTracks, ...]]) -> float:
 
 
 def sharpness_of(image: Image) -> float:
-    """How much finer detail there is than coarse: contrast of edges at full size over that at a quarter of it.
+    """How much finer detail there is than coarse: how sharply edges bend at full size over that at a quarter of it.
 
-    A lens in focus gives 0.3 and more; blur over several pixels takes the fine and leaves the coarse.
+    Along x or y, whichever is less, as motion blurs one direction. A lens in focus gives 0.3 and more.
     """
     import cv2
 
     small = cv2.resize(image, None, fx=0.25, fy=0.25, interpolation=cv2.INTER_AREA)
-    fine, coarse = (np.abs(cv2.Laplacian(cv2.GaussianBlur(i, (0, 0), 0.8), cv2.CV_32F)) for i in (image, small))
-    return float(np.percentile(fine, 99.0) / max(np.percentile(coarse, 99.0), 1.0))
+    smooth = [cv2.GaussianBlur(size, (0, 0), 0.8) for size in (image, small)]
+    ratios = []
+    for order in ((2, 0), (0, 2)):
+        fine, coarse = (
+            float(np.percentile(np.abs(cv2.Sobel(i, cv2.CV_32F, *order, scale=0.25)), 99.0)) for i in smooth
+        )
+        ratios.append(fine / max(coarse, 1.0))
+    return min(ratios)
 
 
 def _look(image: Image) -> tuple[float, float, float, float]:

@@ -64,7 +64,7 @@ def _missing(recording: Recording) -> Iterator[Finding]:
         (len(recording.imu.t_ns), "imu_missing", "readings of the IMU"),
         (len(recording.look.t_ns), "images_missing", "images"),
     ):
-        if count < _FEWEST and not (kind == "images_missing" and recording.wrong_size):
+        if count < _FEWEST:
             yield Finding(
                 kind,
                 f"there are {count or 'no'} {what}",
