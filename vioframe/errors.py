@@ -21,6 +21,14 @@ class DatasetError(VioframeError):
     """A data set cannot be read as asked."""
 
 
+class ImageSizeError(DatasetError):
+    """Images of ``size`` (width, height) px are not of the size that their camera is ``calibrated`` for."""
+
+    def __init__(self, message: str, size: tuple[int, int], calibrated: tuple[int, int]) -> None:
+        super().__init__(message)
+        self.size, self.calibrated = size, calibrated
+
+
 class CalibrationError(VioframeError):
     """A calibration file is missing, unreadable or inconsistent."""
 

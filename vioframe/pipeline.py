@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from vioframe.diagnosis import Diagnosis, Gatherer, diagnose, gather
 from vioframe.errors import DatasetError, PluginError, RunError
 from vioframe.geometry.trajectory import Trajectory
 from vioframe.incidents import Incidents
@@ -27,17 +28,32 @@ from vioframe.parts.config import Config
 from vioframe.parts.registry import BACKEND, DATASET, DETECTOR, LOOP_CLOSER, Registry
 from vioframe.runs import machine
 from vioframe.runs.recorder import Recorder, new_run_folder, write_json
-from vioframe.types import NS_PER_S, FrameSet, ImuSample, LoopClosure, Step, Unreadable
+from vioframe.types import NS_PER_S, FrameSet, ImuSample, LoopClosure, Measurement, Step, Unreadable
+
+# A run looks at stamps and readings of its first minute, and at every so manieth image of it.
+_LOOK_S, _LOOK_EVERY = 60.0, 10
 
 
 def run(
-    dataset: Dataset, odometry: Odometry, *, start_s: float = 0.0, duration_s: float | None = None
+    dataset: Dataset,
+    odometry: Odometry,
+    *,
+    start_s: float = 0.0,
+    duration_s: float | None = None,
+    listen: Callable[[Measurement], None] = lambda measurement: None,
 ) -> Iterator[Step]:
     """Push a data set through ``odometry``, yielding one :class:`~vioframe.types.Step` a frame.
 
     ``start_s`` seconds are skipped, counted from the first frame's stamp; ``duration_s`` is how much is then played.
+    ``listen`` hears every measurement ahead of the odometry.
     """
-    return odometry.follow(played(dataset.measurements(), start_s, duration_s))
+
+    def heard() -> Iterator[Measurement]:
+        for measurement in played(dataset.measurements(), start_s, duration_s):
+            listen(measurement)
+            yield measurement
+
+    return odometry.follow(heard())
 
 
 @dataclass(frozen=True)
@@ -49,6 +65,7 @@ class Experiment:
     dataset: Dataset
     odometry: Odometry
     ground_truth: Trajectory | None
+    gatherer: Gatherer
     loop_closer: LoopCloser | None = None
     left_aside: tuple[str, ...] = ()
     """Cameras of the rig that are not used."""
@@ -66,7 +83,11 @@ class Experiment:
         # Around all of it, not each frame alone: a loop closer's own thread works between frames.
         with limited_threads(), self.registry.blaming():
             for step in run(
-                self.dataset, self.odometry, start_s=self.config.start_s, duration_s=self.config.duration_s
+                self.dataset,
+                self.odometry,
+                start_s=self.config.start_s,
+                duration_s=self.config.duration_s,
+                listen=self.gatherer.add,
             ):
                 if self.loop_closer is None:
                     yield step
@@ -74,6 +95,15 @@ class Experiment:
                 begin = perf_counter()
                 self.loop_closer.add(step)
                 yield replace(step, stage_seconds={**step.stage_seconds, "loop_closure": perf_counter() - begin})
+
+    def look_closely(self) -> Diagnosis:
+        """Read what was played once more, as `vioframe check` does: what may be the cause where a run came to nothing.
+
+        It takes seconds, as points are followed anew, without believing the calibration.
+        """
+        with limited_threads(), self.registry.blaming():
+            measurements = played(self.dataset.measurements(), self.config.start_s, self.config.duration_s)
+            return diagnose(gather(measurements, self.dataset.calibration))
 
     def close_loops(self) -> LoopClosure | None:
         """What the loop closer, if any, made of all steps; to be called once they are through."""
@@ -112,6 +142,7 @@ def prepare(config: Config, registry: Registry) -> Experiment:
         dataset,
         odometry,
         dataset.ground_truth if config.ground_truth is None else load_trajectory(config.ground_truth),
+        Gatherer(dataset.calibration, _LOOK_EVERY, _LOOK_S),
         None
         if config.loop_closure is None
         else registry.create_loop_closer(config.loop_closure.name, dataset.calibration, config.loop_closure.options),
@@ -140,11 +171,13 @@ def record(
     *,
     overwrite: bool = False,
     on_step: Callable[[Step], None] = lambda step: None,
+    explain: bool = False,
 ) -> dict[str, Any]:
     """Run ``experiment`` and write ``folder`` as it goes; returns the summary.
 
     Nothing is created or replaced before the first frame has gone through; after that the folder is completed
-    however the run ends.
+    however the run ends. The summary has the ``findings`` about the recording: those of its stamps and readings, or
+    with ``explain`` all that can be found (:meth:`Experiment.look_closely`) where the run never initialised.
     """
     begin_s = perf_counter()
     steps = experiment.steps()
@@ -153,13 +186,16 @@ def record(
         raise DatasetError(f"{experiment.dataset.name} has no image to process: {_why_none(experiment)}")
     new_run_folder(folder, overwrite=overwrite)
     try:
-        return _write(experiment, folder, chain([first], steps), begin_s, on_step)
+        return _write(experiment, folder, chain([first], steps), begin_s, on_step, explain)
     except OSError as error:
         raise RunError(f"cannot write to {folder}: {error.strerror}; is the disk full?") from error
 
 
 def _why_none(experiment: Experiment) -> str:
     """Why not one frame got as far as the estimator, told by the stamps."""
+    for finding in diagnose(experiment.gatherer.recording()).findings:
+        if finding.kind in ("stamps_zero", "stamp_units"):
+            return str(finding)
     stamps: dict[type, list[int]] = {FrameSet: [], ImuSample: [], Unreadable: []}
     for measurement in experiment.dataset.measurements():
         stamps[type(measurement)].append(measurement.t_ns)
@@ -180,7 +216,12 @@ def _why_none(experiment: Experiment) -> str:
 
 
 def _write(
-    experiment: Experiment, folder: Path, steps: Iterable[Step], begin_s: float, on_step: Callable[[Step], None]
+    experiment: Experiment,
+    folder: Path,
+    steps: Iterable[Step],
+    begin_s: float,
+    on_step: Callable[[Step], None],
+    explain: bool,
 ) -> dict[str, Any]:
     config, registry = experiment.config, experiment.registry
     (folder / "config.yaml").write_text(configuration.render(config, registry), encoding="utf-8")
@@ -195,6 +236,9 @@ def _write(
                 on_step(step)
             if (loop_closure := experiment.close_loops()) is not None:
                 recorder.add_loop_closure(loop_closure)
+            closely = explain and not recorder.initialised
+            found = experiment.look_closely() if closely else diagnose(experiment.gatherer.recording())
+            recorder.add_findings(found.findings)
         except BaseException as error:
             error.add_note(f"what was estimated until then is in {folder}")
             raise

@@ -19,6 +19,7 @@ from vioframe.errors import VioframeError
 
 _COMMANDS = {
     "run": "Estimate the motion along a recording and write a run folder.",
+    "check": "Say what is wrong with a recording, or with a plug-in.",
     "evaluate": "Compare runs with the ground truth, as a table.",
     "plot": "Draw trajectories and errors of one or more runs.",
     "view": "Show runs in space and over time, in rerun's viewer.",
@@ -39,6 +40,8 @@ _MODULES = {
     **dict.fromkeys(("simulate", "convert"), "recordings"),
 }
 
+EXIT_FAILED = 1
+"""What was asked for was done, and came to nothing, or found something wrong."""
 EXIT_BAD_INPUT = 2
 EXIT_INTERRUPTED = 130
 EXIT_TERMINATED = 143

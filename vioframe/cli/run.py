@@ -9,7 +9,9 @@ from typing import Any
 
 import click
 
-from vioframe.cli.common import FILE, Bar, PartName, calibration_option, quiet_option
+from vioframe.cli import EXIT_FAILED
+from vioframe.cli.common import FILE, Bar, PartName, calibration_option, print_notes, quiet_option
+from vioframe.diagnosis import Severity
 from vioframe.errors import DatasetError, TrajectoryError
 from vioframe.evaluation import evaluate
 from vioframe.geometry.trajectory import Trajectory
@@ -21,6 +23,8 @@ from vioframe.report.units import length
 from vioframe.runs.folder import RunFolder
 from vioframe.runs.recorder import check_run_folder, free_run_folder
 from vioframe.types import NS_PER_S, Step
+
+_MOST_REASONS = 4
 
 
 @click.command("run")
@@ -45,6 +49,8 @@ from vioframe.types import NS_PER_S, Step
 def run(out: Path | None, overwrite: bool, quiet: bool, **choices: Any) -> None:
     """Estimate the motion along DATA, a bag or an ASL folder, and write a run folder.
 
+    The exit code is 1 where it never initialised; `vioframe check DATA` says more about why.
+
     Options of the parts are set with -o: `-o backend.max_clones=15`, or just `-o max_clones=15` where only one part has
     such an option. `vioframe plugins NAME` lists them.
     """
@@ -55,12 +61,15 @@ def run(out: Path | None, overwrite: bool, quiet: bool, **choices: Any) -> None:
     with Bar(None, quiet=quiet, late=True) as bar:
         experiment = prepare(config, installed)
         folder = out or free_run_folder(Path("runs"), experiment.name)
-        summary = record(experiment, folder, overwrite=overwrite, on_step=_watched(bar, experiment))
+        summary = record(experiment, folder, overwrite=overwrite, on_step=_watched(bar, experiment), explain=True)
     if not quiet:
         if others := experiment.left_aside:
             used = experiment.dataset.calibration.cameras[0].name
             click.echo(f"camera {used} is used, {', '.join(others)} left aside; -o cameras={others[0]} takes another")
         _report(folder, summary)
+    if summary["initialised_t_ns"] is None:
+        click.echo(f"vioframe: {summary['name']} never initialised; {_likeliest_cause(summary)}", err=True)
+        click.get_current_context().exit(EXIT_FAILED)
 
 
 def _configure(
@@ -112,10 +121,21 @@ def _watched(bar: Bar, experiment: Experiment) -> Callable[[Step], None]:
     return on_step
 
 
+def _likeliest_cause(summary: dict[str, Any]) -> str:
+    """In one line: what is wrong with the recording, or else what may be, or else what was said most often."""
+    findings = summary["findings"]
+    if findings:
+        likeliest = findings[0]
+        return f"likeliest cause: {likeliest['sentence']} ({likeliest['certainty']}); {likeliest['remedy']}"
+    if reasons := summary["event_reasons"]:
+        return f"nothing is wrong with the recording as far as can be told; said most often: {next(iter(reasons))}"
+    return f"it has {summary['frames']} frames only: it takes a second at rest, or two in motion"
+
+
 def _report(folder: Path, summary: dict[str, Any]) -> None:
     """A few lines on how it went, and what to do next."""
     if summary["initialised_t_ns"] is None:
-        went = "never initialised; the events in summary.json say why"
+        went = "never initialised"
     else:
         went = f"initialised after {summary['initialised_after_s']:.2f} s, then {summary['completion']:.1%} tracked"
     click.echo(f"{summary['name']}: {summary['frames']} frames, {went}, {summary['resets']} resets")
@@ -123,6 +143,10 @@ def _report(folder: Path, summary: dict[str, Any]) -> None:
     if summary["incidents"]:
         counts = ", ".join(f"{kind} {count}" for kind, count in summary["incidents"].items())
         click.echo(f"handled on the way: {counts}")
+    for reason, count in list(summary["event_reasons"].items())[:_MOST_REASONS]:
+        click.echo(f"  {count} times {reason}")
+    wrong = [finding for finding in summary["findings"] if finding["severity"] == Severity.WRONG]
+    print_notes(f"{finding['sentence']}; {finding['remedy']}" for finding in wrong)
     results = RunFolder.open(folder)
     estimate, truth = results.trajectory(), results.ground_truth()
     if estimate is not None and truth is not None:

@@ -14,7 +14,8 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from vioframe.errors import DatasetError
+from vioframe.errors import DatasetError, ImageSizeError
+from vioframe.geometry.cameras import Camera
 from vioframe.types import Calibration, FrameSet, Image, Measurement
 
 MOST_PIXELS = 1 << 26
@@ -94,18 +95,24 @@ def frame_set(
 ) -> FrameSet:
     """What the camera at ``place`` in a rig took, as a set without the others; for the image see :func:`to_gray8`.
 
-    Raises :class:`~vioframe.errors.DatasetError` where it is not of the size that the camera was calibrated for.
+    Raises :class:`~vioframe.errors.ImageSizeError` where it is not of the size that the camera was calibrated for.
     """
     gray = to_gray8(image, bit_depth, where)
-    height, width = gray.shape
-    resolution = calibration.cameras[place].model.resolution
-    if (width, height) != resolution:
-        calibrated = "x".join(map(str, resolution))
-        raise DatasetError(
-            f"{where} has images of {width}x{height}, but the calibration is for {calibrated}; "
-            "name the right one with --calibration FILE"
-        )
+    check_size(gray, calibration.cameras[place].model, where)
     return FrameSet(t_ns, tuple(gray if i == place else None for i in range(len(calibration.cameras))))
+
+
+def check_size(image: Image, camera: Camera, where: str) -> None:
+    """Raise :class:`~vioframe.errors.ImageSizeError`, beginning with ``where``, unless ``camera`` has such images."""
+    size = image.shape[1], image.shape[0]
+    if size != camera.resolution:
+        got, calibrated = ("x".join(map(str, each)) for each in (size, camera.resolution))
+        raise ImageSizeError(
+            f"{where} has images of {got}, but the calibration is for {calibrated}; "
+            "name the right one with --calibration FILE",
+            size,
+            camera.resolution,
+        )
 
 
 def gathered(measurements: Iterable[Measurement]) -> Iterator[Measurement]:

@@ -17,8 +17,10 @@ All but the timings, the machine and the summary's clock-dependent figures are t
 from __future__ import annotations
 
 import json
+import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from itertools import count
 from pathlib import Path
 from time import perf_counter
@@ -27,6 +29,7 @@ from typing import Any, Self, TextIO
 
 import numpy as np
 
+from vioframe.diagnosis.findings import Finding
 from vioframe.errors import RunError
 from vioframe.evaluation.landmarks import Landmarks
 from vioframe.geometry import so3
@@ -59,7 +62,8 @@ RUN_FILES = (
 )
 """What a run folder holds; patterns, as are taken out where a run is replaced by another."""
 _UPPER = np.triu_indices(6)
-_EVENTS_KEPT_PER_KIND = 20
+_EVENTS_KEPT_PER_KIND, _REASONS_KEPT = 20, 30
+_NUMBER = re.compile(r"-?\d+(\.\d+)?")
 _RECENT_LANDMARKS = 5000
 
 
@@ -119,6 +123,7 @@ class Recorder:
         self._segments: list[dict[str, int]] = []
         self._events: list[dict[str, Any]] = []
         self._event_counts: Counter[str] = Counter()
+        self._reasons: Counter[str] = Counter()
         self._stage_totals: Counter[str] = Counter()
         self._frame_seconds = 0.0
         self._points = self._frames = self._tracked = self._resets = 0
@@ -142,6 +147,7 @@ class Recorder:
             **self._figures(),
             "events": self._events,
             "event_counts": dict(self._event_counts),
+            "event_reasons": dict(self._reasons.most_common(_REASONS_KEPT)),
             "incidents": dict(sorted(self._incidents.counts.items())),
             "incident_notes": self._incidents.notes,
         }
@@ -199,10 +205,24 @@ class Recorder:
             "seconds_beside": dict(result.stage_seconds),
         }
 
+    def add_findings(self, findings: Sequence[Finding]) -> None:
+        """What was found to be odd about the recording, the likeliest cause of trouble first."""
+        self.summary["findings"] = [asdict(finding) for finding in findings]
+
+    @property
+    def initialised(self) -> bool:
+        """Whether there was a pose by now."""
+        return self._begun is not None
+
     def _add_event(self, t_ns: int, event: str) -> None:
-        """Count an event by its kind, what stands before its colon; the first of a kind are kept, and its last."""
-        kind = event.partition(":")[0]
+        """Count an event by its kind, what stands before its colon; the first of a kind are kept, and its last.
+
+        Why it came to it is counted apart, numbers left out: each of the reasons that stand behind the colon.
+        """
+        kind, _, reasons = event.partition(": ")
         self._event_counts[kind] += 1
+        if reasons:
+            self._reasons.update(_NUMBER.sub("#", reason) for reason in reasons.split("; "))
         if self._event_counts[kind] > _EVENTS_KEPT_PER_KIND:
             self._events = [e for e in self._events if e.get("last_of") != kind]
             self._events.append({"t_ns": t_ns, "event": event, "last_of": kind})

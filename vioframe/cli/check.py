@@ -1,0 +1,179 @@
+"""``vioframe check``: what is wrong with a recording, ahead of a run; or with a plug-in, by the conformance kit."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import click
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from vioframe.cli import EXIT_FAILED
+from vioframe.cli.common import FILE, Bar, calibration_option, print_table
+from vioframe.diagnosis import Certainty, Diagnosis, Finding, Severity, diagnose, gather
+from vioframe.diagnosis.images import wrong_size
+from vioframe.errors import ConfigError, DatasetError, ImageSizeError
+from vioframe.interfaces import Dataset
+from vioframe.io.synchronise import played
+from vioframe.odometry import limited_threads
+from vioframe.parts import registry
+from vioframe.parts.options import did_you_mean
+from vioframe.parts.registry import BACKEND, DATASET, DETECTOR, FLIGHT, KINDS, LOOP_CLOSER, METRIC, Kind, Part, Registry
+from vioframe.types import FrameSet, Measurement
+
+_COLOURS = {Severity.WRONG: "bold red", Severity.WORTH_KNOWING: "yellow"}
+
+
+@click.command("check")
+@click.argument("target", metavar="DATA|NAME")
+@calibration_option
+@click.option("--reader", metavar="NAME", help="Data-set reader, where several accept DATA.")
+@click.option("--camera", metavar="NAME", help="Camera to look at.  [default: the first]")
+@click.option("--start", "start_s", type=float, default=0.0, metavar="S", help="Skip the first S seconds.")
+@click.option("--duration", "duration_s", type=float, metavar="S", help="Stop after S seconds.")
+@click.option("--data", type=FILE, help="For a reader: a recording to try it on.")
+@click.option("--json", "as_json", is_flag=True, help="Print all that was found as JSON.")
+@click.option("--quiet", is_flag=True, help="No progress bar.")
+def check(target: str, as_json: bool, quiet: bool, data: Path | None, **choices: Any) -> None:
+    """Say what is wrong with DATA, a bag or an ASL folder, or whether the plug-in NAME keeps its promises.
+
+    Of a recording stamps, readings and images are looked at, and points are followed where it moves most, to compare
+    camera and IMU with each other and with the calibration. What is found is listed with the likeliest cause first,
+    each with what to do about it. A plug-in is put through the conformance kit, `vioframe.testing`.
+
+    The exit code is 1 where something is wrong.
+    """
+    installed = registry.load()
+    if Path(target).exists():
+        wrong = _check_recording(installed, Path(target), as_json=as_json, quiet=quiet or as_json, **choices)
+    else:
+        wrong = _check_parts(installed, target, data, as_json=as_json)
+    if wrong:
+        click.get_current_context().exit(EXIT_FAILED)
+
+
+def _check_recording(
+    installed: Registry,
+    path: Path,
+    *,
+    as_json: bool,
+    quiet: bool,
+    calibration: tuple[Path, ...],
+    reader: str | None,
+    camera: str | None,
+    start_s: float,
+    duration_s: float | None,
+) -> bool:
+    part = installed.find_reader(path, reader)
+    options: dict[str, Any] = {"calibration": list(calibration)} if calibration else {}
+    try:
+        dataset = installed.open_dataset(path, part.name, options)
+        aside = [other.name for other in dataset.calibration.cameras]
+        chosen = camera or aside[0]
+        if camera or (len(aside) > 1 and any(option.name == "cameras" for option in part.options)):
+            dataset = installed.open_dataset(path, part.name, {**options, "cameras": [chosen]})
+        aside.remove(dataset.calibration.cameras[0].name)
+        with Bar(dataset.frame_count, quiet=quiet, late=True) as bar, limited_threads(), installed.blaming():
+            found = diagnose(gather(_watched(dataset, start_s, duration_s, bar), dataset.calibration))
+    except ImageSizeError as error:
+        # Some readers look at an image as they open a recording.
+        found, aside = Diagnosis((wrong_size(error),), {}), []
+    if as_json:
+        findings = [asdict(finding) for finding in found.findings]
+        tree = {"data": str(path), "reader": part.name, "wrong": bool(found.wrong), "facts": found.facts}
+        click.echo(json.dumps({**tree, "cameras_left_aside": aside, "findings": findings}, indent=2))
+    else:
+        _show(path, part, found, aside)
+    return bool(found.wrong)
+
+
+def _watched(dataset: Dataset, start_s: float, duration_s: float | None, bar: Bar) -> Iterator[Measurement]:
+    for measurement in played(dataset.measurements(), start_s, duration_s):
+        if isinstance(measurement, FrameSet):
+            bar("read")
+        yield measurement
+
+
+def _show(path: Path, part: Part, found: Diagnosis, aside: list[str]) -> None:
+    """What was looked at in a line each, then the findings, the cause first."""
+    console = Console()
+    facts = Table.grid(padding=(0, 2))
+    facts.add_column(style="dim")
+    facts.add_column(overflow="fold")
+    for name, fact in found.facts.items():
+        facts.add_row(name, Text(fact))
+    if aside:
+        facts.add_row("left aside", Text(f"{', '.join(aside)}; look at one with --camera NAME"))
+    console.print(Text(f"{path} (reader {part.name})", style="bold"))
+    console.print(facts) if console.is_terminal else print_table(facts)
+    if not found.findings:
+        console.print(Text("Nothing wrong was found.", style="green"))
+        return
+    listed = Table.grid(padding=(0, 2))
+    listed.add_column()
+    listed.add_column(overflow="fold")
+    for finding in found.findings:
+        listed.add_row(Text(finding.severity, style=_COLOURS[finding.severity]), _told(finding))
+    console.print()
+    console.print(listed) if console.is_terminal else print_table(listed)
+    if not found.wrong:
+        console.print(Text("\nNothing wrong was found.", style="green"))
+
+
+def _told(finding: Finding) -> Text:
+    sure = "" if finding.certainty is Certainty.CERTAIN else f", {finding.certainty}"
+    return Text.assemble(
+        (finding.sentence[:1].upper() + finding.sentence[1:] + ".", ""),
+        (f"  [{finding.kind}{sure}]\n", "dim"),
+        ("-> " + finding.remedy, "cyan"),
+    )
+
+
+def _check_parts(installed: Registry, name: str, data: Path | None, *, as_json: bool) -> bool:
+    """Put every part called ``name`` through the conformance kit; whether one fails it."""
+    parts = [table[name] for kind in KINDS if name in (table := installed.parts.get(kind.name, {}))]
+    if not parts:
+        known = sorted({part for kind in KINDS for part in installed.names(kind)})
+        raise DatasetError(
+            f"{name} is no recording here and no part is called so{did_you_mean(name, known)}; "
+            "`vioframe plugins` lists the parts"
+        )
+    results = [(part, _complaint(part, data)) for part in parts]
+    if as_json:
+        tree = [{"kind": part.kind.name, "name": part.name, "complaint": why} for part, why in results]
+        click.echo(json.dumps({"wrong": any(why for _, why in results), "parts": tree}, indent=2))
+    else:
+        for part, why in results:
+            click.echo(f"{part}: {why or 'keeps to all that is promised'}")
+    return any(why for _, why in results)
+
+
+def _complaint(part: Part, data: Path | None) -> str:
+    """What the kit says of ``part``; "" where it conforms."""
+    from vioframe import testing
+
+    checks: dict[Kind, Callable[[Any], None]] = {
+        DETECTOR: testing.check_detector,
+        BACKEND: testing.check_backend,
+        LOOP_CLOSER: testing.check_loop_closer,
+        FLIGHT: testing.check_flight,
+        METRIC: testing.check_metric,
+    }
+    try:
+        with limited_threads():
+            if part.kind is DATASET:
+                if data is None:
+                    raise ConfigError(f"name a recording to try {part} on, with --data")
+                testing.check_dataset(part.factory, data)
+            elif part.kind in checks:
+                checks[part.kind](part.factory)
+            else:
+                raise ConfigError(f"there is no conformance kit for a {part.kind.name}")
+    except AssertionError as error:
+        return " ".join(str(error).split())
+    return ""
