@@ -10,6 +10,7 @@ from vioframe.estimation.factors.tracks import TrackTable
 from vioframe.geometry import so3
 from vioframe.io.calibration import packaged_calibration
 from vioframe.simulation import TrackSequence, simulated_sequence
+from vioframe.simulation.tracks import EUROC_NOISE
 from vioframe.types import Calibration, CalibrationEstimate, CameraSigma, Float, NavState
 from vioframe_msckf.state import FilterState
 
@@ -21,7 +22,8 @@ START_COV = np.diag(np.repeat([0.005, 0.001, 0.02, 0.005, 0.05], 3) ** 2)
 def prior_of(calibration: Calibration) -> CalibrationEstimate:
     """``calibration`` as well known as the life cycle takes any to be."""
     intrinsics = np.repeat([1.0, 0.005], 4)
-    return CalibrationEstimate(calibration, (CameraSigma(np.full(3, 0.005), np.full(3, 0.015), 0.01, intrinsics),))
+    sigma = CameraSigma(np.full(3, 0.005), np.full(3, 0.015), 0.01, intrinsics, 0.02)
+    return CalibrationEstimate(calibration, (sigma,))
 
 
 def random_covariance(rng: np.random.Generator, n: int) -> Float:
@@ -50,19 +52,33 @@ def random_state(
     return state
 
 
-def seeing_state(seed: int = 0, clones: int = 6) -> tuple[FilterState, TrackTable]:
-    """A filter that knows to a centimetre where it has been on a simulated flight, and what it saw from there."""
-    sequence = simulated_sequence("figure_eight", seed=seed, duration_s=2.0)
+def seeing_state(
+    seed: int = 0, clones: int = 6, *, readout_s: float = 0.0, exact: bool = False
+) -> tuple[FilterState, TrackTable]:
+    """A filter that knows to a centimetre where it has been on a simulated flight, and what it saw from there.
+
+    With a rolling shutter it estimates the readout. An ``exact`` one sees without noise.
+    """
+    calibration = CALIBRATION.with_camera(0, readout_s=readout_s)
+    noise = None if exact else EUROC_NOISE
+    sequence = simulated_sequence(
+        "figure_eight", noise, 0.0 if exact else 1.0, seed, duration_s=2.0, calibration=calibration
+    )
     start = sequence.true_states[0]
     state = FilterState(
-        replace(start, cov=np.eye(15)), prior_of(sequence.calibration), extrinsics=True, offset=True, intrinsics=True
+        replace(start, cov=np.eye(15)),
+        prior_of(sequence.calibration),
+        extrinsics=True,
+        offset=True,
+        intrinsics=True,
+        readout=readout_s != 0.0,
     )
     observations = TrackTable()
-    for k in range(0, 3 * clones, 3):
-        true = sequence.true_states[k]
+    for k in range(1, 3 * clones, 3):
+        true, (imu, tracks) = sequence.true_states[k], sequence.packets[k]
         state.R_WB, state.p_WB, state.v_WB = true.R_WB, true.p_WB, true.v_WB
-        state.augment_clone(np.zeros(3))
-        observations.add_frame(sequence.packets[k][1])
+        state.augment_clone(imu.gyro_B[-1] - true.bias_gyro_B)
+        observations.add_frame(tracks)
     state.cov = 0.01**2 * random_covariance(np.random.default_rng(seed), len(state.cov))
     return state, observations
 

@@ -10,11 +10,18 @@ from msckf_helpers import random_covariance
 from numpy.typing import NDArray
 
 from vioframe.estimation.factors.inertial import ImuFactors, StateArrays
-from vioframe.estimation.factors.landmarks import camera_poses, in_hosts, positions
+from vioframe.estimation.factors.landmarks import in_hosts, positions
 from vioframe.estimation.factors.problem import STATE_SIZE, Prior, Problem, Variables
-from vioframe.estimation.factors.reprojection import CALIBRATION_SIZE, Calibrated, Sightings, pixels_by_residual
+from vioframe.estimation.factors.reprojection import (
+    GLOBAL_SHUTTER,
+    Calibrated,
+    Shutter,
+    Sightings,
+    pixels_by_residual,
+)
 from vioframe.estimation.inertial.preintegration import join_segments, preintegrate
 from vioframe.estimation.standstill import Standstill
+from vioframe.geometry import so3
 from vioframe.geometry.cameras import Camera
 from vioframe.geometry.kernels import intrinsics_of
 from vioframe.io.calibration import packaged_calibration
@@ -24,7 +31,7 @@ from vioframe.types import Float
 CAMERA = packaged_calibration("euroc").cameras[0].model
 NATURAL = np.repeat([0.01, 0.05, 0.1, 0.005, 0.05], 3)
 """Errors of a state that are large but linear enough: rad, m, m/s, rad/s, m/s^2."""
-NATURAL_CALIBRATION = np.repeat([0.005, 0.01, 0.002], [3, 3, 1])
+NATURAL_CALIBRATION = np.repeat([0.005, 0.01, 0.002, 0.005], [3, 3, 1, 1])
 
 
 def flown_window(
@@ -35,13 +42,15 @@ def flown_window(
     on_sphere: bool = False,
     noise_px: float = 2.0,
     offset_s: float = 0.003,
+    readout_s: float = 0.0,
     camera: Camera = CAMERA,
     first_estimates: bool = True,
 ) -> tuple[Problem, Variables]:
     """States a quarter of a second apart, landmarks seen by two frames or more, a prior on the first two states.
 
     They are the true ones, of which pixels and readings are off by noise, and the prior by as much. With ``noise_px`` 0
-    all are exact. Each state but the last hosts some landmarks.
+    all are exact. Each state but the last hosts some landmarks. With a rolling shutter the readout is one of
+    the unknowns, and the body moves while rows are read in some way of its own.
     """
     rng, exact = np.random.default_rng(seed), noise_px == 0.0
     duration_s = 0.25 * frames + 0.1
@@ -54,7 +63,7 @@ def flown_window(
         imu = join_segments([imu for imu, _ in sequence.packets[k + 1 : k + 6]])
         biases = np.zeros((2, 3)) if exact else rng.normal(size=(2, 3)) * [[0.002], [0.02]]
         readings.append(preintegrate(imu, *biases, sequence.calibration.imu))
-    calibrated = Calibrated(sequence.calibration.cameras[0].R_BC, sequence.calibration.cameras[0].p_BC, offset_s)
+    calibrated = Calibrated(sequence.calibration.cameras[0].R_BC, sequence.calibration.cameras[0].p_BC, offset_s, readout_s)
     sightings, points = _sightings(states, calibrated, camera, landmarks, noise_px, on_sphere, rng)
     x = Variables(states, calibrated, points)
     prior = prior_on(x, 2, rng)
@@ -67,9 +76,10 @@ def flown_window(
 def prior_on(x: Variables, frozen: int, rng: np.random.Generator) -> Prior:
     """A random prior on the first ``frozen`` states and the calibration, about ``x``."""
     n, known = STATE_SIZE * len(x.states), STATE_SIZE * frozen
-    index = np.r_[0:known, n : n + CALIBRATION_SIZE]
-    sigma = np.concatenate([np.tile(NATURAL, frozen), NATURAL_CALIBRATION])
-    H, b = np.zeros((n + CALIBRATION_SIZE, n + CALIBRATION_SIZE)), np.zeros(n + CALIBRATION_SIZE)
+    end = len(natural(x))
+    index = np.r_[0:known, n:end]
+    sigma = natural(x)[index]
+    H, b = np.zeros((end, end)), np.zeros(end)
     H[np.ix_(index, index)] = random_covariance(rng, len(index)) / np.outer(sigma, sigma)
     b[index] = rng.normal(size=len(index)) / sigma
     return Prior(H, b, x.states, x.camera, np.arange(len(x.states)) < frozen)
@@ -88,7 +98,8 @@ def without_sightings(problem: Problem) -> Problem:
 
 def only(sightings: Sightings, rows: slice | NDArray[np.bool_]) -> Sightings:
     s = sightings
-    return s._replace(seen=s.seen[rows], xy=s.xy[rows], velocity=s.velocity[rows], to_px=s.to_px[rows])
+    s = s._replace(seen=s.seen[rows], xy=s.xy[rows], velocity=s.velocity[rows], to_px=s.to_px[rows])
+    return s if s.shutter is GLOBAL_SHUTTER else s._replace(shutter=s.shutter._replace(row=s.shutter.row[rows]))
 
 
 def moved(x: Variables, rng: np.random.Generator, scale: float) -> Variables:
@@ -100,12 +111,13 @@ def moved(x: Variables, rng: np.random.Generator, scale: float) -> Variables:
 
 def natural(x: Variables) -> Float:
     """(n,) natural sizes of the error of states and calibration."""
-    return np.concatenate([np.tile(NATURAL, len(x.states)), NATURAL_CALIBRATION])
+    calibration = NATURAL_CALIBRATION if x.camera.readout_s else NATURAL_CALIBRATION[:-1]
+    return np.concatenate([np.tile(NATURAL, len(x.states)), calibration])
 
 
 def retracted(x: Variables, d: Float) -> Variables:
     """``x`` moved by ``d``: states and calibration, then landmarks."""
-    n = STATE_SIZE * len(x.states) + CALIBRATION_SIZE
+    n = len(natural(x))
     return x.retract(d[:n], d[n:].reshape(-1, 3))
 
 
@@ -117,6 +129,16 @@ def numeric(function: Callable[[Float], Float], sizes: Float, eps: float = 1e-4)
         far = np.asarray(function(2.0 * e)) - np.asarray(function(-2.0 * e))
         columns.append((8.0 * near - far) / (12.0 * e.sum()))
     return np.stack(columns, axis=-1)
+
+
+def row_poses(states: StateArrays, camera: Calibrated, shutter: Shutter, row: int, frame: int) -> tuple[Float, Float]:
+    """R_WC (3, 3) and p_WC (3,) when the landmark ``row`` was seen in ``frame``."""
+    R_WB, p_WB = states.R_WB[frame], states.p_WB[frame]
+    if camera.readout_s:
+        late_s = camera.readout_s * shutter.row[row, frame]
+        p_WB = p_WB + R_WB @ shutter.velocity_B[frame] * late_s
+        R_WB = R_WB @ so3.exp(shutter.rate_B[frame] * late_s)
+    return R_WB @ camera.R_BC, R_WB @ camera.p_BC + p_WB
 
 
 def _sightings(
@@ -133,8 +155,12 @@ def _sightings(
     hosts = np.arange(drawn) % (frames - 1)
     xy_rho = np.column_stack([rng.uniform(-0.5, 0.5, (drawn, 2)), 1.0 / rng.uniform(3.0, 10.0, drawn)])
     p_WF = positions(states, calibrated, hosts, xy_rho)
-    R_WC, p_WC = camera_poses(states, calibrated)
-    p_CF = np.einsum("kji,lkj->lki", R_WC, p_WF[:, None] - p_WC)
+    shutter = GLOBAL_SHUTTER
+    if calibrated.readout_s:
+        own = np.random.default_rng(1)
+        shutter = Shutter(own.uniform(-0.5, 0.5, (drawn, frames)), *own.normal(size=(2, frames, 3)))
+    poses = [[row_poses(states, calibrated, shutter, i, f) for f in range(frames)] for i in range(drawn)]
+    p_CF = np.array([[(p - p_WC) @ R_WC for R_WC, p_WC in own] for own, p in zip(poses, p_WF, strict=True)])
     in_view = (p_CF[..., 2] > 1.0) & (np.abs(p_CF[..., :2]) < 0.7 * p_CF[..., 2:]).all(axis=2)
     seen = in_view & (rng.random((drawn, frames)) < 0.7) & (np.arange(frames) > hosts[:, None])
     seen[np.arange(drawn), hosts] = True
@@ -151,4 +177,6 @@ def _sightings(
     to_px[seen] = pixels_by_residual(*intrinsics_of(camera), xy[seen], on_sphere)
     landmarks, in_front = in_hosts(states, calibrated, hosts, p_WF)
     assert in_front.all()
-    return Sightings(seen, xy, velocity, to_px, 0.8, 2.0, on_sphere), landmarks
+    if calibrated.readout_s:
+        shutter = shutter._replace(row=shutter.row[chosen])
+    return Sightings(seen, xy, velocity, to_px, 0.8, 2.0, on_sphere, shutter), landmarks

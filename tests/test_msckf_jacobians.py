@@ -11,7 +11,7 @@ from vioframe.geometry import kernels, so3
 from vioframe.geometry.cameras import Camera
 from vioframe_msckf.measurement import Window, landmark_rows, mahalanobis, observations, reduce_landmark, track_rows
 from vioframe_msckf.options import MsckfOptions
-from vioframe_msckf.state import CALIBRATION, OFFSET
+from vioframe_msckf.state import IMU, OFFSET, READOUT
 from vioframe_msckf.updates import promote_tracks
 
 CAMERAS = {
@@ -20,30 +20,39 @@ CAMERAS = {
 }
 
 
+@pytest.mark.parametrize("readout_s", [0.0, 0.03, -0.02], ids=["global", "rolling", "upwards"])
 @pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS.keys())
-def test_observation_jacobian_is_the_derivative_on_the_manifold(camera):
+def test_observation_jacobian_is_the_derivative_on_the_manifold(camera, readout_s):
     rng = np.random.default_rng(3)
     model, k = kernels.intrinsics_of(camera)
     R_BC, p_BC = so3.exp(rng.normal(size=3)), 0.1 * rng.normal(size=3)
     R_WB, p_WB = so3.exp(rng.normal(size=3)), rng.normal(size=3)
     p_WF = p_WB + R_WB @ (R_BC @ np.array([0.7, -0.4, 3.0]) + p_BC)
+    rate_B, velocity_B, y = np.array([0.7, -1.1, 1.6]), np.array([1.2, 0.4, -0.9]), 40.0
+    row = (y + 0.5) / 480 - 0.5
 
     def predicted(d):
-        """Pixel after perturbing [theta_BC p_BC offset k(8) | theta_WB p_WB | p_WF] by d (24,)."""
+        """Pixel after perturbing [theta_BC p_BC offset k(8) readout | theta_WB p_WB | p_WF] by d (25,)."""
         R_C, p_C = R_BC @ so3.exp(d[0:3]), p_BC + d[3:6]
-        R_B, p_B = R_WB @ so3.exp(d[15:18]), p_WB + d[18:21]
-        point = R_C.T @ (R_B.T @ (p_WF + d[21:24] - p_B) - p_C)
+        R_B, p_B = R_WB @ so3.exp(d[16:19]), p_WB + d[19:22]
+        late_s = (readout_s + d[15]) * row
+        R_row, p_row = R_B @ so3.exp(rate_B * late_s), p_B + R_B @ velocity_B * late_s
+        point = R_C.T @ (R_row.T @ (p_WF + d[22:25] - p_row) - p_C)
         perturbed = k + d[7:15]
         return Camera(*perturbed[:4], tuple(perturbed[4:]), camera.resolution, camera.distortion_model).project(
             point[None]
         )[0]
 
-    xy = predicted(np.zeros(24)) + np.array([0.3, -0.2])
-    window = Window(R_WB[None], p_WB[None], R_WB[None], p_WB[None], R_BC, p_BC, model, k)
+    exact = predicted(np.zeros(25))
+    xy = np.array([exact[0] + 0.3, y])
+    motion = rate_B[None], velocity_B[None]
+    window = Window(
+        R_WB[None], p_WB[None], R_WB[None], p_WB[None], *motion, R_BC, p_BC, model, k, readout_s, 480, calibrated=16
+    )
     blocks, residual = observations(window, 0, p_WF[None], p_WF[None], xy[None])
     eps = 1e-6
-    numeric = np.stack([(predicted(eps * e) - predicted(-eps * e)) / (2 * eps) for e in np.eye(24)], axis=1)
-    np.testing.assert_allclose(residual[0], [0.3, -0.2], atol=1e-9)
+    numeric = np.stack([(predicted(eps * e) - predicted(-eps * e)) / (2 * eps) for e in np.eye(25)], axis=1)
+    np.testing.assert_allclose(residual[0], [0.3, y - exact[1]], atol=1e-9)
     np.testing.assert_allclose(blocks[0], numeric, rtol=1e-6, atol=1e-5)
 
 
@@ -52,9 +61,10 @@ def rows_of(table, row, window, pixel_sigma):
     return track_rows(window, table.xy[row], table.xy_normalised[row], table.seen[row], pixel_sigma)
 
 
-def test_rows_of_landmarks_predict_how_residuals_change_with_the_state():
+@pytest.mark.parametrize("readout_s", [0.0, 0.03], ids=["global", "rolling"])
+def test_rows_of_landmarks_predict_how_residuals_change_with_the_state(readout_s):
     """Column by column, through the filter's own correction; only the offset acts through the clones alone."""
-    state, table = seeing_state()
+    state, table = seeing_state(readout_s=readout_s)
     full = np.flatnonzero(table.seen.all(axis=1))[:4]
     for row in full:
         ok, p_WF, *_ = rows_of(table, row, Window.of(state, False), 1.0)
@@ -72,6 +82,24 @@ def test_rows_of_landmarks_predict_how_residuals_change_with_the_state():
     numeric = np.stack([(residual(-eps * e) - residual(eps * e)) / (2 * eps) for e in np.eye(n)], axis=1)
     np.testing.assert_allclose(H, numeric, rtol=1e-6, atol=2e-4)
     assert (H[:, OFFSET] == 0.0).all()
+    assert readout_s == 0.0 or np.abs(H[:, READOUT]).min() > 1.0
+
+
+def test_exact_poses_explain_exact_rows():
+    """Pixels of a rolling shutter, each from the pose at the time of its row; what is left is of second order."""
+    state, table = seeing_state(readout_s=0.03, exact=True)
+    full = np.flatnonzero(table.seen.all(axis=1))
+
+    def largest(window):
+        rows = [rows_of(table, row, window, 1.0) for row in full]
+        assert all(ok for ok, *_ in rows)
+        return max(np.abs(residual).max() for *_, residual in rows)
+
+    window = Window.of(state, False)
+    assert len(full) > 20
+    assert largest(window) < 0.02
+    assert largest(window._replace(readout_s=0.0)) > 0.5
+    assert largest(window._replace(readout_s=-0.03)) > 1.0
 
 
 def test_first_estimates_hold_the_jacobian_and_not_the_residual():
@@ -80,7 +108,7 @@ def test_first_estimates_hold_the_jacobian_and_not_the_residual():
     _, p_WF, *_ = rows_of(table, row, Window.of(state, True), 1.0)
     state.add_landmark(row, p_WF, p_WF, np.zeros((3, len(state.cov))), np.eye(3))
     moved, dx = copy.deepcopy(state), 0.01 * np.random.default_rng(0).normal(size=len(state.cov))
-    dx[CALIBRATION] = 0.0
+    dx[state.calibrated] = 0.0
     moved._correct(dx)
 
     def rows(of, first_estimates):
@@ -123,7 +151,7 @@ def test_delayed_initialisation_is_the_joint_update_with_nothing_known_of_the_la
     # In information form the landmark's prior is exactly nothing.
     n = len(state.cov)
     joint = np.zeros((len(residual), n + 3))
-    joint[:, CALIBRATION.start : n], joint[:, n:] = H, H_f
+    joint[:, IMU:n], joint[:, n:] = H, H_f
     information = joint.T @ joint / 0.7**2
     information[:n, :n] += np.linalg.inv(state.cov)
     cov = np.linalg.inv(information)

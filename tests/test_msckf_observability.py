@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import pytest
-from msckf_helpers import drawn_start, since
+from msckf_helpers import CALIBRATION, drawn_start, since
 
 import vioframe_msckf.updates as updates
 from vioframe.bench import run_backend
@@ -21,15 +21,15 @@ from vioframe.simulation import simulated_sequence
 from vioframe.types import DP, DTHETA, DV, Float, NavState
 from vioframe_msckf.backend import Msckf
 from vioframe_msckf.options import MsckfOptions
-from vioframe_msckf.state import CLONES, IMU, FilterState
+from vioframe_msckf.state import IMU, FilterState
 
 UP = np.array([0.0, 0.0, 1.0])
 FLIGHTS = ("figure_eight", "aggressive", "stop_and_go")
 
 
 def unobservable(state: FilterState) -> Float:
-    """(30, 4) of the body and the calibration: the world moved along its axes, and turned about gravity."""
-    N = np.zeros((CLONES, 4))
+    """(30 or 31, 4) of the body and the calibration: the world moved along its axes, and turned about gravity."""
+    N = np.zeros((state.calibrated.stop, 4))
     N[DP, :3] = np.eye(3)
     R_WB, p_WB, v_WB = state.first
     N[DTHETA, 3], N[DP, 3], N[DV, 3] = R_WB.T @ UP, np.cross(UP, p_WB), np.cross(UP, v_WB)
@@ -72,9 +72,10 @@ class Recorder:
         # A filter whose body is known only through its correlation with the calibration shows its transition there.
         shadow = copy.copy(state)
         shadow.cov = np.zeros_like(state.cov)
-        shadow.cov[:IMU, IMU:CLONES] = np.eye(IMU)
+        shown = slice(IMU, 2 * IMU)
+        shadow.cov[:IMU, shown] = np.eye(IMU)
         original(shadow, *arguments)
-        self.N[:IMU] = shadow.cov[:IMU, IMU:CLONES] @ self.N[:IMU]
+        self.N[:IMU] = shadow.cov[:IMU, shown] @ self.N[:IMU]
 
     def _augment_clone(self, state, original, *arguments) -> None:
         shadow = copy.copy(state)
@@ -99,9 +100,16 @@ class Recorder:
 
 
 def fly(
-    flight: str, options: MsckfOptions, monkeypatch: pytest.MonkeyPatch, seed: int = 0, *, at_rest: bool = True
+    flight: str,
+    options: MsckfOptions,
+    monkeypatch: pytest.MonkeyPatch,
+    seed: int = 0,
+    *,
+    at_rest: bool = True,
+    readout_s: float = 0.0,
 ) -> Recorder:
-    sequence = simulated_sequence(flight, seed=seed, duration_s=6.0)
+    calibration = CALIBRATION.with_camera(0, readout_s=readout_s)
+    sequence = simulated_sequence(flight, seed=seed, duration_s=6.0, calibration=calibration)
     recorder = Recorder()
     recorder.attach(monkeypatch)
     estimation = EstimationOptions(zero_velocity_update=at_rest)
@@ -114,6 +122,14 @@ def fly(
 @pytest.mark.parametrize("flight", FLIGHTS)
 def test_first_estimates_keep_position_and_yaw_unobservable(flight, monkeypatch):
     seen = np.array(fly(flight, MsckfOptions(), monkeypatch, at_rest=False).seen)
+    assert len(seen) > 200
+    assert seen.max() < 1e-8
+
+
+def test_the_rows_of_a_rolling_shutter_tell_nothing_of_position_and_yaw(monkeypatch):
+    """Where the body moves as each row is read is known in its own frame, which turns with the world."""
+    options = MsckfOptions(calibrate_readout=True)
+    seen = np.array(fly("figure_eight", options, monkeypatch, at_rest=False, readout_s=0.03).seen)
     assert len(seen) > 200
     assert seen.max() < 1e-8
 

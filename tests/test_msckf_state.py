@@ -8,7 +8,7 @@ from msckf_helpers import random_covariance, random_state
 from vioframe.errors import DivergedError
 from vioframe.geometry import so3
 from vioframe.types import DBA, DBG, DP, DTHETA, DV, NS_PER_S, Float, ImuNoise, ImuSegment
-from vioframe_msckf.state import CALIBRATION, CLONES, IMU, OFFSET, FilterState, compress
+from vioframe_msckf.state import IMU, OFFSET, FilterState, compress
 
 NOISE = ImuNoise(gyro_density=2e-3, accel_density=2e-2, gyro_walk=2e-3, accel_walk=3e-2, rate_hz=200.0)
 
@@ -46,11 +46,12 @@ def _clone_jacobian(state: FilterState, gyro_B: Float, n: int) -> Float:
         return R, state.p_WB + d[DP] + (state.v_WB + d[DV]) * offset_s
 
     eps, J = 1e-6, np.zeros((6, n))
-    for k in range(CLONES):
-        d = np.zeros(CLONES)
+    begin = state.calibrated.stop
+    for k in range(begin):
+        d = np.zeros(begin)
         d[k] = eps
         (R_plus, p_plus), (R_minus, p_minus) = clone(d), clone(-d)
-        R = clone(np.zeros(CLONES))[0]
+        R = clone(np.zeros(begin))[0]
         J[:, k] = np.concatenate([so3.log(R.T @ R_plus) - so3.log(R.T @ R_minus), p_plus - p_minus]) / (2.0 * eps)
     return J
 
@@ -87,7 +88,8 @@ def test_dropping_a_clone_and_landmarks_leaves_the_marginal():
     state = random_state(4, clones=4, landmarks=3)
     P, poses, points = state.cov.copy(), state.clones, state.p_WF
     state.drop_oldest_clone()
-    keep = np.r_[0:CLONES, CLONES + 6 : len(P)]
+    begin = state.calibrated.stop
+    keep = np.r_[0:begin, begin + 6 : len(P)]
     np.testing.assert_array_equal(state.cov, P[np.ix_(keep, keep)])
     np.testing.assert_array_equal(state.clones.p_WB, poses.p_WB[1:])
     np.testing.assert_array_equal(state.clones.R_WB_first, poses.R_WB_first[1:])
@@ -117,7 +119,7 @@ def test_a_landmark_comes_last_with_its_correlations():
 def test_update_agrees_with_filterpy(part, noise):
     state, rng = random_state(6, scale=0.02), np.random.default_rng(6)
     n = len(state.cov)
-    columns = {"all": slice(0, n), "window": slice(CALIBRATION.start, state.landmarks_begin), "imu": slice(0, IMU)}[
+    columns = {"all": slice(0, n), "window": slice(IMU, state.landmarks_begin), "imu": slice(0, IMU)}[
         part
     ]
     H, residual = rng.normal(size=(20, columns.stop - columns.start)), 0.05 * rng.normal(size=20)
@@ -135,7 +137,7 @@ def test_update_agrees_with_filterpy(part, noise):
     np.testing.assert_allclose(state.cov, oracle.P, rtol=1e-9, atol=1e-14)
     np.testing.assert_allclose(so3.log(R_WB.T @ state.R_WB), x[DTHETA], atol=1e-12)
     np.testing.assert_allclose(so3.log(R_BC.T @ state.R_BC), x[15:18], atol=1e-12)
-    poses = x[CLONES : state.landmarks_begin].reshape(-1, 6)
+    poses = x[state.calibrated.stop : state.landmarks_begin].reshape(-1, 6)
     np.testing.assert_allclose(so3.log(clones.R_WB.transpose(0, 2, 1) @ state.clones.R_WB), poses[:, :3], atol=1e-12)
     additive = [x[DP], x[DV], x[DBG], x[DBA], x[18:21], x[21:22], x[22:30], poses[:, 3:], x[state.landmarks_begin :]]
     for new, old, dx in zip(mean(state), before, additive, strict=True):
@@ -146,7 +148,7 @@ def test_update_agrees_with_filterpy(part, noise):
 
 def test_compression_gives_the_same_update():
     rng = np.random.default_rng(7)
-    columns = slice(CALIBRATION.start, random_state(7).landmarks_begin)
+    columns = slice(IMU, random_state(7).landmarks_begin)
     H, residual = rng.normal(size=(300, columns.stop - columns.start)), 0.05 * rng.normal(size=300)
     small_H, small_residual = compress(H.copy(), residual.copy())
     assert small_H.shape == (H.shape[1], H.shape[1])
@@ -169,13 +171,13 @@ def test_what_is_not_longer_than_wide_is_not_compressed():
 def test_calibration_that_is_not_estimated_never_moves():
     state, rng = random_state(8, calibrate=False), np.random.default_rng(8)
     before = state.R_BC, state.p_BC, state.offset_s, state.intrinsics
-    columns = slice(CALIBRATION.start, state.landmarks_begin)
+    columns = slice(IMU, state.landmarks_begin)
     state.update(rng.normal(size=(30, columns.stop - columns.start)), rng.normal(size=30), columns, 1.0)
     np.testing.assert_allclose(state.R_BC, before[0], atol=1e-16)
     np.testing.assert_array_equal(state.p_BC, before[1])
     assert state.offset_s == before[2]
     np.testing.assert_array_equal(state.intrinsics, before[3])
-    assert (state.cov[CALIBRATION] == 0.0).all()
+    assert (state.cov[state.calibrated] == 0.0).all()
 
 
 def test_biases_walk_at_standstill():

@@ -16,6 +16,7 @@ from sliding_window_helpers import (
     natural,
     numeric,
     retracted,
+    row_poses,
     standing,
     without_sightings,
 )
@@ -48,8 +49,8 @@ def residuals(x: Variables, s: Sightings) -> Float:
     """(N, 2) px, of all sightings in turn, neither whitened nor weighted."""
     row, frame = np.nonzero(s.seen)
     p_WF = positions(x.states, x.camera, s.seen.argmax(axis=1), x.landmarks)
-    R_WC, p_WC = camera_poses(x.states, x.camera)
-    p_C = (np.swapaxes(R_WC[frame], -1, -2) @ (p_WF[row] - p_WC[frame])[..., None])[..., 0]
+    poses = [row_poses(x.states, x.camera, s.shutter, *at) for at in zip(row, frame, strict=True)]
+    p_C = np.array([(p - p_WC) @ R_WC for p, (R_WC, p_WC) in zip(p_WF[row], poses, strict=True)])
     xy = s.xy[row, frame] - x.camera.offset_s * s.velocity[row, frame]
     if s.on_sphere:
         r = (across(xy) @ (p_C / np.linalg.norm(p_C, axis=1, keepdims=True))[..., None])[..., 0]
@@ -73,11 +74,12 @@ def expected_normal(x: Variables, at: Variables, s: Sightings) -> tuple[Float, F
 
 def assembled(x: Variables, first: Variables, s: Sightings) -> tuple[Float, Float]:
     """The same as the kernels have it."""
-    camera, n = x.camera, 15 * len(x.states) + 7
+    camera, n = x.camera, len(natural(x))
+    size = n - 15 * len(x.states)
     poses, first_poses = (Poses.of(v.states.R_WB, v.states.p_WB) for v in (x, first))
-    H_p, b_p, V, W, c = s.linearise(poses, first_poses, camera, x.landmarks)
+    H_p, b_p, V, W, c = s.linearise(poses, first_poses, camera, x.landmarks, size)
     total = n + 3 * len(x.landmarks)
-    H, b, columns = np.zeros((total, total)), np.zeros(total), pose_columns(len(x.states))
+    H, b, columns = np.zeros((total, total)), np.zeros(total), pose_columns(len(x.states), size)
     H[np.ix_(columns, columns)], b[columns] = H_p, b_p
     for i in range(len(V)):
         own = np.arange(n + 3 * i, n + 3 * i + 3)
@@ -93,27 +95,32 @@ def assert_normal(actual: tuple[Float, Float], expected: tuple[Float, Float], sc
         np.testing.assert_allclose(a * unit, e * unit, rtol=0.0, atol=rtol * np.abs(e * unit).max())
 
 
+SHUTTERS = pytest.mark.parametrize("readout_s", [0.0, 0.03], ids=["global", "rolling"])
+
+
 @pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS.keys())
 @pytest.mark.parametrize("on_sphere", [False, True], ids=["plane", "sphere"])
-def test_sightings_on_the_manifold(camera, on_sphere):
+@SHUTTERS
+def test_sightings_on_the_manifold(camera, on_sphere, readout_s):
     """Without noise, so that the tangents of the sphere, which turn with the time offset, have no part in it."""
-    problem, x = flown_window(on_sphere=on_sphere, noise_px=0.0, camera=camera)
+    problem, x = flown_window(on_sphere=on_sphere, noise_px=0.0, camera=camera, readout_s=readout_s)
     H, b = assembled(x, x, problem.sightings)
     expected, _ = expected_normal(x, x, problem.sightings)
     scale = sizes(x)
     np.testing.assert_allclose(H, H.T, rtol=1e-12, atol=1e-6)
     assert_normal((H,), (expected,), scale, 1e-9)
-    # No block is zero: poses of the host and the frame, extrinsics, time offset, landmarks.
+    # No block is zero: poses of the host and the frame, extrinsics, time offset, readout, landmarks.
     seen = np.diag(H) > 0.0
     assert seen[pose_columns(len(x.states))].all()
-    assert seen[15 * len(x.states) + 7 :].all()
+    assert seen[15 * len(x.states) + 6 :].all()
     # The sphere's residual is exact, so there is nothing to pull at.
     assert np.abs(b * scale).max() < 1e-6
 
 
 @pytest.mark.parametrize("on_sphere", [False, True], ids=["plane", "sphere"])
-def test_first_estimates_hold_the_jacobian_and_not_the_residual(on_sphere):
-    problem, first = flown_window(on_sphere=on_sphere)
+@SHUTTERS
+def test_first_estimates_hold_the_jacobian_and_not_the_residual(on_sphere, readout_s):
+    problem, first = flown_window(on_sphere=on_sphere, readout_s=readout_s)
     x = moved(first, np.random.default_rng(1), 0.3)
     # Of what is linearised anew the first estimate is the present one.
     at = replace(x, states=first.states)
@@ -169,9 +176,10 @@ def assert_gradient(problem: Problem, x: Variables, skip: tuple[int, ...] = ()) 
 
 @pytest.mark.parametrize("on_sphere", [False, True], ids=["plane", "sphere"])
 @pytest.mark.parametrize("noise_px", [0.5, 20.0])
-def test_gradient_of_the_robust_cost_of_sightings(on_sphere, noise_px):
+@SHUTTERS
+def test_gradient_of_the_robust_cost_of_sightings(on_sphere, noise_px, readout_s):
     """Also far out, where Cauchy's loss discounts nearly all."""
-    problem, x = flown_window(on_sphere=on_sphere, noise_px=noise_px, first_estimates=False)
+    problem, x = flown_window(on_sphere=on_sphere, noise_px=noise_px, first_estimates=False, readout_s=readout_s)
     nothing = replace(problem.prior, H=np.zeros_like(problem.prior.H), b=np.zeros_like(problem.prior.b))
     problem = replace(problem, prior=nothing, readings=ImuFactors.stack([]))
     offset = 15 * len(x.states) + 6
@@ -191,7 +199,7 @@ def test_gradient_of_readings_and_standstill():
 
 
 def test_gradient_of_everything_at_once():
-    problem, x = flown_window(first_estimates=False)
+    problem, x = flown_window(first_estimates=False, readout_s=0.03)
     assert_gradient(standing(problem, 3), replace(x, landmarks=x.landmarks + 0.01))
 
 

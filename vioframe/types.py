@@ -165,6 +165,9 @@ class CameraOnBody:
 
     Where nobody knows how the camera is turned, ``rotation_known`` is False and ``R_BC`` (3, 3) means nothing: it is
     found while initialising. ``name`` is that of its folder or topic, such as ``cam0``.
+
+    ``readout_s`` is the time a rolling shutter takes from the first row to the last (rows times the time of one), 0 for
+    a global one, negative where the last row comes first. The stamp is that of the middle row; see :meth:`row`.
     """
 
     name: str
@@ -173,6 +176,14 @@ class CameraOnBody:
     p_BC: Float
     time_offset_ns: int = 0
     rotation_known: bool = True
+    readout_s: float = 0.0
+
+    def row(self, y: Float) -> Float:
+        """Where pixels at height ``y`` are between the first row and the last, from -1/2 to 1/2.
+
+        They are exposed that part of ``readout_s`` after the stamp.
+        """
+        return (y + 0.5) / self.model.resolution[1] - 0.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -207,13 +218,14 @@ class CameraSigma:
     """Standard deviations of a camera's calibration; zero is what is taken as given and not estimated.
 
     ``rotation`` (3,) rad and ``position`` (3,) m of the camera on the body, right perturbation; ``time_offset_s``;
-    ``intrinsics`` (8,) of fx fy cx cy px and of the four distortion coefficients.
+    ``intrinsics`` (8,) of fx fy cx cy px and of the four distortion coefficients; ``readout_s``.
     """
 
     rotation: Float
     position: Float
     time_offset_s: float
     intrinsics: Float
+    readout_s: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)

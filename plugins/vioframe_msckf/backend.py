@@ -35,6 +35,7 @@ class Msckf:
             extrinsics=options.calibrate_extrinsics,
             offset=options.calibrate_time_offset,
             intrinsics=options.calibrate_intrinsics,
+            readout=options.calibrate_readout,
         )
         self._noise, self._noise_at_rest = start.calibration.calibration.imu, start.noise_at_rest
         self._observations = TrackTable()

@@ -1,8 +1,9 @@
 """Residuals and Jacobians of the image measurements, in pixels, with distortion.
 
 A landmark seen from a cloned body pose: ``p_B = R_WB^T (p_WF - p_WB)``, ``p_C = R_BC^T (p_B - p_BC)``, pixel =
-distort(p_C). Residuals are evaluated at the estimate, Jacobians at the first estimates of pose and landmark.
-Derivation: ``docs/derivations/msckf.md``.
+distort(p_C). With a rolling shutter the camera is where the body's motion at the clone has taken it by the time of the
+pixel's row (Li, Kim, Mourikis, "Real-time motion tracking on a cellphone", ICRA 2013). Residuals are evaluated at the
+estimate, Jacobians at the first estimates of pose and landmark. Derivation: ``docs/derivations/msckf.md``.
 """
 
 from __future__ import annotations
@@ -11,11 +12,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vioframe.geometry.kernels import distort, hat, intrinsics_jacobian, undistort
+from vioframe.geometry.kernels import cross, distort, exp, hat, intrinsics_jacobian, undistort
 from vioframe.geometry.triangulation import triangulate
 from vioframe.jit import kernel
 from vioframe.types import Float
-from vioframe_msckf.state import CALIBRATION, CLONES, FilterState
+from vioframe_msckf.state import FilterState
 
 ACCEPTED, NOT_TRIANGULATED, GATED = 0, 1, 2
 
@@ -27,62 +28,93 @@ class Window(NamedTuple):
     p_WB: Float
     R_WB_first: Float
     p_WB_first: Float
+    rate_B: Float
+    velocity_B: Float
     R_BC: Float
     p_BC: Float
     camera_model: int
     intrinsics: Float
+    readout_s: float
+    image_height: int
+    calibrated: int
+    """How many columns the calibration has."""
 
     @staticmethod
     def of(state: FilterState, first_estimates: bool) -> Window:
         c = state.clones
         first = (c.R_WB_first, c.p_WB_first) if first_estimates else (c.R_WB, c.p_WB)
-        return Window(c.R_WB, c.p_WB, *first, state.R_BC, state.p_BC, state.camera_model, state.intrinsics)
+        camera = state.R_BC, state.p_BC, state.camera_model, state.intrinsics, state.readout_s, state.image_height
+        calibrated = state.calibrated.stop - state.calibrated.start
+        return Window(c.R_WB, c.p_WB, *first, c.rate_B, c.velocity_B, *camera, calibrated)
 
 
 def landmark_rows(state: FilterState, clone: int, xy: Float, first_estimates: bool) -> tuple[Float, Float]:
     """Measurements (M, 2) px of the state's landmarks from one clone: H (2 M, n) and residuals (2 M,)."""
     p_first = state.p_WF_first if first_estimates else state.p_WF
-    blocks, residual = observations(Window.of(state, first_estimates), clone, state.p_WF, p_first, xy)
+    window = Window.of(state, first_estimates)
+    blocks, residual = observations(window, clone, state.p_WF, p_first, xy)
     H = np.zeros((2 * len(xy), len(state.cov)))
-    H[:, CALIBRATION] = blocks[:, :, :15].reshape(-1, 15)
-    H[:, CLONES + 6 * clone : CLONES + 6 * clone + 6] = blocks[:, :, 15:21].reshape(-1, 6)
+    H[:, state.calibrated] = blocks[:, :, : window.calibrated].reshape(-1, window.calibrated)
+    at = state.calibrated.stop + 6 * clone
+    H[:, at : at + 6] = blocks[:, :, 16:22].reshape(-1, 6)
     rows, columns = np.arange(2 * len(xy)).reshape(-1, 2, 1), np.arange(3 * len(xy)).reshape(-1, 1, 3)
-    H[rows, state.landmarks_begin + columns] = blocks[:, :, 21:]
+    H[rows, state.landmarks_begin + columns] = blocks[:, :, 22:]
     return H, residual.ravel()
 
 
 @kernel
+def _row(w, y):
+    """Where the row ``y`` px is between the first and the last, from -1/2 to 1/2: its part of the readout."""
+    return (y + 0.5) / w.image_height - 0.5
+
+
+@kernel
+def _camera_at_row(w, c, y):
+    """The camera as seen from the body at a clone, (3, 3) and (3,), at the time of the row ``y`` px."""
+    if w.readout_s == 0.0:
+        return w.R_BC, w.p_BC
+    late_s = w.readout_s * _row(w, y)
+    turn = exp(late_s * w.rate_B[c])
+    return turn @ w.R_BC, turn @ w.p_BC + late_s * w.velocity_B[c]
+
+
+@kernel
 def _observe(w, c, p_WF, p_WF_first, xy, block, residual):
-    """One observation: ``block`` (2, 24) over [calibration 15, clone 6, landmark 3] and ``residual`` (2,)."""
-    p_C = w.R_BC.T @ (w.R_WB[c].T @ (p_WF - w.p_WB[c]) - w.p_BC)
+    """One observation: ``block`` (2, 25) over [calibration 16, clone 6, landmark 3] and ``residual`` (2,)."""
+    R_rowC, p_rowC = _camera_at_row(w, c, xy[1])
+    p_C = R_rowC.T @ (w.R_WB[c].T @ (p_WF - w.p_WB[c]) - p_rowC)
     drawn, _ = distort(w.camera_model, w.intrinsics, p_C[0] / p_C[2], p_C[1] / p_C[2])
     residual[0], residual[1] = xy[0] - drawn[0], xy[1] - drawn[1]
 
     R_first = w.R_WB_first[c]
     p_B = R_first.T @ (p_WF_first - w.p_WB_first[c])
-    p_C = w.R_BC.T @ (p_B - w.p_BC)
+    p_C = R_rowC.T @ (p_B - p_rowC)
     x, y = p_C[0] / p_C[2], p_C[1] / p_C[2]
     _, D = distort(w.camera_model, w.intrinsics, x, y)
     J = np.empty((2, 3))
     for i in range(2):
         J[i, 0], J[i, 1] = D[i, 0] / p_C[2], D[i, 1] / p_C[2]
         J[i, 2] = -(D[i, 0] * x + D[i, 1] * y) / p_C[2]
-    J_B = J @ w.R_BC.T
+    J_B = J @ R_rowC.T
     J_W = J_B @ R_first.T
+    J_row = J_B if w.readout_s == 0.0 else J @ w.R_BC.T  # by the point as seen from the body at the time of the row
     block[:, 0:3] = J @ hat(p_C)
-    block[:, 3:6] = -J_B
+    block[:, 3:6] = -J_row
     block[:, 6] = 0.0  # the time offset acts through the clone
     block[:, 7:15] = intrinsics_jacobian(w.camera_model, w.intrinsics, x, y)
-    block[:, 15:18] = J_B @ hat(p_B)
-    block[:, 18:21] = -J_W
-    block[:, 21:24] = J_W
+    if w.calibrated > 15:
+        p_row = w.R_BC @ p_C + w.p_BC
+        block[:, 15] = -_row(w, xy[1]) * (J_row @ cross(w.rate_B[c], p_row) + J_B @ w.velocity_B[c])
+    block[:, 16:19] = J_B @ hat(p_B)
+    block[:, 19:22] = -J_W
+    block[:, 22:25] = J_W
 
 
 @kernel
 def observations(w, clone, p_WF, p_WF_first, xy):
-    """Landmarks (M, 3) seen at (M, 2) px from one clone: blocks (M, 2, 24) and residuals (M, 2)."""
+    """Landmarks (M, 3) seen at (M, 2) px from one clone: blocks (M, 2, 25) and residuals (M, 2)."""
     m = len(xy)
-    blocks = np.empty((m, 2, 24))
+    blocks = np.empty((m, 2, 25))
     residual = np.empty((m, 2))
     for i in range(m):
         _observe(w, clone, p_WF[i], p_WF_first[i], xy[i], blocks[i], residual[i])
@@ -100,23 +132,25 @@ def track_rows(w, xy, xy_normalised, seen, pixel_sigma):
     points = np.empty((m, 2))
     for i in range(m):
         c = clones[i]
-        R_WC[i] = w.R_WB[c] @ w.R_BC
-        p_WC[i] = w.R_WB[c] @ w.p_BC + w.p_WB[c]
+        R_rowC, p_rowC = _camera_at_row(w, c, xy[c, 1])
+        R_WC[i] = w.R_WB[c] @ R_rowC
+        p_WC[i] = w.R_WB[c] @ p_rowC + w.p_WB[c]
         points[i, 0], points[i, 1] = undistort(
             w.camera_model, w.intrinsics, xy[c, 0], xy[c, 1], xy_normalised[c, 0], xy_normalised[c, 1]
         )
     ok, p_WF = triangulate(R_WC, p_WC, points, pixel_sigma / w.intrinsics[0])
-    H = np.zeros((2 * m, 15 + 6 * C))
+    n = w.calibrated
+    H = np.zeros((2 * m, n + 6 * C))
     H_f = np.empty((2 * m, 3))
     residual = np.empty(2 * m)
     if ok:
-        block = np.empty((2, 24))
+        block = np.empty((2, 25))
         for i in range(m):
             c = clones[i]
             _observe(w, c, p_WF, p_WF, xy[c], block, residual[2 * i : 2 * i + 2])
-            H[2 * i : 2 * i + 2, 0:15] = block[:, 0:15]
-            H[2 * i : 2 * i + 2, 15 + 6 * c : 21 + 6 * c] = block[:, 15:21]
-            H_f[2 * i : 2 * i + 2] = block[:, 21:24]
+            H[2 * i : 2 * i + 2, 0:n] = block[:, 0:n]
+            H[2 * i : 2 * i + 2, n + 6 * c : n + 6 * c + 6] = block[:, 16:22]
+            H_f[2 * i : 2 * i + 2] = block[:, 22:25]
     return ok, p_WF, H, H_f, residual
 
 
@@ -175,7 +209,7 @@ def msckf_rows(w, xy, xy_normalised, seen, P, pixel_sigma, gate):
     The stacked H and residual over [calibration, clones], whose covariance is ``P``; p_WF (F, 3); each one's verdict.
     """
     F, C = seen.shape
-    n = 15 + 6 * C
+    n = w.calibrated + 6 * C
     H_all = np.empty((2 * seen.sum(), n))
     r_all = np.empty(2 * seen.sum())
     p_WF = np.empty((F, 3))

@@ -28,5 +28,7 @@ class MsckfOptions:
     """Estimate the camera's pose on the body."""
     calibrate_time_offset: bool = True
     """Estimate what is left of the time offset between camera and IMU."""
+    calibrate_readout: bool = False
+    """Estimate the readout time of a rolling shutter."""
     calibrate_intrinsics: bool = True
     """Estimate focal lengths, principal point and distortion."""

@@ -1,8 +1,9 @@
 """The filter's mean and covariance. This module alone edits the covariance.
 
-Error state: [imu 15 | calibration 15 | clones 6 each | landmarks 3 each] with
-imu [dtheta dp dv dbg dba], calibration [dtheta_BC dp_BC d_offset d_intrinsics(8)], clone [dtheta dp], landmark dp_WF.
-Parts of the calibration that are not estimated have zero covariance and so are never corrected.
+Error state: [imu 15 | calibration 15 or 16 | clones 6 each | landmarks 3 each] with
+imu [dtheta dp dv dbg dba], calibration [dtheta_BC dp_BC d_offset d_intrinsics(8)], and d_readout last where it is
+estimated, clone [dtheta dp], landmark dp_WF. Other parts of the calibration that are not estimated have zero covariance
+and so are never corrected.
 """
 
 from __future__ import annotations
@@ -33,36 +34,53 @@ from vioframe.types import (
 )
 
 IMU = 15
-CALIBRATION = slice(15, 30)
-EXTRINSICS, OFFSET, INTRINSICS = slice(15, 21), slice(21, 22), slice(22, 30)
-CLONES = 30  # where the clones begin
+EXTRINSICS, OFFSET, INTRINSICS, READOUT = slice(15, 21), slice(21, 22), slice(22, 30), slice(30, 31)
 
 
 @dataclass(frozen=True, slots=True)
 class Poses:
-    """The cloned body poses, oldest first, as estimated and as first estimated: (C, 3, 3) and (C, 3)."""
+    """The cloned body poses, oldest first, as estimated and as first estimated: (C, 3, 3) and (C, 3).
+
+    ``rate_B`` (C, 3) rad/s and ``velocity_B`` (C, 3) m/s are how the body moved there, in its own frame. They take a
+    pose to the rows of a rolling shutter before and after it.
+    """
 
     R_WB: Float
     p_WB: Float
     R_WB_first: Float
     p_WB_first: Float
+    rate_B: Float
+    velocity_B: Float
 
-    def append(self, R_WB: Float, p_WB: Float) -> Poses:
+    @classmethod
+    def none(cls) -> Poses:
+        return cls(*2 * (np.empty((0, 3, 3)), np.empty((0, 3))), *2 * (np.empty((0, 3)),))
+
+    def append(self, R_WB: Float, p_WB: Float, rate_B: Float, velocity_B: Float) -> Poses:
         """With one more pose, which is its own first estimate."""
         return Poses(
             np.concatenate([self.R_WB, R_WB[None]]),
             np.concatenate([self.p_WB, p_WB[None]]),
             np.concatenate([self.R_WB_first, R_WB[None]]),
             np.concatenate([self.p_WB_first, p_WB[None]]),
+            np.concatenate([self.rate_B, rate_B[None]]),
+            np.concatenate([self.velocity_B, velocity_B[None]]),
         )
 
     def without_oldest(self) -> Poses:
-        return Poses(self.R_WB[1:], self.p_WB[1:], self.R_WB_first[1:], self.p_WB_first[1:])
+        return Poses(
+            self.R_WB[1:],
+            self.p_WB[1:],
+            self.R_WB_first[1:],
+            self.p_WB_first[1:],
+            self.rate_B[1:],
+            self.velocity_B[1:],
+        )
 
     def corrected(self, dx: Float) -> Poses:
         """Moved by the error ``dx`` (6 C,)."""
         d = dx.reshape(-1, 6)
-        return Poses(self.R_WB @ so3.exp(d[:, :3]), self.p_WB + d[:, 3:], self.R_WB_first, self.p_WB_first)
+        return replace(self, R_WB=self.R_WB @ so3.exp(d[:, :3]), p_WB=self.p_WB + d[:, 3:])
 
     def __len__(self) -> int:
         return len(self.p_WB)
@@ -72,7 +90,14 @@ class FilterState:
     """Mean, first estimates and covariance of the error-state filter."""
 
     def __init__(
-        self, initial: NavState, prior: CalibrationEstimate, *, extrinsics: bool, offset: bool, intrinsics: bool
+        self,
+        initial: NavState,
+        prior: CalibrationEstimate,
+        *,
+        extrinsics: bool,
+        offset: bool,
+        intrinsics: bool,
+        readout: bool = False,
     ):
         assert initial.cov is not None
         self.R_WB, self.p_WB, self.v_WB = initial.R_WB.copy(), initial.p_WB.copy(), initial.v_WB.copy()
@@ -83,27 +108,32 @@ class FilterState:
         self._given = prior.calibration
         (camera,), (known,) = prior.calibration.cameras, prior.sigma
         self.R_BC, self.p_BC = camera.R_BC.copy(), camera.p_BC.copy()
-        self.offset_s = 0.0
+        self.offset_s, self.readout_s = 0.0, camera.readout_s
         self.camera_model, self.intrinsics = kernels.intrinsics_of(camera.model)
-        self.clones = Poses(np.empty((0, 3, 3)), np.empty((0, 3)), np.empty((0, 3, 3)), np.empty((0, 3)))
+        self.image_height = camera.model.resolution[1]
+        self.clones = Poses.none()
         self.landmark_ids: NDArray[np.int64] = np.empty(0, np.int64)
         self.p_WF: Float = np.empty((0, 3))
         self.p_WF_first: Float = np.empty((0, 3))
 
-        sigma = np.zeros(CLONES)
+        self.calibrated = slice(IMU, READOUT.stop if readout else INTRINSICS.stop)
+        """Columns of the calibration; the clones begin where it ends."""
+        sigma = np.zeros(self.calibrated.stop)
         if extrinsics:
             sigma[EXTRINSICS] = np.concatenate([known.rotation, known.position])
         if offset:
             sigma[OFFSET] = known.time_offset_s
         if intrinsics:
             sigma[INTRINSICS] = known.intrinsics
+        if readout:
+            sigma[READOUT] = known.readout_s
         self.cov: Float = np.diag(sigma**2)
         self.cov[:IMU, :IMU] = initial.cov
 
     @property
     def landmarks_begin(self) -> int:
         """Column at which the landmarks begin."""
-        return CLONES + 6 * len(self.clones)
+        return self.calibrated.stop + 6 * len(self.clones)
 
     def nav_state(self, t_ns: int) -> NavState:
         """The body's state as a copy of its own."""
@@ -123,12 +153,17 @@ class FilterState:
         fx, fy, cx, cy, d1, d2, d3, d4 = self.intrinsics.tolist()
         model = replace(camera.model, fx=fx, fy=fy, cx=cx, cy=cy, distortion=(d1, d2, d3, d4))
         offset_ns = camera.time_offset_ns + round(self.offset_s * NS_PER_S)
-        sigma = np.sqrt(np.diag(self.cov)[CALIBRATION])
+        sigma = np.sqrt(np.diag(self.cov)[self.calibrated])
         return CalibrationEstimate(
             self._given.with_camera(
-                0, model=model, R_BC=self.R_BC.copy(), p_BC=self.p_BC.copy(), time_offset_ns=offset_ns
+                0,
+                model=model,
+                R_BC=self.R_BC.copy(),
+                p_BC=self.p_BC.copy(),
+                time_offset_ns=offset_ns,
+                readout_s=self.readout_s,
             ),
-            (CameraSigma(sigma[0:3], sigma[3:6], float(sigma[6]), sigma[7:15]),),
+            (CameraSigma(sigma[0:3], sigma[3:6], float(sigma[6]), sigma[7:15], float(sigma[15:].sum())),),
         )
 
     def propagate(self, imu: ImuSegment, noise: ImuNoise, first_estimates: bool) -> None:
@@ -170,11 +205,11 @@ class FilterState:
         JP = J @ self.cov
         at = self.landmarks_begin
         self.cov = _insert(self.cov, at, JP, JP @ J.T)
-        self.clones = self.clones.append(R, p)
+        self.clones = self.clones.append(R, p, gyro_B, R.T @ self.v_WB)
 
     def drop_oldest_clone(self) -> None:
         """Marginalise the oldest clone."""
-        self._delete(np.arange(CLONES, CLONES + 6))
+        self._delete(self.calibrated.stop + np.arange(6))
         self.clones = self.clones.without_oldest()
 
     def add_landmark(self, landmark_id: int, p_WF: Float, p_WF_first: Float, cross: Float, cov: Float) -> None:
@@ -237,8 +272,9 @@ class FilterState:
         self.p_BC = self.p_BC + dx[18:21]
         self.offset_s += float(dx[21])
         self.intrinsics = self.intrinsics + dx[INTRINSICS]
-        at = self.landmarks_begin
-        self.clones = self.clones.corrected(dx[CLONES:at])
+        begin, at = self.calibrated.stop, self.landmarks_begin
+        self.readout_s += float(dx[INTRINSICS.stop : begin].sum())
+        self.clones = self.clones.corrected(dx[begin:at])
         self.p_WF = self.p_WF + dx[at:].reshape(-1, 3)
         if not (np.isfinite(dx).all() and (np.diag(self.cov)[:IMU] > 0.0).all()):
             raise DivergedError("the state is not finite or its variances are not positive")

@@ -20,7 +20,7 @@ from vioframe_msckf.measurement import (
     track_rows,
 )
 from vioframe_msckf.options import MsckfOptions
-from vioframe_msckf.state import CALIBRATION, IMU, FilterState, compress
+from vioframe_msckf.state import IMU, FilterState, compress
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,7 +71,7 @@ def update_from_tracks(
     state: FilterState, observations: TrackTable, rows: NDArray[np.intp], options: MsckfOptions, gate: Float
 ) -> tuple[Int, Float]:
     """The multi-state constraint update; returns ids and positions of the landmarks it accepted."""
-    columns = slice(CALIBRATION.start, state.landmarks_begin)
+    columns = slice(IMU, state.landmarks_begin)
     H, residual, p_WF, verdict = msckf_rows(
         Window.of(state, options.first_estimate_jacobians),
         observations.xy[rows],
@@ -133,7 +133,7 @@ def promote_tracks(
             continue
         used.append(row)
         reduce_landmark(H, H_f, residual)
-        columns = slice(CALIBRATION.start, state.landmarks_begin)
+        columns = slice(IMU, state.landmarks_begin)
         P = np.ascontiguousarray(state.cov[columns, columns])
         if mahalanobis(H[3:], residual[3:], P, variance) > gate[len(residual) - 3]:
             continue

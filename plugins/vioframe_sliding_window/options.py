@@ -40,5 +40,7 @@ class SlidingWindowOptions:
     """Estimate the camera's pose on the body."""
     calibrate_time_offset: bool = True
     """Estimate what is left of the time offset between camera and IMU."""
+    calibrate_readout: bool = False
+    """Estimate the readout time of a rolling shutter."""
     max_jump_m: PositiveFloat = 1.0
     """Most that images may move the newest position from where the readings put it."""

@@ -10,7 +10,14 @@ from vioframe.arrays import Bool
 from vioframe.estimation.factors.inertial import ImuFactors, StateArrays
 from vioframe.estimation.factors.landmarks import image_velocities, in_hosts, positions, triangulate_tracks
 from vioframe.estimation.factors.problem import STATE_SIZE, Prior, Problem, Variables, marginalise_oldest
-from vioframe.estimation.factors.reprojection import CALIBRATION_SIZE, Calibrated, Sightings, pixels_by_residual
+from vioframe.estimation.factors.reprojection import (
+    CALIBRATION_SIZE,
+    GLOBAL_SHUTTER,
+    Calibrated,
+    Shutter,
+    Sightings,
+    pixels_by_residual,
+)
 from vioframe.estimation.factors.solver import solve, solve_positive
 from vioframe.estimation.factors.tracks import LandmarkTable, TrackTable
 from vioframe.estimation.inertial.preintegration import Preintegrated, join_segments, preintegrate
@@ -51,8 +58,9 @@ class Window:
         self._t_ns = [state.t_ns]
         self._states = StateArrays.stack([state])
         self._gyro_B = start.imu.gyro_B[-1:]
-        self._camera = Calibrated(camera.R_BC, camera.p_BC, 0.0)
-        self._camera_sigma = np.concatenate([sigma.rotation, sigma.position, [sigma.time_offset_s]])
+        self._camera = Calibrated(camera.R_BC, camera.p_BC, 0.0, camera.readout_s)
+        readout = [sigma.readout_s] if options.calibrate_readout else []
+        self._camera_sigma = np.concatenate([sigma.rotation, sigma.position, [sigma.time_offset_s], readout])
         self._prior = Prior.of(state, self._camera, np.diag(self._camera_sigma**2))
         self._readings: list[Preintegrated] = []
         self._still: dict[int, Standstill] = {}
@@ -78,9 +86,12 @@ class Window:
         """What is believed of the calibration by now."""
         given, camera, sigma = self._given.cameras[0], self._camera, self._camera_sigma
         offset_ns = given.time_offset_ns + round(camera.offset_s * NS_PER_S)
+        learned = self._given.with_camera(
+            0, R_BC=camera.R_BC, p_BC=camera.p_BC, time_offset_ns=offset_ns, readout_s=camera.readout_s
+        )
+        readout_s = float(sigma[CALIBRATION_SIZE:].sum())
         return CalibrationEstimate(
-            self._given.with_camera(0, R_BC=camera.R_BC, p_BC=camera.p_BC, time_offset_ns=offset_ns),
-            (CameraSigma(sigma[:3], sigma[3:6], float(sigma[6]), np.zeros(8)),),
+            learned, (CameraSigma(sigma[:3], sigma[3:6], float(sigma[6]), np.zeros(8), readout_s),)
         )
 
     @property
@@ -152,7 +163,7 @@ class Window:
         tracks = self.tracks
         rows = np.flatnonzero(~tracks.known & (tracks.lengths() >= self._options.min_observations))
         known, landmarks = triangulate_tracks(
-            self._states, self._camera, tracks.seen[rows], tracks.xy_normalised[rows], self._sigma
+            self._states, self._camera, tracks.seen[rows], tracks.xy_normalised[rows], self._sigma, self._shutter(rows)
         )
         tracks.landmarks[rows], tracks.known[rows] = landmarks, known
 
@@ -264,24 +275,33 @@ class Window:
             options.pixel_sigma,
             options.cauchy_sigmas,
             options.residual == "sphere",
+            self._shutter(rows),
         )
+
+    def _shutter(self, rows: Int) -> Shutter:
+        if not (self._camera.readout_s or self._options.calibrate_readout):
+            return GLOBAL_SHUTTER
+        states = self._states
+        velocity_B = np.einsum("kji,kj->ki", states.R_WB, states.v_WB)
+        row = self._given.cameras[0].row(self.tracks.xy[rows, :, 1])
+        return Shutter(row, self._gyro_B - states.bias_gyro_B, velocity_B)
 
     def _active(self) -> Int:
         """The entries of the error vector that are estimated."""
         options, n = self._options, STATE_SIZE * len(self)
-        active = np.ones(n + CALIBRATION_SIZE, dtype=bool)
+        active = np.ones(n + self._prior.calibration_size, dtype=bool)
         active[n : n + 6] = options.calibrate_extrinsics
         active[n + 6] = options.calibrate_time_offset
         return np.flatnonzero(active)
 
     def _covariance(self, S: Float) -> tuple[Float, Float]:
-        """Of the newest state (15, 15), and the standard deviations of the calibration (7,), zero where it is fixed."""
+        """Of the newest state (15, 15), and the standard deviations of the calibration, zero where it is fixed."""
         active = self._active()
         at = STATE_SIZE * (len(self) - 1)
         unit = np.zeros((len(active), len(active) - at))
         unit[at:] = np.eye(len(active) - at)
         end = solve_positive(S[np.ix_(active, active)], unit)[at:]
-        sigma = np.zeros(CALIBRATION_SIZE)
+        sigma = np.zeros(self._prior.calibration_size)
         sigma[active[at + STATE_SIZE :] - at - STATE_SIZE] = np.sqrt(np.diag(end)[STATE_SIZE:])
         cov = end[:STATE_SIZE, :STATE_SIZE]
         return 0.5 * (cov + cov.T), sigma

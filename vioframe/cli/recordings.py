@@ -53,6 +53,12 @@ _COMPRESSIONS = sorted({name for format in FORMATS.values() for name in format.c
 @click.option("--seed", type=int, help="Seed of all that is random.  [default: 0]")
 @click.option("--rate", "frame_rate_hz", type=float, metavar="HZ", help="Frames per second.  [default: 20]")
 @click.option("--imu-rate", "imu_rate_hz", type=float, metavar="HZ", help="Of the IMU.  [default: the calibration's]")
+@click.option(
+    "--readout-ms",
+    type=float,
+    metavar="MS",
+    help="Rolling shutter, first row to last, which the calibration says.  [default: the calibration's]",
+)
 @click.option("--exact-imu", is_flag=True, default=None, help="An IMU without noise and biases.")
 @click.option(
     "--calibration", type=FILE, multiple=True, help="Of a rig: file or folder.  [default: EuRoC's left camera]"

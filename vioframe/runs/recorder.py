@@ -43,13 +43,13 @@ STATE_COLUMNS = (
 )
 POSE_COV_COLUMNS = ("t_ns", *(f"c{i}{j}" for i in range(6) for j in range(i, 6)))
 CALIBRATION_COLUMNS = (
-    *("t_ns", "camera", "qx", "qy", "qz", "qw", "px", "py", "pz", "time_offset_s"),
+    *("t_ns", "camera", "qx", "qy", "qz", "qw", "px", "py", "pz", "time_offset_s", "readout_s"),
     *("fx", "fy", "cx", "cy", "d1", "d2", "d3", "d4"),
-    *(f"sigma_{name}" for name in ("rx", "ry", "rz", "px", "py", "pz", "time_offset_s")),
+    *(f"sigma_{name}" for name in ("rx", "ry", "rz", "px", "py", "pz", "time_offset_s", "readout_s")),
     *(f"sigma_{name}" for name in ("fx", "fy", "cx", "cy", "d1", "d2", "d3", "d4")),
 )
 """Of ``calibration.csv``: the camera by its place in the rig, its pose on the body (R_BC as a quaternion, p_BC m), time
-offset, intrinsics, and their standard deviations (rad, m, s, px); zero is what is not estimated."""
+offset and readout, intrinsics, and their standard deviations (rad, m, s, px); zero is what is not estimated."""
 LOOP_COLUMNS = ("earlier_t_ns", "later_t_ns", "x_m", "y_m", "z_m", "yaw_rad", "inliers", "accepted")
 RUN_FILES = (
     *("summary.json", "config.yaml", "machine.json", "evaluation.json", "evaluation_loop.json"),
@@ -226,10 +226,11 @@ class Recorder:
                 [
                     so3.to_quat_xyzw(camera.R_BC),
                     camera.p_BC,
-                    [camera.time_offset_ns / NS_PER_S, model.fx, model.fy, model.cx, model.cy, *model.distortion],
+                    [camera.time_offset_ns / NS_PER_S, camera.readout_s],
+                    [model.fx, model.fy, model.cx, model.cy, *model.distortion],
                     sigma.rotation,
                     sigma.position,
-                    [sigma.time_offset_s],
+                    [sigma.time_offset_s, sigma.readout_s],
                     sigma.intrinsics,
                 ]
             )

@@ -47,7 +47,7 @@ class Conditions(Section):
     """calibration that is off, in random directions: 1 is 10 px in focal length and centre, 1 deg and 2 cm in the
     camera's pose"""
     rolling_shutter: Level = 0.0
-    """time from the first row to the last: 1 is 30 ms"""
+    """readout of a rolling shutter that nobody is told of: 1 is 30 ms from the first row to the last"""
 
     @classmethod
     def of(cls, levels: Mapping[str, float | str]) -> Conditions:

@@ -26,7 +26,8 @@ class SimulationConfig(Section):
     """Everything that determines a simulated recording.
 
     The motion is a ``flight`` by name, the file ``trajectory``, or that of the EuRoC sequence ``recorded``, whose
-    readings of the IMU are then taken as they are. ``made`` is what came of it, in a manifest; nothing reads it.
+    readings of the IMU are then taken as they are. ``readout_ms`` is that of a rolling shutter, which the estimator is
+    told of, in place of the calibration's. ``made`` is what came of it, in a manifest; nothing reads it.
     """
 
     flight: PartConfig = PartConfig(name="figure_eight")
@@ -37,6 +38,7 @@ class SimulationConfig(Section):
     seed: Annotated[int, Field(ge=0)] = 0
     frame_rate_hz: Annotated[float, Field(gt=0.0, le=1000.0)] = 20.0
     imu_rate_hz: Annotated[float | None, Field(gt=0.0, le=10_000.0)] = None
+    readout_ms: Annotated[float | None, Field(ge=-200.0, le=200.0)] = None
     exact_imu: bool = False
     imu: dict[str, Any] = Field(default_factory=dict)
     world: PartConfig = PartConfig(name="hall")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
+from dataclasses import replace
 from heapq import merge
 
 import numpy as np
@@ -20,7 +21,7 @@ from vioframe.simulation.flights import fit_flight, levelled
 from vioframe.simulation.imu import ImuErrors, vibration
 from vioframe.simulation.scenario import Scenario, fly, load_euroc
 from vioframe.simulation.world import MeshWorld, check_clear, draw_movers
-from vioframe.types import NS_PER_S, FrameSet, ImuSample, Measurement
+from vioframe.types import NS_PER_S, Calibration, FrameSet, ImuSample, Measurement
 
 DEFAULT_DURATION_S = 30.0
 # Within an exposure the image moves by this between two instants that are rendered, unless that were too many.
@@ -47,16 +48,23 @@ class SimulatedRecording:
         self._workers = workers
         seeds = np.random.SeedSequence(config.seed).spawn(7)
         imu_rng, world_rng, movers_rng, light_rng, drops_rng, misled_rng, shaken_rng = map(np.random.default_rng, seeds)
-        self.true_calibration = (
+        known = (
             load_calibration(*config.calibration)
             if config.calibration
             else packaged_calibration("euroc", cameras=["cam0"])
         )
+        if config.readout_ms is not None:
+            known = _with_readout(known, [1e-3 * config.readout_ms] * len(known.cameras))
+        self.true_calibration = known
+        if self.conditions.readout_s:
+            self.true_calibration = _with_readout(
+                known, [camera.readout_s + self.conditions.readout_s for camera in known.cameras]
+            )
         self._cameras = range(len(self.true_calibration.cameras))
         for camera in self.true_calibration.cameras:
             if not camera.rotation_known:
                 raise ConfigError(f"rendering must know how {camera.name} is turned, and the calibration does not say")
-        self.calibration = self.conditions.mislead(self.true_calibration, misled_rng)
+        self.calibration = self.conditions.mislead(known, misled_rng)
         self._scenario = self._fly(registry, imu_rng)
         self.name = self._scenario.name
         self.ground_truth = self._scenario.truth
@@ -149,17 +157,19 @@ class SimulatedRecording:
                 movers = None
                 if self._movers is not None:
                     movers = self._movers.at((instants_ns.mean(axis=1) - self.ground_truth.t_ns[0]) / NS_PER_S)
-                shape = instants_ns.shape if self.conditions.readout_s else instants_ns.shape[:1]
+                rolling = self.true_calibration.cameras[camera].readout_s != 0.0
+                shape = instants_ns.shape if rolling else instants_ns.shape[:1]
                 R_WC, p_WC = R_WC.reshape(*shape, 3, 3), p_WC.reshape(*shape, 3)
                 yield Shot(camera, R_WC, p_WC, movers, gain, (self.config.seed, index, camera))
 
     def _instants(self, camera: int, t_ns: int) -> Int:
         """(S, R) stamps at which the exposure of R rows, or of the whole image, is rendered; the middle is ``t_ns``."""
-        exposure_s, readout_s = self.conditions.exposure_s, self.conditions.readout_s
-        rows = self.true_calibration.cameras[camera].model.resolution[1] if readout_s else 1
+        exposure_s, on_body = self.conditions.exposure_s, self.true_calibration.cameras[camera]
         count = self._blur_instants(camera, t_ns) if exposure_s else 1
         within = exposure_s * ((np.arange(count) + 0.5) / count - 0.5)
-        of_row = readout_s * ((np.arange(rows) + 0.5) / rows - 0.5)
+        of_row = np.zeros(1)
+        if on_body.readout_s:
+            of_row = on_body.readout_s * on_body.row(np.arange(float(on_body.model.resolution[1])))
         return self._known(t_ns + np.round((within[:, None] + of_row) * NS_PER_S).astype(np.int64))
 
     def _blur_instants(self, camera: int, t_ns: int) -> int:
@@ -179,6 +189,12 @@ class SimulatedRecording:
         on_body = self.true_calibration.cameras[camera]
         R_WB, p_WB = self._scenario.body_poses(self.true_calibration, camera, t_ns)
         return R_WB @ on_body.R_BC, R_WB @ on_body.p_BC + p_WB
+
+
+def _with_readout(calibration: Calibration, readout_s: list[float]) -> Calibration:
+    """The rig with a readout time (C,) for each of its cameras."""
+    pairs = zip(calibration.cameras, readout_s, strict=True)
+    return replace(calibration, cameras=tuple(replace(camera, readout_s=seconds) for camera, seconds in pairs))
 
 
 def _wandering_gain(t_s: Float, stops: float, rng: np.random.Generator) -> Float:

@@ -5,7 +5,7 @@ A :class:`TrackSequence` is a recording reduced to what a back-end takes in, wit
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from heapq import merge
 from pathlib import Path
@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from vioframe.arrays import Bool, Float, Int
-from vioframe.errors import DatasetError
+from vioframe.errors import ConfigError, DatasetError
 from vioframe.geometry.cameras import Camera
 from vioframe.geometry.trajectory import Trajectory
 from vioframe.incidents import Incidents
@@ -24,6 +24,7 @@ from vioframe.simulation.flights import flight as named_flight
 from vioframe.simulation.imu import ImuErrors
 from vioframe.simulation.scenario import Scenario, fly, load_euroc
 from vioframe.types import (
+    NS_PER_S,
     Calibration,
     FrameSet,
     FrameTracks,
@@ -35,6 +36,8 @@ from vioframe.types import (
 )
 
 Packet = tuple[ImuSegment, FrameTracks]
+PoseLater = Callable[[int, Float], tuple[Float, Float]]
+"""The camera's place in the rig, and seconds (N,) after the frame's stamp: ``R_WB`` (N, 3, 3), ``p_WB`` (N, 3) m."""
 
 REAL_MOTION_SEQUENCES = ("MH_02_easy", "MH_03_medium", "MH_05_difficult", "V1_01_easy", "V1_02_medium")
 """The flights of ``euroc_imu_gt`` in the shared data."""
@@ -50,6 +53,8 @@ _NEAREST_M = 0.3
 # Landmarks are seen this far inside the image, as a tracking window needs.
 _BORDER_PX = 5.0
 _OUTLIER_PX = (5.0, 30.0)
+# The row of a rolling shutter that sees a landmark is found to this.
+_ROW_STEP_PX, _MOST_ROW_STEPS = 1e-6, 20
 
 
 @dataclass(frozen=True)
@@ -219,24 +224,26 @@ class TrackSimulator:
     def p_WF(self) -> dict[int, Float]:
         return dict(zip(self._ids.tolist(), self._p_WF, strict=True))
 
-    def observe(self, t_ns: int, R_WB: Float, p_WB: Float) -> FrameTracks:
+    def observe(self, t_ns: int, R_WB: Float, p_WB: Float, later: PoseLater | None = None) -> FrameTracks:
         """The tracks of frames taken at ``R_WB`` (3, 3), ``p_WB`` (3,) m.
 
-        Where cameras have clocks of their own, the poses are one a camera: (C, 3, 3) and (C, 3).
+        Where cameras have clocks of their own, the poses are one a camera: (C, 3, 3) and (C, 3). A camera with a
+        rolling shutter needs to know where the body is ``later`` than that: each point is seen from the pose at the
+        time of its own row.
         """
         count = len(self._cameras)
         R_WB, p_WB = np.broadcast_to(R_WB, (count, 3, 3)), np.broadcast_to(p_WB, (count, 3))
-        poses = [(R @ c.R_BC, R @ c.p_BC + p) for c, R, p in zip(self._cameras, R_WB, p_WB, strict=True)]
-        views = [self._project(c, *pose, self._p_WF) for c, pose in enumerate(poses)]
+        poses = [self._camera_pose(c, R, p) for c, (R, p) in enumerate(zip(R_WB, p_WB, strict=True))]
+        views = [self._project(c, *pose, later, self._p_WF) for c, pose in enumerate(poses)]
         living = np.any([seen for _, seen in views], axis=0)
         self._ids, self._p_WF = self._ids[living], self._p_WF[living]
         views = [(xy[living], seen[living]) for xy, seen in views]
         for c in range(count):
             missing = self._options.max_points - int(views[c][1].sum())
             if missing > 0:
-                born_xy, p_WF = self._add_landmarks(c, missing, *poses[c])
+                born_xy, p_WF = self._add_landmarks(c, missing, *poses[c], later)
                 for other, (xy, seen) in enumerate(views):
-                    new_xy, new_seen = self._project(other, *poses[other], p_WF)
+                    new_xy, new_seen = self._project(other, *poses[other], later, p_WF)
                     if other == c:  # the very pixels that were drawn
                         new_xy, new_seen = born_xy, np.ones(missing, bool)
                     views[other] = np.concatenate([xy, new_xy]), np.concatenate([seen, new_seen])
@@ -247,10 +254,38 @@ class TrackSimulator:
         ids, camera, xy, xy_normalised = map(np.concatenate, zip(*parts, strict=True))
         return FrameTracks(t_ns, ids, camera, xy, xy_normalised)
 
-    def _project(self, camera: int, R_WC: Float, p_WC: Float, p_WF: Float) -> tuple[Float, Bool]:
+    def _project(
+        self, camera: int, R_WC: Float, p_WC: Float, later: PoseLater | None, p_WF: Float
+    ) -> tuple[Float, Bool]:
         """Pixels (N, 2) of landmarks (N, 3) m in a camera, and which of them it sees."""
+        xy, seen = self._project_from(camera, R_WC, p_WC, p_WF)
+        if not self._cameras[camera].readout_s or not len(p_WF):
+            return xy, seen
+        height = self._cameras[camera].model.resolution[1]
+        for _ in range(_MOST_ROW_STEPS):
+            # What is out of sight is looked for from the nearest row, and behind the camera from the middle one.
+            y = np.nan_to_num(np.clip(xy[:, 1], 0.0, height - 1.0), nan=0.5 * (height - 1.0))
+            xy, seen = self._project_from(camera, *self._row_poses(camera, y, later), p_WF)
+            if not seen.any() or np.abs(xy[seen, 1] - y[seen]).max() < _ROW_STEP_PX:
+                break
+        return xy, seen
+
+    def _camera_pose(self, camera: int, R_WB: Float, p_WB: Float) -> tuple[Float, Float]:
+        """R_WC and p_WC, (..., 3, 3) and (..., 3), of one body pose or many."""
+        on_body = self._cameras[camera]
+        return R_WB @ on_body.R_BC, R_WB @ on_body.p_BC + p_WB
+
+    def _row_poses(self, camera: int, y: Float, later: PoseLater | None) -> tuple[Float, Float]:
+        """Of a camera when it exposes its rows ``y`` (N,): R_WC (N, 3, 3) and p_WC (N, 3)."""
+        on_body = self._cameras[camera]
+        if later is None:
+            raise ConfigError(f"{on_body.name} has a rolling shutter: say where the body is at the time of a row")
+        return self._camera_pose(camera, *later(camera, on_body.readout_s * on_body.row(y)))
+
+    def _project_from(self, camera: int, R_WC: Float, p_WC: Float, p_WF: Float) -> tuple[Float, Bool]:
+        """The same from one pose, or from one for each landmark."""
         model = self._cameras[camera].model
-        p_CF = (p_WF - p_WC) @ R_WC
+        p_CF = (p_WF - p_WC) @ R_WC if R_WC.ndim == 2 else np.einsum("ni,nij->nj", p_WF - p_WC, R_WC)
         in_front = p_CF[:, 2] > _NEAREST_M
         uv = p_CF[:, :2] / np.where(in_front, p_CF[:, 2], 1.0)[:, None]
         # Far outside the image the distortion model folds back into it.
@@ -259,13 +294,20 @@ class TrackSimulator:
         xy[in_front] = model.distort(uv[in_front])
         return xy, in_front & model.contains(xy, _BORDER_PX)
 
-    def _add_landmarks(self, camera: int, count: int, R_WC: Float, p_WC: Float) -> tuple[Float, Float]:
+    def _add_landmarks(
+        self, camera: int, count: int, R_WC: Float, p_WC: Float, later: PoseLater | None
+    ) -> tuple[Float, Float]:
         """Pixels (N, 2) and positions (N, 3) m of ``count`` new ones, anywhere in the view of a camera."""
         model = self._cameras[camera].model
         xy = self._rng.uniform(_BORDER_PX, np.array(model.resolution) - 1.0 - _BORDER_PX, (count, 2))
         depth = self._rng.uniform(*self._options.depth_m, count)
         rays_C = np.column_stack([model.undistort(xy), np.ones(count)])
-        p_WF = (rays_C * depth[:, None]) @ R_WC.T + p_WC
+        p_CF = rays_C * depth[:, None]
+        if self._cameras[camera].readout_s:
+            R_WC, p_WC = self._row_poses(camera, xy[:, 1], later)
+            p_WF = np.einsum("nij,nj->ni", R_WC, p_CF) + p_WC
+        else:
+            p_WF = p_CF @ R_WC.T + p_WC
         self._ids = np.concatenate([self._ids, np.arange(self._next_id, self._next_id + count)])
         self._next_id += count
         self._p_WF = np.concatenate([self._p_WF, p_WF])
@@ -310,7 +352,13 @@ def _tracks(scenario: Scenario, calibration: Calibration, simulator: TrackSimula
     frames_ns = scenario.frames_ns
     poses = [scenario.body_poses(calibration, c, frames_ns) for c in range(len(calibration.cameras))]
     R_WB, p_WB = (np.stack(part, axis=1) for part in zip(*poses, strict=True))
-    return map(simulator.observe, frames_ns.tolist(), R_WB, p_WB)
+    for t_ns, R, p in zip(frames_ns.tolist(), R_WB, p_WB, strict=True):
+
+        def later(camera: int, seconds: Float, t_ns: int = t_ns) -> tuple[Float, Float]:
+            rows_ns = t_ns + np.round(seconds * NS_PER_S).astype(np.int64)
+            return scenario.body_poses(calibration, camera, rows_ns)
+
+        yield simulator.observe(t_ns, R, p, later)
 
 
 def _path(flight: str | Flight, duration_s: float | None, calibration: Calibration) -> tuple[Flight, float]:

@@ -6,17 +6,17 @@ import numpy as np
 
 from vioframe.arrays import Bool, Float, Int
 from vioframe.estimation.factors.inertial import StateArrays
-from vioframe.estimation.factors.reprojection import Calibrated
+from vioframe.estimation.factors.reprojection import GLOBAL_SHUTTER, Calibrated, Shutter, camera_at_row
 from vioframe.geometry.triangulation import MIN_DEPTH_M, triangulate
 from vioframe.jit import kernel
 
 
 def triangulate_tracks(
-    states: StateArrays, camera: Calibrated, seen: Bool, xy: Float, sigma: float
+    states: StateArrays, camera: Calibrated, seen: Bool, xy: Float, sigma: float, shutter: Shutter = GLOBAL_SHUTTER
 ) -> tuple[Bool, Float]:
     """Which of F tracks, ``seen`` (F, K) at ``xy`` (F, K, 2), have a trustworthy landmark, and [x y rho] (F, 3)."""
     R_WC, p_WC = camera_poses(states, camera)
-    return _triangulate_all(R_WC, p_WC, seen, xy, sigma)
+    return _triangulate_all(R_WC, p_WC, states.R_WB, states.p_WB, camera, shutter, seen, xy, sigma)
 
 
 def positions(states: StateArrays, camera: Calibrated, hosts: Int, landmarks: Float) -> Float:
@@ -41,6 +41,7 @@ def image_velocities(states: StateArrays, camera: Calibrated, gyro_B: Float, hos
     ``gyro_B`` (K, 3) rad/s are the readings at the frames. A fixed point moves by p_C' = -w x p_C - v as seen from a
     camera that turns by w and flies at v. The difference of two observations would have their noise in it, and as it
     multiplies a residual with the same noise, would pass for a time offset. Zero for points that are not in front.
+    It is that at the stamp: until the row of a rolling shutter is read it hardly changes.
     """
     R_WC, p_WC = camera_poses(states, camera)
     p_C = np.einsum("kji,lkj->lki", R_WC, positions(states, camera, hosts, landmarks)[:, None] - p_WC)
@@ -59,13 +60,30 @@ def camera_poses(states: StateArrays, camera: Calibrated) -> tuple[Float, Float]
 
 
 @kernel
-def _triangulate_all(R_WC: Float, p_WC: Float, seen: Bool, xy: Float, sigma: float) -> tuple[Bool, Float]:
+def _triangulate_all(
+    R_WC: Float,
+    p_WC: Float,
+    R_WB: Float,
+    p_WB: Float,
+    camera: Calibrated,
+    shutter: Shutter,
+    seen: Bool,
+    xy: Float,
+    sigma: float,
+) -> tuple[Bool, Float]:
+    R_rowC, p_rowC = np.empty((3, 3)), np.empty(3)
     count = len(seen)
     known = np.zeros(count, dtype=np.bool_)
     landmarks = np.zeros((count, 3))
     for i in range(count):
         views = np.flatnonzero(seen[i])
-        ok, p_WF = triangulate(R_WC[views], p_WC[views], xy[i][views], sigma)
+        R_views, p_views = R_WC[views], p_WC[views]
+        if camera.readout_s != 0.0:
+            for j in range(len(views)):
+                f = views[j]
+                camera_at_row(camera, shutter, i, f, R_rowC, p_rowC)
+                R_views[j], p_views[j] = R_WB[f] @ R_rowC, R_WB[f] @ p_rowC + p_WB[f]
+        ok, p_WF = triangulate(R_views, p_views, xy[i][views], sigma)
         if ok:
             host = views[0]
             p_C = R_WC[host].T @ (p_WF - p_WC[host])

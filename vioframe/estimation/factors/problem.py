@@ -1,10 +1,10 @@
 """What the solver minimises: prior, readings, standstill and sightings over the states of a window, and calibration.
 
-The error vector is [dtheta dp dv dbg dba] of every state, oldest first, then [dtheta_BC dp_BC d_offset]; landmarks are
-eliminated before it is solved for (Triggs et al., "Bundle Adjustment: A Modern Synthesis", 2000, section 6.1). A state
-that has to go leaves all that its factors say about the others behind as the prior (Sibley, Matthies, Sukhatme,
-"Sliding window filter with application to planetary landing", J. Field Robotics 2010). Derivation:
-``docs/derivations/sliding_window.md``.
+The error vector is [dtheta dp dv dbg dba] of every state, oldest first, then [dtheta_BC dp_BC d_offset], and d_readout
+where the prior has a place for it; landmarks are eliminated before it is solved for (Triggs et al., "Bundle Adjustment:
+A Modern Synthesis", 2000, section 6.1). A state that has to go leaves all that its factors say about the others behind
+as the prior (Sibley, Matthies, Sukhatme, "Sliding window filter with application to planetary landing", J. Field
+Robotics 2010). Derivation: ``docs/derivations/sliding_window.md``.
 """
 
 from __future__ import annotations
@@ -40,12 +40,16 @@ class Variables:
         return Poses.of(self.states.R_WB, self.states.p_WB)
 
     def retract(self, step: Float, landmark_step: Float) -> Variables:
-        """Moved by ``step`` (15 K + 7,) and ``landmark_step`` (L, 3)."""
-        d = step[-CALIBRATION_SIZE:]
+        """Moved by ``step`` (15 K + 7 or 8,) and ``landmark_step`` (L, 3)."""
+        n = STATE_SIZE * len(self.states)
+        camera, d = self.camera, step[n:]
         camera = Calibrated(
-            self.camera.R_BC @ so3.exp(d[:3]), self.camera.p_BC + d[3:6], float(self.camera.offset_s + d[6])
+            camera.R_BC @ so3.exp(d[:3]),
+            camera.p_BC + d[3:6],
+            float(camera.offset_s + d[6]),
+            float(camera.readout_s + d[CALIBRATION_SIZE:].sum()),
         )
-        states = self.states.retract(step[:-CALIBRATION_SIZE].reshape(-1, STATE_SIZE))
+        states = self.states.retract(step[:n].reshape(-1, STATE_SIZE))
         return Variables(states, camera, self.landmarks + landmark_step)
 
 
@@ -65,18 +69,23 @@ class Prior:
 
     @staticmethod
     def of(state: NavState, camera: Calibrated, camera_cov: Float) -> Prior:
-        """On a single state with covariance, and on the calibration with covariance (7, 7)."""
+        """On a single state with covariance, and on the calibration with covariance (7, 7), (8, 8) with readout."""
         assert state.cov is not None
-        H = np.zeros((STATE_SIZE + CALIBRATION_SIZE, STATE_SIZE + CALIBRATION_SIZE))
+        n = STATE_SIZE + len(camera_cov)
+        H = np.zeros((n, n))
         H[:STATE_SIZE, :STATE_SIZE] = np.linalg.inv(state.cov)
         H[STATE_SIZE:, STATE_SIZE:] = np.linalg.inv(camera_cov)
         return Prior(H, np.zeros(len(H)), StateArrays.stack([state]), camera, np.ones(1, dtype=bool))
 
+    @property
+    def calibration_size(self) -> int:
+        """How many entries of the error vector are the calibration's."""
+        return len(self.b) - STATE_SIZE * len(self.frozen)
+
     def with_state(self, states: StateArrays) -> Prior:
         """The same on the window ``states`` (K + 1), of which it does not know the newest."""
-        old = np.r_[
-            0 : len(self.b) - CALIBRATION_SIZE, len(self.b) + STATE_SIZE - CALIBRATION_SIZE : len(self.b) + STATE_SIZE
-        ]
+        at = STATE_SIZE * len(self.frozen)
+        old = np.r_[0:at, at + STATE_SIZE : len(self.b) + STATE_SIZE]
         H, b = np.zeros((len(self.b) + STATE_SIZE, len(self.b) + STATE_SIZE)), np.zeros(len(self.b) + STATE_SIZE)
         H[np.ix_(old, old)], b[old] = self.H, self.b
         return Prior(H, b, self.first(states[:-1]).append(states[-1:]), self.camera, np.append(self.frozen, False))
@@ -84,7 +93,7 @@ class Prior:
     def without_newest(self) -> Prior:
         """The same without the newest state, of which it must not know."""
         assert not self.frozen[-1]
-        at = len(self.b) - CALIBRATION_SIZE - STATE_SIZE
+        at = STATE_SIZE * (len(self.frozen) - 1)
         keep = np.r_[0:at, at + STATE_SIZE : len(self.b)]
         return Prior(self.H[np.ix_(keep, keep)], self.b[keep], self.states[:-1], self.camera, self.frozen[:-1])
 
@@ -93,8 +102,9 @@ class Prior:
         d = x.states.difference(self.states)
         d[~self.frozen] = 0.0
         rotation = so3.log(self.camera.R_BC.T @ x.camera.R_BC)
-        offset = x.camera.offset_s - self.camera.offset_s
-        return np.concatenate([d.ravel(), rotation, x.camera.p_BC - self.camera.p_BC, [offset]])
+        times = [x.camera.offset_s - self.camera.offset_s, x.camera.readout_s - self.camera.readout_s]
+        camera = np.concatenate([rotation, x.camera.p_BC - self.camera.p_BC, times])
+        return np.concatenate([d.ravel(), camera[: self.calibration_size]])
 
     def first(self, states: StateArrays) -> StateArrays:
         """``states``, with the first estimates of those that are frozen in their place."""
@@ -140,8 +150,9 @@ class Problem:
             b[at] += J.T @ residual
         poses = x.poses
         first_poses = Poses.of(first.R_WB, first.p_WB) if self.first_estimates else poses
-        H_visual, b_visual, V, W, c = self.sightings.linearise(poses, first_poses, x.camera, x.landmarks)
-        columns = pose_columns(K)
+        size = self.prior.calibration_size
+        H_visual, b_visual, V, W, c = self.sightings.linearise(poses, first_poses, x.camera, x.landmarks, size)
+        columns = pose_columns(K, size)
         H[np.ix_(columns, columns)] += H_visual
         b[columns] += b_visual
         return Normal(H, b, V, W, c, columns)
@@ -198,10 +209,10 @@ def _still_residual(still: Standstill, states: StateArrays, k: int) -> Float:
     return still.residual(states.R_WB[k], states.v_WB[k], states.bias_gyro_B[k], states.bias_accel_B[k])
 
 
-def pose_columns(K: int) -> NDArray[np.intp]:
+def pose_columns(K: int, calibration_size: int = CALIBRATION_SIZE) -> NDArray[np.intp]:
     """Indices of [dtheta dp] of every state, and of the calibration, in the error vector of K states."""
     poses = (STATE_SIZE * np.arange(K)[:, None] + np.arange(6)).ravel()
-    return np.concatenate([poses, STATE_SIZE * K + np.arange(CALIBRATION_SIZE)])
+    return np.concatenate([poses, STATE_SIZE * K + np.arange(calibration_size)])
 
 
 def marginalise_oldest(problem: Problem, x: Variables) -> Prior:

@@ -5,8 +5,10 @@ A landmark m = [x y rho] of the host h is seen from the frame f at the direction
     X = R_BC^T (R_fh q + rho t_fh - rho p_BC),   q = R_BC [x y 1]^T + rho p_BC,
 
 with R_fh = R_WBf^T R_WBh and t_fh = R_WBf^T (p_WBh - p_WBf): rho times its position in the camera. Being polynomial in
-rho, it holds for points as far as one likes. Residuals are evaluated at the estimate, Jacobians at the first estimates
-of poses that are in the prior. Derivation: ``docs/derivations/sliding_window.md``.
+rho, it holds for points as far as one likes. With a rolling shutter, a frame's camera is where the body's motion has
+taken it by the time of the row: R_BC and p_BC in X, not in q, become Exp(w t) R_BC and Exp(w t) p_BC + v t. Residuals
+are evaluated at the estimate, Jacobians at the first estimates of poses that are in the prior. Derivation:
+``docs/derivations/sliding_window.md``.
 """
 
 from __future__ import annotations
@@ -17,24 +19,25 @@ from typing import NamedTuple
 import numpy as np
 
 from vioframe.arrays import Bool, Float
-from vioframe.geometry.kernels import distort
+from vioframe.geometry.kernels import distort, exp
 from vioframe.jit import kernel
 
 # Depth in a frame over depth in the host: a landmark nearer than this is beside the camera, and cannot be seen.
 _LEAST_DEPTH_RATIO = 0.05
 CALIBRATION_SIZE = 7
-"""Error of the calibration: [dtheta_BC dp_BC d_offset]."""
+"""Error of the calibration: [dtheta_BC dp_BC d_offset]; one more with d_readout, where that is estimated."""
 
 
 Linearised = tuple[Float, Float, Float, Float, Float]
 
 
 class Calibrated(NamedTuple):
-    """The calibration that is estimated: the camera on the body, and what is left of the time offset, s."""
+    """What may be estimated: the camera on the body, what is left of the time offset, s, and the readout, s."""
 
     R_BC: Float
     p_BC: Float
     offset_s: float = 0.0
+    readout_s: float = 0.0
 
 
 class Poses(NamedTuple):
@@ -55,6 +58,22 @@ class Poses(NamedTuple):
         return Poses(np.ascontiguousarray(R_WB), R_fh, t_fh)
 
 
+class Shutter(NamedTuple):
+    """When the rows are read, and how the body moves meanwhile, which is constant while a window is solved for.
+
+    ``row`` (L, K) is that of a sighting, from -1/2 for the first to 1/2 for the last; ``rate_B`` (K, 3) rad/s and
+    ``velocity_B`` (K, 3) m/s are the body's in every frame, in its own axes.
+    """
+
+    row: Float
+    rate_B: Float
+    velocity_B: Float
+
+
+GLOBAL_SHUTTER = Shutter(np.zeros((1, 1)), np.zeros((1, 3)), np.zeros((1, 3)))
+"""Where the readout is zero and stays so, nothing is asked of the shutter."""
+
+
 class Sightings(NamedTuple):
     """What was seen of L landmarks in K frames, as in the table of tracks, with its noise and robust loss.
 
@@ -70,6 +89,7 @@ class Sightings(NamedTuple):
     sigma: float
     cauchy: float
     on_sphere: bool = False
+    shutter: Shutter = GLOBAL_SHUTTER
 
     def cost(self, poses: Poses, camera: Calibrated, landmarks: Float) -> float:
         """Half the robust sum of squares."""
@@ -79,13 +99,20 @@ class Sightings(NamedTuple):
         """(L,) root mean square residual of each landmark, standard deviations; infinite behind a camera."""
         return _evaluate(poses, camera, self, landmarks)[1]
 
-    def linearise(self, poses: Poses, first: Poses, camera: Calibrated, landmarks: Float) -> Linearised:
+    def linearise(
+        self,
+        poses: Poses,
+        first: Poses,
+        camera: Calibrated,
+        landmarks: Float,
+        calibration_size: int = CALIBRATION_SIZE,
+    ) -> Linearised:
         """H (n, n), b (n,) of poses and calibration, and V (L, 3, 3), W (L, 3, n), c (L, 3) of the landmarks.
 
-        n = 6 K + 7: [dtheta dp] of every frame, then the calibration. The gradient is [b c], the Gauss-Newton matrix
-        [H W^T; W V], with the robust weights in them. Jacobians are taken at the poses ``first``.
+        n = 6 K + ``calibration_size``: [dtheta dp] of every frame, then the calibration. The gradient is [b c], the
+        Gauss-Newton matrix [H W^T; W V], with the robust weights in them. Jacobians are taken at the poses ``first``.
         """
-        return _linearise(poses, first, camera, self, landmarks)
+        return _linearise(poses, first, camera, self, landmarks, calibration_size)
 
 
 @kernel
@@ -160,6 +187,20 @@ def _in_camera(R_fh: Float, t_fh: Float, R_BC: Float, p_BC: Float, rho: float, q
 
 
 @kernel
+def camera_at_row(camera: Calibrated, shutter: Shutter, i: int, f: int, R_rowC: Float, p_rowC: Float) -> None:
+    """``R_rowC`` (3, 3) and ``p_rowC`` (3,): the camera, seen from the body at frame f, when it saw landmark i."""
+    late_s = camera.readout_s * shutter.row[i, f]
+    turn = exp(late_s * shutter.rate_B[f])
+    for j in range(3):
+        p_rowC[j] = late_s * shutter.velocity_B[f, j]
+        for k in range(3):
+            p_rowC[j] += turn[j, k] * camera.p_BC[k]
+            R_rowC[j, k] = (
+                turn[j, 0] * camera.R_BC[0, k] + turn[j, 1] * camera.R_BC[1, k] + turn[j, 2] * camera.R_BC[2, k]
+            )
+
+
+@kernel
 def _tangents(x: float, y: float, T: Float) -> None:
     """``T`` (2, 3): two orthonormal directions across the ray [x y 1]."""
     length = math.sqrt(1.0 + x * x)
@@ -217,6 +258,14 @@ def _residual_jacobian(
 
 
 @kernel
+def _times_transposed(A: Float, M: Float, out: Float) -> None:
+    """``out`` = A M^T, (2, 3) times (3, 3)."""
+    for i in range(2):
+        for k in range(3):
+            out[i, k] = A[i, 0] * M[k, 0] + A[i, 1] * M[k, 1] + A[i, 2] * M[k, 2]
+
+
+@kernel
 def _times(A: Float, M: Float, out: Float) -> None:
     """``out`` = A M, (2, 3) times (3, 3)."""
     for i in range(2):
@@ -227,8 +276,9 @@ def _times(A: Float, M: Float, out: Float) -> None:
 @kernel
 def _evaluate(poses: Poses, camera: Calibrated, s: Sightings, landmarks: Float) -> tuple[float, Float]:
     """Half the robust sum of squares, and each landmark's root mean square residual."""
-    R_BC, p_BC, offset_s = camera
-    seen, xy, velocity, to_px, sigma, cauchy, on_sphere = s
+    R_BC, p_BC, offset_s, readout_s = camera
+    seen, xy, velocity, to_px, sigma, cauchy, on_sphere, shutter = s
+    R_rowC, p_rowC = R_BC.copy(), p_BC.copy()
     q, b, X, r, T = np.empty(3), np.empty(3), np.empty(3), np.empty(2), np.empty((2, 3))
     count, frames = seen.shape
     cost, errors = 0.0, np.empty(count)
@@ -240,7 +290,9 @@ def _evaluate(poses: Poses, camera: Calibrated, s: Sightings, landmarks: Float) 
                 continue
             host = f if host < 0 else host
             x, y = xy[i, f, 0] - offset_s * velocity[i, f, 0], xy[i, f, 1] - offset_s * velocity[i, f, 1]
-            _in_camera(poses.R_fh[f, host], poses.t_fh[f, host], R_BC, p_BC, landmarks[i, 2], q, b, X)
+            if readout_s != 0.0:
+                camera_at_row(camera, shutter, i, f, R_rowC, p_rowC)
+            _in_camera(poses.R_fh[f, host], poses.t_fh[f, host], R_rowC, p_rowC, landmarks[i, 2], q, b, X)
             _residual(X, x, y, to_px[i, f], on_sphere, T, r)
             squared = r[0] * r[0] + r[1] * r[1]
             cost += 0.5 * cauchy * cauchy * math.log(1.0 + squared / (sigma * sigma * cauchy * cauchy))
@@ -253,21 +305,25 @@ def _evaluate(poses: Poses, camera: Calibrated, s: Sightings, landmarks: Float) 
 
 
 @kernel
-def _linearise(poses: Poses, first: Poses, camera: Calibrated, s: Sightings, landmarks: Float) -> Linearised:
-    R_BC, p_BC, offset_s = camera
-    seen, xy, velocity, to_px, sigma, cauchy, on_sphere = s
+def _linearise(
+    poses: Poses, first: Poses, camera: Calibrated, s: Sightings, landmarks: Float, size: int
+) -> Linearised:
+    R_BC, p_BC, offset_s, readout_s = camera
+    seen, xy, velocity, to_px, sigma, cauchy, on_sphere, shutter = s
+    rolling = readout_s != 0.0
+    R_rowC, p_rowC = R_BC.copy(), p_BC.copy()
     count, frames = seen.shape
-    n = 6 * frames + CALIBRATION_SIZE
+    n = 6 * frames + size
     H, g = np.zeros((n, n)), np.zeros(n)
     V, W, c = np.zeros((count, 3, 3)), np.zeros((count, 3, n)), np.zeros((count, 3))
     q, b, X, r, T = np.empty(3), np.empty(3), np.empty(3), np.empty(2), np.empty((2, 3))
     D, A, B, C, E = np.empty((2, 3)), np.empty((2, 3)), np.empty((2, 3)), np.empty((2, 3)), np.empty((2, 3))
-    R_CB = np.ascontiguousarray(R_BC.T)
-    by_offset = np.empty(2)
-    J = np.empty((2, 19))  # host, frame, calibration
+    A_row = np.empty((2, 3))
+    by_offset, p_row = np.empty(2), np.empty(3)
+    J = np.empty((2, 12 + size))  # host, frame, calibration
     J_m = np.empty((2, 3))
-    columns = np.empty(19, np.int64)
-    for k in range(CALIBRATION_SIZE):
+    columns = np.empty(12 + size, np.int64)
+    for k in range(size):
         columns[12 + k] = 6 * frames + k
     ray = np.ones(3)
     for i in range(count):
@@ -281,21 +337,28 @@ def _linearise(poses: Poses, first: Poses, camera: Calibrated, s: Sightings, lan
             host = f if host < 0 else host
             vx, vy = velocity[i, f, 0], velocity[i, f, 1]
             x, y = xy[i, f, 0] - offset_s * vx, xy[i, f, 1] - offset_s * vy
-            _in_camera(poses.R_fh[f, host], poses.t_fh[f, host], R_BC, p_BC, rho, q, b, X)
+            if rolling:
+                camera_at_row(camera, shutter, i, f, R_rowC, p_rowC)
+            _in_camera(poses.R_fh[f, host], poses.t_fh[f, host], R_rowC, p_rowC, rho, q, b, X)
             _residual(X, x, y, to_px[i, f], on_sphere, T, r)
             weight = 1.0 / (1.0 + (r[0] * r[0] + r[1] * r[1]) / (sigma * sigma * cauchy * cauchy))
             scale = math.sqrt(weight) / sigma
 
-            _in_camera(first.R_fh[f, host], first.t_fh[f, host], R_BC, p_BC, rho, q, b, X)
+            _in_camera(first.R_fh[f, host], first.t_fh[f, host], R_rowC, p_rowC, rho, q, b, X)
             _residual_jacobian(X, vx, vy, to_px[i, f], on_sphere, T, D, by_offset)
-            _times(D, R_CB, A)
+            _times_transposed(D, R_rowC, A)
+            _times_transposed(D, R_BC, A_row)
             _times(A, first.R_fh[f, host], B)
             _times(B, R_BC, C)
             _times(A, first.R_WB[f].T, E)
+            moved = host != f
+            # In the host itself a landmark is where it was seen, unless rows are read at different times.
+            apart = moved or rolling
+            for k in range(3):
+                p_row[k] = rho * p_BC[k] + R_BC[k, 0] * X[0] + R_BC[k, 1] * X[1] + R_BC[k, 2] * X[2]
             for a in range(2):
                 r[a] *= scale
-                moved = host != f
-                by_rho = 0.0
+                by_rho, by_readout = 0.0, 0.0
                 for k in range(3):
                     i1, i2 = (k + 1) % 3, (k + 2) % 3  # a x b in its component k
                     by_host = q[i1] * B[a, i2] - q[i2] * B[a, i1]
@@ -305,20 +368,28 @@ def _linearise(poses: Poses, first: Poses, camera: Calibrated, s: Sightings, lan
                     J[a, 3 + k] = scale * rho * E[a, k] if moved else 0.0
                     J[a, 6 + k] = scale * by_frame if moved else 0.0
                     J[a, 9 + k] = -J[a, 3 + k]
-                    J[a, 12 + k] = scale * by_camera if moved else 0.0
-                    J[a, 15 + k] = scale * rho * (B[a, k] - A[a, k]) if moved else 0.0
+                    J[a, 12 + k] = scale * by_camera if apart else 0.0
+                    J[a, 15 + k] = scale * rho * (B[a, k] - A_row[a, k]) if apart else 0.0
                     by_rho += A[a, k] * first.t_fh[f, host, k] + (B[a, k] - A[a, k]) * p_BC[k]
+                    by_rho -= A[a, k] * (p_rowC[k] - p_BC[k])
                 J[a, 18] = scale * by_offset[a]
+                if size > CALIBRATION_SIZE:
+                    rate, velocity_B = shutter.rate_B[f], shutter.velocity_B[f]
+                    for k in range(3):
+                        i1, i2 = (k + 1) % 3, (k + 2) % 3
+                        by_readout -= A_row[a, k] * (rate[i1] * p_row[i2] - rate[i2] * p_row[i1])
+                        by_readout -= rho * A[a, k] * velocity_B[k]
+                    J[a, 19] = scale * by_readout * shutter.row[i, f]
                 J_m[a, 0], J_m[a, 1] = scale * C[a, 0], scale * C[a, 1]
-                J_m[a, 2] = scale * by_rho if moved else 0.0
+                J_m[a, 2] = scale * by_rho if apart else 0.0
             for k in range(6):
                 columns[k], columns[6 + k] = 6 * host + k, 6 * f + k
 
             begin = 0 if host != f else 12
-            for u in range(begin, 19):
+            for u in range(begin, 12 + size):
                 cu = columns[u]
                 g[cu] += J[0, u] * r[0] + J[1, u] * r[1]
-                for v in range(begin, 19):
+                for v in range(begin, 12 + size):
                     H[cu, columns[v]] += J[0, u] * J[0, v] + J[1, u] * J[1, v]
                 for k in range(3):
                     W[i, k, cu] += J_m[0, k] * J[0, u] + J_m[1, k] * J[1, u]

@@ -32,7 +32,7 @@ _SOON_S, _LATER_S, _LATEST_S = 0.1, 0.05, 0.5
 # Readings that are smoother than their calibration has it count as such: this many times what they jump by.
 _IN_MOTION, _JUMPS = 2.0, 2.5
 # How well a calibration is known (rad, m, s, px, distortion), as published for OpenVINS on EuRoC.
-GIVEN = CameraSigma(np.full(3, 0.005), np.full(3, 0.015), 0.01, np.repeat([1.0, 0.005], 4))
+GIVEN = CameraSigma(np.full(3, 0.005), np.full(3, 0.015), 0.01, np.repeat([1.0, 0.005], 4), 0.02)
 
 
 class Initializer:

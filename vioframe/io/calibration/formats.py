@@ -10,9 +10,14 @@ IMU, ``td`` is ``t_imu - t_cam``. Its ``acc_n, gyr_n, acc_w, gyr_w`` are *not* d
 with ``(G dt) Q (G dt)^T`` (section IV-B), Q holding their squares, which a density sigma would enter as ``sigma^2 dt``.
 So ``density = value * sqrt(dt)``.
 
-Two keys are additions of this project. ``timeshift_cam_imu`` in EuRoC's files keeps a written calibration whole.
-``camera_rotation: unknown``, in EuRoC's and Kalibr's, says that nobody knows how the camera is turned on the body, as
-VINS-Mono's ``estimate_extrinsic: 2`` does: of the transform beside it, if there is one, only the position counts.
+VINS-Mono's ``rolling_shutter_tr`` is the readout time, its stamps are those of the middle row. Kalibr's calibration of
+a rolling shutter writes no file: it prints the time of one line.
+
+Three keys are additions of this project. ``timeshift_cam_imu`` in EuRoC's files keeps a written calibration whole.
+``readout_time``, in EuRoC's and Kalibr's, is that of a rolling shutter: rows times the time of one, the stamp being
+that of the middle row. ``camera_rotation: unknown``, in both, says that nobody knows how the camera is turned on the
+body, as VINS-Mono's ``estimate_extrinsic: 2`` does: of the transform beside it, if there is one, only the position
+counts.
 """
 
 from __future__ import annotations
@@ -51,6 +56,8 @@ _LARGEST = 1e30
 _LONGEST_SHIFT_S = 9e9  # an integer of nanoseconds holds no more
 _Positive = Annotated[float, Field(gt=0.0, lt=_LARGEST)]
 _Shift = Annotated[float, Field(gt=-_LONGEST_SHIFT_S, lt=_LONGEST_SHIFT_S)]
+# No shutter takes a second; who writes milliseconds is told.
+_Readout = Annotated[float, Field(gt=-1.0, lt=1.0)]
 # VINS-Mono's file does not state the rate its noise parameters belong to; this is the one they were tuned for.
 _VINS_MONO_RATE_HZ = 200.0
 
@@ -68,12 +75,15 @@ class CameraPart:
     time_offset_ns: int = 0
     rotation_known: bool = True
     topic: str | None = None
+    readout_s: float = 0.0
 
     def on_body(self, T_BI: Float) -> CameraOnBody:
         """The camera as seen from the IMU, which ``T_BI`` (4, 4) maps into the same frame as ``T_BC``."""
         T_IC = inverse(T_BI) @ self.T_BC
         R_IC = T_IC[:3, :3] if self.rotation_known else np.eye(3)
-        return CameraOnBody(self.name, self.model, R_IC, T_IC[:3, 3], self.time_offset_ns, self.rotation_known)
+        return CameraOnBody(
+            self.name, self.model, R_IC, T_IC[:3, 3], self.time_offset_ns, self.rotation_known, self.readout_s
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -156,6 +166,7 @@ def write_calibration(calibration: Calibration, folder: Path) -> None:
             f"distortion_model: {distortion_model}",
             f"distortion_coefficients: {_list(model.distortion)}",
             f"timeshift_cam_imu: {camera.time_offset_ns / NS_PER_S!r}  # [s] t_imu = t_cam + shift",
+            *([f"readout_time: {float(camera.readout_s)!r}  # [s] rolling shutter"] if camera.readout_s else []),
         )
     noise = calibration.imu
     _write(
@@ -211,6 +222,7 @@ class _PinholeCamera(BaseModel):
     )
     resolution: Annotated[Float, _numbers(2)]
     timeshift_cam_imu: _Shift = 0.0
+    readout_time: _Readout = 0.0
     camera_rotation: Literal["known", "unknown"] = "known"
     rostopic: str | None = None
     T_BS: Annotated[Float | None, _numbers(16)] = None
@@ -245,6 +257,8 @@ class _VinsMono(BaseModel):
     extrinsicRotation: Annotated[Float | None, _numbers(9)] = None
     extrinsicTranslation: Annotated[Float | None, _numbers(3)] = None
     td: _Shift = 0.0
+    rolling_shutter: int = 0
+    rolling_shutter_tr: _Readout = 0.0
     image_topic: str | None = None
     gyr_n: _Positive
     acc_n: _Positive
@@ -281,7 +295,7 @@ def _camera(document: object, where: str, name: str) -> CameraPart:
     is_fisheye = said.distortion_model in ("equidistant", "equi")
     model = _model((fx, fy, cx, cy, k1, k2, k3, k4), resolution, "equidistant" if is_fisheye else "radtan", where)
     known, offset_ns = said.camera_rotation == "known", _nanoseconds(said.timeshift_cam_imu)
-    return CameraPart(name, model, _T_BC(said, known, where), offset_ns, known, said.rostopic)
+    return CameraPart(name, model, _T_BC(said, known, where), offset_ns, known, said.rostopic, said.readout_time)
 
 
 def _model(numbers: Sequence[float], resolution: tuple[int, int], kind: DistortionModel, where: str) -> Camera:
@@ -347,7 +361,8 @@ def _vins_mono(document: Document, where: str) -> tuple[CameraPart, ImuPart]:
     if known and said.extrinsicRotation is not None:
         R_BC = _rotation(said.extrinsicRotation.reshape(3, 3), "extrinsicRotation", where)
     T_BC = _transform(R_BC, np.zeros(3) if p_BC is None else p_BC)
-    camera = CameraPart("cam0", model, T_BC, _nanoseconds(said.td), known, said.image_topic)
+    readout_s = said.rolling_shutter_tr if said.rolling_shutter else 0.0
+    camera = CameraPart("cam0", model, T_BC, _nanoseconds(said.td), known, said.image_topic, readout_s)
 
     scale = 1.0 / sqrt(_VINS_MONO_RATE_HZ)
     noise = ImuNoise(scale * said.gyr_n, scale * said.acc_n, scale * said.gyr_w, scale * said.acc_w, _VINS_MONO_RATE_HZ)
