@@ -30,6 +30,7 @@ SECOND = CameraOnBody(
     Camera(20.0, 21.0, 15.5, 11.5, (0.1, -0.02, 1e-3, 2e-3), (32, 24), "equidistant"),
     so3.exp([0.3, -1.2, 0.4]),
     np.array([-0.1, 1 / 3, 0.05]),
+    readout_s=1 / 47,
 )
 PAIR = Calibration((CAMERA, SECOND), CALIBRATION.imu)
 
@@ -85,7 +86,7 @@ def assert_same_rig(actual: Calibration, expected: Calibration) -> None:
     assert actual.imu == expected.imu
     assert len(actual.cameras) == len(expected.cameras)
     for one, other in zip(actual.cameras, expected.cameras, strict=True):
-        for name in ("name", "model", "time_offset_ns", "rotation_known"):
+        for name in ("name", "model", "time_offset_ns", "rotation_known", "readout_s"):
             assert getattr(one, name) == getattr(other, name)
         np.testing.assert_array_equal(one.R_BC, other.R_BC)
         np.testing.assert_array_equal(one.p_BC, other.p_BC)

@@ -149,6 +149,23 @@ def test_vins_mono(tmp_path: Path, header: str) -> None:
     assert_equal(load_calibration(file, cameras=["/any/topic"]), noise=noise)
 
 
+@pytest.mark.parametrize(("said", "readout_s"), [("1", 0.0333), ("0", 0.0)])
+def test_vins_mono_rolling_shutter(tmp_path: Path, said: str, readout_s: float) -> None:
+    file = tmp_path / "phone.yaml"
+    file.write_text(f"{VINS_MONO}\nrolling_shutter: {said}\nrolling_shutter_tr: 0.0333\n")
+    assert load_calibration(file).cameras[0].readout_s == readout_s
+
+
+def test_kalibr_rolling_shutter(tmp_path: Path) -> None:
+    chain, imu = tmp_path / "chain.yaml", tmp_path / "imu.yaml"
+    chain.write_text("cam0:" + kalibr_camera(f"T_imu_cam: {rows(T_BC)}") + "  readout_time: 0.0213\n")
+    imu.write_text(KALIBR_IMU)
+    (camera,) = load_calibration(chain, imu).cameras
+    assert camera.readout_s == 0.0213
+    # The middle row at the stamp, the first half the readout before it.
+    np.testing.assert_allclose(camera.row(np.array([-0.5, 239.5, 479.5])), [-0.5, 0.0, 0.5])
+
+
 def test_vins_mono_kannala_brandt(tmp_path: Path) -> None:
     file = tmp_path / "fisheye.yaml"
     before, _, after = VINS_MONO.partition("distortion_parameters:")
@@ -194,8 +211,8 @@ def test_written_calibrations_read_back_to_the_last_bit(tmp_path: Path, model: D
     odd = Camera(1 / 3, 2 / 3, 1e-17, 1e17, (0.1 + 0.2, -1e-300, 0.0, 1.0), (752, 480), model)
     cameras = (
         CameraOnBody("cam0", odd, np.eye(3), np.array([1 / 3, -1e-20, 7.0]), -123_456_789_012),
-        CameraOnBody("cam1", CAMERA, np.eye(3), P_BC, OFFSET_NS, rotation_known=False),
-        CameraOnBody("thermal", CAMERA, R_BC, P_BC),
+        CameraOnBody("cam1", CAMERA, np.eye(3), P_BC, OFFSET_NS, rotation_known=False, readout_s=1 / 30),
+        CameraOnBody("thermal", CAMERA, R_BC, P_BC, readout_s=-0.1),
         *packaged_calibration("euroc").with_camera(0, name="cam2").with_camera(1, name="cam3").cameras,
     )
     cameras = tuple(sorted(cameras, key=lambda camera: camera.name))
@@ -343,6 +360,7 @@ def test_distortion_models(tmp_path: Path) -> None:
             "should be 0 or 4 or 5 finite numbers",
         ),
         ("distortion_coeffs:", "coeffs:", "distortion needs four coefficients"),
+        ("rostopic:", "readout_time: 30\n  rostopic:", "'readout_time' should be less than 1, not 30"),
         ("cam0:\n", "camera:\n", "not a calibration of a known format"),
     ],
 )

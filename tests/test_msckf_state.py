@@ -119,9 +119,7 @@ def test_a_landmark_comes_last_with_its_correlations():
 def test_update_agrees_with_filterpy(part, noise):
     state, rng = random_state(6, scale=0.02), np.random.default_rng(6)
     n = len(state.cov)
-    columns = {"all": slice(0, n), "window": slice(IMU, state.landmarks_begin), "imu": slice(0, IMU)}[
-        part
-    ]
+    columns = {"all": slice(0, n), "window": slice(IMU, state.landmarks_begin), "imu": slice(0, IMU)}[part]
     H, residual = rng.normal(size=(20, columns.stop - columns.start)), 0.05 * rng.normal(size=20)
     R = 0.04 if noise == "common" else rng.uniform(0.01, 0.1, 20)
 

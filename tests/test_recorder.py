@@ -114,9 +114,9 @@ def learned(k: int) -> CalibrationEstimate:
     rig: Calibration = packaged_calibration("euroc")
     for place, camera in enumerate(rig.cameras):
         moved = camera.p_BC + np.array([0.001 * k, 0.01 * place, 0.0])
-        rig = rig.with_camera(place, p_BC=moved, time_offset_ns=1_000_000 * k + place)
-    sigma = tuple(CameraSigma(np.full(3, 1e-3), np.full(3, 2e-3 / (k + 1)), 3e-3, np.arange(8.0)) for _ in rig.cameras)
-    return CalibrationEstimate(rig, sigma)
+        rig = rig.with_camera(place, p_BC=moved, time_offset_ns=1_000_000 * k + place, readout_s=0.01 * k)
+    sigma = CameraSigma(np.full(3, 1e-3), np.full(3, 2e-3 / (k + 1)), 3e-3, np.arange(8.0), 4e-3)
+    return CalibrationEstimate(rig, (sigma,) * len(rig.cameras))
 
 
 def test_what_is_learned_of_the_rig_is_kept_a_row_a_frame_and_camera_and_at_last_as_files(tmp_path):
@@ -135,17 +135,16 @@ def test_what_is_learned_of_the_rig_is_kept_a_row_a_frame_and_camera_and_at_last
     )
     np.testing.assert_allclose(table["sigma_px"], np.repeat([1e-3, 2e-3 / 3, 5e-4], 2))
     np.testing.assert_allclose(table["time_offset_s"], np.repeat([1e-3, 2e-3, 3e-3], 2), atol=1e-8)
+    np.testing.assert_allclose(table["readout_s"], np.repeat([0.01, 0.02, 0.03], 2))
+    np.testing.assert_allclose(table["sigma_readout_s"], 0.004)
     np.testing.assert_allclose(table["fx"], [c.model.fx for c in given.cameras] * 3)
     assert table["sigma_d4"].tolist() == [7.0] * 6
     read, last = RunFolder.open(tmp_path / "run").learned_calibration(), learned(3).calibration
     assert read is not None
     assert read.imu == last.imu
     for camera, expected in zip(read.cameras, last.cameras, strict=True):
-        assert (camera.name, camera.model, camera.time_offset_ns) == (
-            expected.name,
-            expected.model,
-            expected.time_offset_ns,
-        )
+        for name in ("name", "model", "time_offset_ns", "readout_s"):
+            assert getattr(camera, name) == getattr(expected, name)
         np.testing.assert_array_equal(camera.p_BC, expected.p_BC)
         np.testing.assert_allclose(camera.R_BC, expected.R_BC, atol=1e-15)
 

@@ -139,6 +139,20 @@ def test_a_wrong_calibration_is_wrong_by_the_amount_asked_for(tmp_path, clear):
     assert np.array_equal(images(wrong), images(clear))
 
 
+def test_a_rolling_shutter_is_told_or_not(tmp_path, clear):
+    told = small_simulation(tmp_path, duration_s=0.5, readout_ms=30.0)
+    hidden = under(tmp_path, "rolling_shutter")
+    assert [r.true_calibration.cameras[0].readout_s for r in (told, hidden, clear)] == [0.03, 0.03, 0.0]
+    assert [r.calibration.cameras[0].readout_s for r in (told, hidden, clear)] == [0.03, 0.0, 0.0]
+    assert np.array_equal(images(told), images(hidden))
+    # The stamp is that of the middle row: there the picture is the one of a global shutter.
+    apart = np.abs(images(told) - images(clear)).mean(axis=(0, 2))
+    rows = len(apart)
+    assert apart[rows // 2 - 1 : rows // 2 + 1].mean() < 0.2 * min(
+        apart[: rows // 8].mean(), apart[-rows // 8 :].mean()
+    )
+
+
 def test_the_imu_is_exact_or_as_wrong_as_asked(tmp_path, clear):
     exact = small_simulation(tmp_path, duration_s=0.5, exact_imu=True)
     assert not exact.ground_truth.values[:, 10:].any()

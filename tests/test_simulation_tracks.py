@@ -5,6 +5,7 @@ import tracemalloc
 import numpy as np
 import pytest
 
+from vioframe.errors import ConfigError
 from vioframe.io.calibration import packaged_calibration
 from vioframe.simulation import TrackOptions, TrackSimulator, simulated_sequence, simulated_stream
 from vioframe.simulation.flights import flight
@@ -42,6 +43,39 @@ def test_without_noise_every_observation_is_the_projection_of_its_landmark():
         np.testing.assert_allclose(tracks.xy, project(landmarks, pose, tracks.ids), atol=1e-9)
         np.testing.assert_allclose(CAMERA.distort(tracks.xy_normalised), tracks.xy, atol=1e-6)
         assert CAMERA.contains(tracks.xy, border_px=5.0 - 1e-9).all()
+
+
+@pytest.mark.parametrize("readout_s", [0.03, -0.02])
+def test_a_rolling_shutter_sees_every_point_from_the_pose_at_the_time_of_its_row(readout_s):
+    """Rays of two frames, from the poses at their own rows' times, meet in the landmark; from the stamps' they miss."""
+    rolling = CALIBRATION.with_camera(0, readout_s=readout_s)
+    sequence = simulated_sequence("aggressive", None, 0.0, duration_s=2.0, calibration=rolling)
+    motion = flight("aggressive", 2.0, ON_BODY.R_BC)
+    frames = [tracks for _, tracks in sequence.packets]
+    gaps_m: dict[bool, list[float]] = {True: [], False: []}
+    for k in range(10, 35):
+        both, *at = np.intersect1d(frames[k].ids, frames[k + 3].ids, return_indices=True)
+        assert len(both) > 30
+        for in_time, gaps in gaps_m.items():
+            rays, origins = [], []
+            for frame, own in zip((k, k + 3), at, strict=True):
+                seen = frames[frame].only(own)
+                late_s = in_time * readout_s * ((seen.xy[:, 1] + 0.5) / 480 - 0.5)
+                pose = motion.at(0.05 * frame + late_s)
+                rays_B = np.column_stack([seen.xy_normalised, np.ones(len(both))]) @ ON_BODY.R_BC.T
+                rays.append(np.einsum("nij,nj->ni", pose.R_WB, rays_B))
+                origins.append(pose.R_WB @ ON_BODY.p_BC + pose.p_WB)
+            normal = np.cross(*rays)
+            normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+            gaps.append(float(np.abs(np.einsum("ni,ni->n", normal, origins[1] - origins[0])).max()))
+    assert max(gaps_m[True]) < 1e-6
+    assert max(gaps_m[False]) > 1e-2
+
+
+def test_a_rolling_shutter_needs_to_know_where_the_body_is_meanwhile():
+    simulator = TrackSimulator(CALIBRATION.with_camera(0, readout_s=0.03), TrackOptions(), np.random.default_rng(0))
+    with pytest.raises(ConfigError, match="rolling shutter"):
+        simulator.observe(0, np.eye(3), np.zeros(3))
 
 
 def test_every_camera_of_a_rig_sees_the_landmarks_before_it_under_one_id():

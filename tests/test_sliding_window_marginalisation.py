@@ -6,7 +6,7 @@ from dataclasses import fields, replace
 
 import numpy as np
 import pytest
-from msckf_helpers import since
+from msckf_helpers import CALIBRATION, since
 from sliding_window_helpers import flown_window, moved, natural, only, standing
 
 from vioframe.bench import run_backend
@@ -205,7 +205,12 @@ def start_in_the_dark(true: NavState, seed: int, position_m: float, yaw_rad: flo
 
 
 def fly(
-    flight: str, monkeypatch: pytest.MonkeyPatch, options: SlidingWindowOptions, position_m: float, yaw_rad: float
+    flight: str,
+    monkeypatch: pytest.MonkeyPatch,
+    options: SlidingWindowOptions,
+    position_m: float,
+    yaw_rad: float,
+    readout_s: float = 0.0,
 ) -> list[Prior]:
     """The priors along a flight, the first first."""
     priors: list[Prior] = []
@@ -217,7 +222,8 @@ def fly(
         return priors[-1]
 
     monkeypatch.setattr(window_module, "marginalise_oldest", recorded)
-    sequence = simulated_sequence(flight, seed=1, duration_s=8.0)
+    calibration = CALIBRATION.with_camera(0, readout_s=readout_s)
+    sequence = simulated_sequence(flight, seed=1, duration_s=8.0, calibration=calibration)
     start = start_in_the_dark(sequence.true_states[1], 1, position_m, yaw_rad)
     run = run_backend(since(sequence, 1), SlidingWindow(options), initial_state=start)
     assert run.completion == 1.0
@@ -237,10 +243,11 @@ def cancelled(prior: Prior) -> Float:
     return known(prior) / np.diag(np.abs(N).T @ np.abs(prior.H) @ np.abs(N))
 
 
-@pytest.mark.parametrize("flight", FLIGHTS)
-def test_prior_keeps_the_four_unobservable_directions(flight, monkeypatch):
+@pytest.mark.parametrize(("flight", "readout_s"), [*((flight, 0.0) for flight in FLIGHTS), ("figure_eight", 0.03)])
+def test_prior_keeps_the_four_unobservable_directions(flight, readout_s, monkeypatch):
     """Whose start is hardly known: no flight may teach it where it is, nor where north is."""
-    priors = fly(flight, monkeypatch, SlidingWindowOptions(), 10.0, 1.0)
+    options = SlidingWindowOptions(calibrate_readout=readout_s != 0.0)
+    priors = fly(flight, monkeypatch, options, 10.0, 1.0, readout_s)
     growth = np.array([known(prior) / known(priors[0]) for prior in priors])
     assert growth.max() < 1.0 + 1e-3
     assert cancelled(priors[-1]).max() < 1e-7

@@ -305,9 +305,7 @@ def _evaluate(poses: Poses, camera: Calibrated, s: Sightings, landmarks: Float) 
 
 
 @kernel
-def _linearise(
-    poses: Poses, first: Poses, camera: Calibrated, s: Sightings, landmarks: Float, size: int
-) -> Linearised:
+def _linearise(poses: Poses, first: Poses, camera: Calibrated, s: Sightings, landmarks: Float, size: int) -> Linearised:
     R_BC, p_BC, offset_s, readout_s = camera
     seen, xy, velocity, to_px, sigma, cauchy, on_sphere, shutter = s
     rolling = readout_s != 0.0

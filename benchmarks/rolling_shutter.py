@@ -1,0 +1,139 @@
+"""A rolling shutter of 30 ms against a global one: the same rendered flights, the readout told, hidden and estimated.
+
+    python benchmarks/rolling_shutter.py [--record] [--backend NAME] [--recordings FOLDER]
+
+Target. With the readout told, ATE at most 1.15 times that with a global shutter; estimated from a wrong value (0 and
+15 ms) it ends within 2 ms of the truth. Points are followed once a recording; a back-end, which initialises itself, is
+flown from starts two seconds apart. The pieces overlap, so their spread is not that of independent flights.
+"""
+
+import os
+from collections.abc import Iterator
+from contextlib import ExitStack
+from dataclasses import replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import click
+import numpy as np
+from common import benchmark, present
+
+from vioframe.bench import Row, backend_row, run_backend
+from vioframe.frontend import Frontend, FrontendOptions
+from vioframe.incidents import Incidents
+from vioframe.io.synchronise import synchronise
+from vioframe.odometry import limited_threads
+from vioframe.parts import config as configuration
+from vioframe.parts import registry
+from vioframe.parts.config import Config, PartConfig
+from vioframe.parts.registry import FLIGHT, Registry
+from vioframe.simulation import TrackSequence
+from vioframe.simulation.config import SimulationConfig, complete
+from vioframe.simulation.record import record
+from vioframe.simulation.recording import SimulatedRecording
+from vioframe.types import NS_PER_S
+
+FLIGHTS_S = {"figure_eight": 30.0, "aggressive": 20.0}
+READOUT_MS = 30.0
+PIECE_S, EVERY_S = 12.0, 2.0
+# What the shutter is, what the back-end is told of it, both ms, and whether it estimates it.
+CASES = {
+    "global": (0.0, 0.0, False),
+    "rolling, told": (READOUT_MS, READOUT_MS, False),
+    "rolling, not told": (READOUT_MS, 0.0, False),
+    "rolling, estimated from 0 ms": (READOUT_MS, 0.0, True),
+    "rolling, estimated from 15 ms": (READOUT_MS, 15.0, True),
+}
+COLUMNS = {
+    "flight": "",
+    "shutter": "",
+    "start_s": ".0f",
+    "initialised_s": ".2f",
+    "completion": ".1%",
+    "resets": "d",
+    "ate_m": ".4f",
+    "scale": ".4f",
+    "readout_ms": ".2f",
+    "readout_sigma_ms": ".2f",
+    "cpu_ms": ".2f",
+}
+
+
+@benchmark
+@click.option(
+    "--recordings",
+    type=click.Path(file_okay=False, path_type=Path),
+    help="Folder of the recordings, FLIGHT_READOUT.bag; made there where missing.  [default: none is kept]",
+)
+def main(data: Path, backend: str, assignments: tuple[str, ...], keep: bool, recordings: Path | None) -> None:
+    """Rendered flights with a global and a rolling shutter."""
+    installed = registry.load()
+    config = configuration.override(Config(backend=PartConfig(name=backend)), installed, assignments)
+
+    def rows() -> Iterator[Row]:
+        with ExitStack() as stack:
+            folder = recordings or Path(stack.enter_context(TemporaryDirectory()))
+            folder.mkdir(parents=True, exist_ok=True)
+            for flight, duration_s in FLIGHTS_S.items():
+                seen = {ms: tracked(rendered(folder, flight, duration_s, ms, installed)) for ms in (0.0, READOUT_MS)}
+                for shutter, (true_ms, told_ms, estimate) in CASES.items():
+                    for start_s in np.arange(0.0, duration_s - PIECE_S + 0.5 * EVERY_S, EVERY_S).tolist():
+                        sequence = piece(seen[true_ms], start_s, 1e-3 * told_ms)
+                        options = {**config.backend.options, "calibrate_readout": estimate}
+                        estimator = installed.create_backend(backend, options)
+                        with limited_threads():
+                            run = run_backend(sequence, estimator, config.estimation_options)
+                        row = {"flight": flight, "shutter": shutter, "start_s": start_s, **backend_row(sequence, run)}
+                        learned = run.estimates[-1].calibration
+                        if learned is not None:
+                            row["readout_ms"] = 1e3 * learned.calibration.cameras[0].readout_s
+                            row["readout_sigma_ms"] = 1e3 * learned.sigma[0].readout_s
+                        yield row
+
+    settings = {
+        "backend": backend,
+        "options": list(assignments),
+        "readout_ms": READOUT_MS,
+        "piece_s": PIECE_S,
+        "every_s": EVERY_S,
+        "flights_s": FLIGHTS_S,
+    }
+    present("rolling_shutter", f"{backend}: rolling shutter of {READOUT_MS:g} ms", rows(), COLUMNS, settings, keep)
+
+
+def rendered(folder: Path, flight: str, duration_s: float, readout_ms: float, installed: Registry) -> Path:
+    """The recording of a flight, made where it is missing."""
+    bag = folder / f"{flight}_{readout_ms:g}.bag"
+    if not bag.exists():
+        config = SimulationConfig(
+            flight=PartConfig(name=installed.find(FLIGHT, flight).name), duration_s=duration_s, readout_ms=readout_ms
+        )
+        record(SimulatedRecording(complete(config, installed), installed, os.cpu_count() or 1), [bag])
+    return bag
+
+
+def tracked(bag: Path) -> TrackSequence:
+    """What the front-end, with its defaults, follows in a recording."""
+    installed = registry.load()
+    dataset = installed.open_dataset(bag)
+    calibration, incidents = dataset.calibration, Incidents()
+    frontend = Frontend(installed.create_detector("shi_tomasi"), calibration, FrontendOptions(), incidents)
+    with limited_threads():
+        packets = tuple(
+            (imu, frontend.track(imu, frames, calibration))
+            for imu, frames in synchronise(dataset.measurements(), incidents=incidents)
+        )
+    assert dataset.ground_truth is not None
+    return TrackSequence(bag.stem, calibration, packets, dataset.ground_truth)
+
+
+def piece(sequence: TrackSequence, start_s: float, told_s: float) -> TrackSequence:
+    """``PIECE_S`` seconds from ``start_s`` on, of a camera whose readout is said to be ``told_s``."""
+    begin_ns = sequence.packets[0][1].t_ns + round(start_s * NS_PER_S)
+    end_ns = begin_ns + round(PIECE_S * NS_PER_S)
+    packets = tuple(packet for packet in sequence.packets if begin_ns <= packet[1].t_ns <= end_ns)
+    return replace(sequence, packets=packets, calibration=sequence.calibration.with_camera(0, readout_s=told_s))
+
+
+if __name__ == "__main__":
+    main()
