@@ -22,7 +22,7 @@ from vioframe.report.units import length
 HERE = Path(__file__).resolve().parent
 ROOT = HERE.parent
 _DOCS = ROOT / "docs"
-PAGES = (ROOT / "README.md", HERE / "README.md", _DOCS / "keypointnet.md", _DOCS / "montecarlo.md")
+PAGES = (ROOT / "README.md", HERE / "README.md", *(_DOCS / f"{name}.md" for name in ("data", "keypointnet", "montecarlo")))
 BLOCK = re.compile(r"(<!-- figures: (\w+) -->\n).*?(<!-- end -->)", re.DOTALL)
 _RENDERED = "MH_05_difficult"
 
@@ -148,6 +148,28 @@ def april() -> str:
         }
         for row in rows.itertuples()
     ]
+    return markdown(shown) + source(rows)
+
+
+def rolling_shutter() -> str:
+    """ATE with a rolling shutter over that with a global one, and the readout that was estimated."""
+    rows = recorded("rolling_shutter_*.json")
+    shown = []
+    for (flight, backend), own in rows.groupby(["flight", "backend"], sort=False):
+        still = own[own["shutter"] == "global"]
+        for shutter, found in own.groupby("shutter", sort=False):
+            told = found["readout_ms"]
+            shown.append(
+                {
+                    "flight": flight,
+                    "back-end": f"`{backend}`",
+                    "shutter": str(shutter),
+                    "ATE": _ate(found),
+                    "times that of the global shutter": f"{found['ate_m'].mean() / still['ate_m'].mean():.2f}",
+                    "resets": f"{found['resets'].sum()}",
+                    "readout": f"{told.mean():.1f} ± {told.std():.1f} ms" if "estimated" in str(shutter) else "-",
+                }
+            )
     return markdown(shown) + source(rows)
 
 
@@ -323,7 +345,7 @@ FIGURES: dict[str, Callable[[], str]] = {
     make.__name__: make
     for make in (
         *(headline, real_images, stages, at_rest, landmarks, rendered, april, frontend, consistency, memory, push),
-        *(speed, quality, clean, comparison, stress, throughput),
+        *(speed, quality, clean, comparison, stress, throughput, rolling_shutter),
     )
 }
 
