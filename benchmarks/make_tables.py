@@ -22,7 +22,11 @@ from vioframe.report.units import length
 HERE = Path(__file__).resolve().parent
 ROOT = HERE.parent
 _DOCS = ROOT / "docs"
-PAGES = (ROOT / "README.md", HERE / "README.md", *(_DOCS / f"{name}.md" for name in ("data", "keypointnet", "montecarlo")))
+PAGES = (
+    ROOT / "README.md",
+    HERE / "README.md",
+    *(_DOCS / name for name in ("data.md", "keypointnet.md", "montecarlo.md")),
+)
 BLOCK = re.compile(r"(<!-- figures: (\w+) -->\n).*?(<!-- end -->)", re.DOTALL)
 _RENDERED = "MH_05_difficult"
 
