@@ -2,9 +2,9 @@
 
     python benchmarks/rolling_shutter.py [--record] [--backend NAME] [--recordings FOLDER]
 
-Target. With the readout told, ATE at most 1.15 times that with a global shutter; estimated from zero it ends within 2 ms of
-the truth. Points are followed once a recording; a back-end, which initialises itself, is flown from starts four seconds
-apart. The pieces overlap, so their spread is not that of independent flights.
+Target. With the readout told, ATE at most 1.15 times that with a global shutter; estimated from zero it ends within
+2 ms of the truth. Points are followed once a recording; a back-end, which initialises itself, is flown from starts four
+seconds apart. The pieces overlap, so their spread is not that of independent flights.
 """
 
 import os
