@@ -25,7 +25,7 @@ _DOCS = ROOT / "docs"
 PAGES = (
     ROOT / "README.md",
     HERE / "README.md",
-    *(_DOCS / f"{name}.md" for name in ("data", "keypointnet", "montecarlo")),
+    *(_DOCS / name for name in ("data.md", "keypointnet.md", "montecarlo.md")),
 )
 BLOCK = re.compile(r"(<!-- figures: (\w+) -->\n).*?(<!-- end -->)", re.DOTALL)
 _RENDERED = "MH_05_difficult"
@@ -160,18 +160,19 @@ def rolling_shutter() -> str:
     rows = recorded("rolling_shutter_*.json")
     shown = []
     for (flight, backend), own in rows.groupby(["flight", "backend"], sort=False):
-        still = own[own["shutter"] == "global"]
+        still = own[own["shutter"] == "global"]["ate_m"].mean()
         for shutter, found in own.groupby("shutter", sort=False):
-            told = found["readout_ms"]
+            begun = found.dropna(subset=["ate_m"])
+            readout = begun["readout_ms"] if "estimated" in str(shutter) else begun["readout_ms"].head(0)
             shown.append(
                 {
                     "flight": flight,
                     "back-end": f"`{backend}`",
                     "shutter": str(shutter),
-                    "ATE": _ate(found),
-                    "times that of the global shutter": f"{found['ate_m'].mean() / still['ate_m'].mean():.2f}",
-                    "resets": f"{found['resets'].sum()}",
-                    "readout": f"{told.mean():.1f} ± {told.std():.1f} ms" if "estimated" in str(shutter) else "-",
+                    "begun": f"{len(begun)} of {len(found)}",
+                    "ATE": _ate(begun) if len(begun) else "-",
+                    "times that of the global shutter": _number(begun["ate_m"].mean() / still, ".2f"),
+                    "readout": _range(readout, ".1f", "ms") if len(readout) else "-",
                 }
             )
     return markdown(shown) + source(rows)

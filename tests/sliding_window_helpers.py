@@ -63,9 +63,8 @@ def flown_window(
         imu = join_segments([imu for imu, _ in sequence.packets[k + 1 : k + 6]])
         biases = np.zeros((2, 3)) if exact else rng.normal(size=(2, 3)) * [[0.002], [0.02]]
         readings.append(preintegrate(imu, *biases, sequence.calibration.imu))
-    calibrated = Calibrated(
-        sequence.calibration.cameras[0].R_BC, sequence.calibration.cameras[0].p_BC, offset_s, readout_s
-    )
+    on_body = sequence.calibration.cameras[0]
+    calibrated = Calibrated(on_body.R_BC, on_body.p_BC, offset_s, readout_s)
     sightings, points = _sightings(states, calibrated, camera, landmarks, noise_px, on_sphere, rng)
     x = Variables(states, calibrated, points)
     prior = prior_on(x, 2, rng)

@@ -56,6 +56,8 @@ _LARGEST = 1e30
 _LONGEST_SHIFT_S = 9e9  # an integer of nanoseconds holds no more
 _Positive = Annotated[float, Field(gt=0.0, lt=_LARGEST)]
 _Shift = Annotated[float, Field(gt=-_LONGEST_SHIFT_S, lt=_LONGEST_SHIFT_S)]
+# No shutter takes a second; who writes milliseconds is told.
+_Readout = Annotated[float, Field(gt=-1.0, lt=1.0)]
 # VINS-Mono's file does not state the rate its noise parameters belong to; this is the one they were tuned for.
 _VINS_MONO_RATE_HZ = 200.0
 
