@@ -34,7 +34,10 @@ def adjustment(window: Window, imu: list[Preintegrated], x: Variables, camera: C
     ``sigma`` (7,) is how well the pose of ``camera`` on the body and its time offset are known.
     """
     seen = np.ascontiguousarray(window.seen.T)
-    xy = np.ascontiguousarray(np.where(seen[..., None], np.swapaxes(window.xy, 0, 1), 0.0))
+    xy = window.xy
+    if camera.readout_s:
+        xy = camera.model.undistort(window.xy_px.reshape(-1, 2)).reshape(xy.shape)
+    xy = np.ascontiguousarray(np.where(seen[..., None], np.swapaxes(xy, 0, 1), 0.0))
     to_px = np.tile(camera.model.focal_px * np.eye(2), (*seen.shape, 1, 1))
     gyro_B = np.stack([imu[0].imu.gyro_B[0], *(m.imu.gyro_B[-1] for m in imu)])
     velocity = image_velocities(x.states, x.camera, gyro_B, seen.argmax(axis=1), x.landmarks)

@@ -16,6 +16,7 @@ from vioframe.estimation.initialization.window import (
     Packet,
     RefusalError,
     UnsureError,
+    unrolled,
 )
 from vioframe.types import NS_PER_S, Calibration, CameraSigma, FrameTracks, ImuNoise, ImuSegment
 
@@ -103,7 +104,7 @@ class Initializer:
         if imu.largest_gap_s > LARGEST_IMU_GAP_S:
             self.reset()
             _log.info("no readings for %.2f s: begun anew", imu.largest_gap_s)
-        tracks = tracks.finite()
+        tracks = unrolled(tracks.finite(), self._calibration.cameras[0], imu.gyro_B[-1])
         self._readings.add(imu)
         self._waiting.append(tracks)
         self._sensors.add(tracks, self._calibration.cameras[0].model)

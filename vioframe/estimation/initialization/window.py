@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import Literal
 
@@ -12,7 +12,8 @@ import numpy as np
 from vioframe.arrays import Bool
 from vioframe.estimation.factors.tracks import TrackTable
 from vioframe.estimation.inertial.preintegration import join_segments
-from vioframe.types import Float, FrameTracks, ImuSegment, Int, NavState
+from vioframe.geometry import so3
+from vioframe.types import CameraOnBody, Float, FrameTracks, ImuSegment, Int, NavState
 
 Packet = tuple[ImuSegment, FrameTracks]
 
@@ -57,8 +58,8 @@ def refuse_unless(good: object, why: str) -> None:
 class Window:
     """K keyframes, the readings between them, and L tracks.
 
-    ``t_ns`` (K,), ``segments`` K - 1, ``ids`` (L,). ``xy`` (K, L, 2) are points on the z = 1 plane, NaN where ``seen``
-    (K, L) is False; ``xy_px`` (K, L, 2) the pixels.
+    ``t_ns`` (K,), ``segments`` K - 1, ``ids`` (L,). ``xy`` (K, L, 2) are points on the z = 1 plane, as :func:`unrolled`
+    leaves them, NaN where ``seen`` (K, L) is False; ``xy_px`` (K, L, 2) the pixels.
     """
 
     t_ns: Int
@@ -77,6 +78,19 @@ class Window:
     def without_last(self) -> Window:
         """The same tracks without the newest keyframe."""
         return Window(self.t_ns[:-1], self.segments[:-1], self.ids, self.xy[:-1], self.seen[:-1], self.xy_px[:-1])
+
+
+def unrolled(tracks: FrameTracks, camera: CameraOnBody, rate_B: Float) -> FrameTracks:
+    """``tracks`` as they were at the frame's stamp, but for the way flown meanwhile; ``rate_B`` (3,) rad/s turns them.
+
+    With a global shutter, or a camera of which nobody knows how it is turned, they are left as they are.
+    """
+    if not camera.readout_s or not camera.rotation_known:
+        return tracks
+    late_s = camera.readout_s * camera.row(tracks.xy[:, 1])
+    rays = np.column_stack([tracks.xy_normalised, np.ones(len(tracks.ids))])
+    turned = (so3.exp(late_s[:, None] * (rate_B @ camera.R_BC)) @ rays[..., None])[..., 0]
+    return replace(tracks, xy_normalised=turned[:, :2] / turned[:, 2:])
 
 
 def build_window(packets: Sequence[Packet], chosen: Sequence[int], min_views: int, max_landmarks: int) -> Window:
