@@ -211,10 +211,6 @@ def _numbers(*counts: int) -> PlainValidator:
     return PlainValidator(read)
 
 
-# No shutter takes a second; who writes milliseconds is told.
-_Readout = Annotated[FiniteFloat, Field(gt=-1.0, lt=1.0)]
-
-
 class _PinholeCamera(BaseModel):
     """A camera of EuRoC's (``T_BS``), of Kalibr's or of OpenVINS' (``T_cam_imu``, ``T_imu_cam``)."""
 
