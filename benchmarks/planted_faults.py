@@ -35,7 +35,7 @@ from vioframe.simulation.config import SimulationConfig, complete
 from vioframe.simulation.recording import SimulatedRecording
 from vioframe.types import Calibration, FrameSet, ImuSample, Measurement, g_W
 
-COLUMNS = {"fault": "", "recording": "", "right": "", "first": "", "then": "", "seconds": ".1f"}
+COLUMNS = {"fault": "", "recording": "", "right": "", "kind": "", "then": "", "seconds": ".1f"}
 _SEED, _DURATION_S = 40, 10.0
 _FISHEYE = Camera(290.0, 290.0, 367.2, 248.4, (-0.0076, 0.0216, -0.0280, 0.0127), (752, 480), "equidistant")
 
@@ -304,6 +304,7 @@ def row(fault: str, recording: str, right: set[str], flight: Flight) -> Row:
         "fault": fault,
         "recording": recording,
         "right": "yes" if good else "NO",
+        "kind": kinds[0] if kinds else "nothing",
         "first": str(found.findings[0]) if kinds else "",
         "then": ", ".join(kinds[1:]),
         "seconds": process_time() - begin_s,

@@ -14,7 +14,7 @@ from rich.table import Table
 from rich.text import Text
 
 from vioframe.cli import EXIT_FAILED
-from vioframe.cli.common import FILE, Bar, calibration_option, print_table
+from vioframe.cli.common import FILE, Bar, PartName, calibration_option, print_table
 from vioframe.diagnosis import Certainty, Diagnosis, Finding, Severity, diagnose, gather
 from vioframe.diagnosis.images import wrong_size
 from vioframe.errors import ConfigError, DatasetError, ImageSizeError
@@ -32,7 +32,7 @@ _COLOURS = {Severity.WRONG: "bold red", Severity.WORTH_KNOWING: "yellow"}
 @click.command("check")
 @click.argument("target", metavar="DATA|NAME")
 @calibration_option
-@click.option("--reader", metavar="NAME", help="Data-set reader, where several accept DATA.")
+@click.option("--reader", type=PartName("DATASET"), help="Data-set reader, where several accept DATA.")
 @click.option("--camera", metavar="NAME", help="Camera to look at.  [default: the first]")
 @click.option("--start", "start_s", type=float, default=0.0, metavar="S", help="Skip the first S seconds.")
 @click.option("--duration", "duration_s", type=float, metavar="S", help="Stop after S seconds.")

@@ -76,7 +76,7 @@ def look_at_geometry(recording: Recording) -> Geometry:
     pairs = Pairs(recording.stretches, imu, 0.1 + abs(coarse.offset_s))
     if len(pairs) < _FEWEST_PAIRS:
         return Geometry(tuple(findings))
-    start = start_at(camera.model, so3.project(coarse.M), coarse.bias_gyro_B / factor, coarse.offset_s)
+    start = start_at(camera, so3.project(coarse.M), coarse.bias_gyro_B / factor, coarse.offset_s)
     found = pairs.calibrate(start, _ALL)
     lens = _lens(found, camera.model, pairs)
     if lens is not None and lens.figures["bend_px"] > _BEND_PX_OF_ANOTHER:
@@ -91,7 +91,7 @@ def look_at_geometry(recording: Recording) -> Geometry:
     findings += _rotation(found, camera, imu)
     findings += _offset(found, camera)
     findings += _drift(found, pairs)
-    findings += _shutter(found)
+    findings += _shutter(found, camera)
     return Geometry(tuple(findings), found)
 
 
@@ -246,7 +246,7 @@ def _with_other_model(
     coarse = _coarse(seen, camera, imu)
     if coarse is None or coarse.mirrored:
         return None
-    return pairs.calibrate(start_at(camera.model, coarse.M, coarse.bias_gyro_B, coarse.offset_s), _ALL)
+    return pairs.calibrate(start_at(camera, coarse.M, coarse.bias_gyro_B, coarse.offset_s), _ALL)
 
 
 def _as_other_model(given: Camera) -> Finding:
@@ -277,15 +277,15 @@ def _focal(found: Calibrated, given: Camera, pairs: Pairs) -> Finding | None:
     )
 
 
-def _shutter(found: Calibrated) -> Iterator[Finding]:
-    sigma = found.sigma(READOUT)
-    if abs(found.readout_s) > max(_READOUT_S, _SIGMAS * sigma) and abs(found.readout_s) < _LONGEST_READOUT_S:
+def _shutter(found: Calibrated, camera: CameraOnBody) -> Iterator[Finding]:
+    off, sigma = abs(found.readout_s - camera.readout_s), found.sigma(READOUT)
+    if off > max(_READOUT_S, _SIGMAS * sigma) and abs(found.readout_s) < _LONGEST_READOUT_S:
         yield Finding(
             "rolling_shutter",
             f"the rows are exposed one after the other: {1e3 * found.readout_s:.0f} ms (+-{1e3 * sigma:.0f}) from the "
-            "first to the last",
-            "use a global shutter if there is one, or move slowly",
-            certainty=Certainty.CERTAIN if abs(found.readout_s) > 2.0 * _SIGMAS * sigma else Certainty.LIKELY,
+            f"first to the last, {1e3 * camera.readout_s:.0f} ms are given",
+            f"`readout_time: {found.readout_s:.4f}` in the camera's calibration",
+            certainty=Certainty.CERTAIN if off > 2.0 * _SIGMAS * sigma else Certainty.LIKELY,
             figures={"readout_ms": 1e3 * found.readout_s, "sigma_ms": 1e3 * sigma},
         )
 

@@ -17,7 +17,7 @@ from vioframe.diagnosis.recording import Readings
 from vioframe.geometry import kernels, so3
 from vioframe.geometry.cameras import Camera
 from vioframe.jit import kernel
-from vioframe.types import NS_PER_S, Float, FrameTracks, Int
+from vioframe.types import NS_PER_S, CameraOnBody, Float, FrameTracks, Int
 
 BIAS, ROTATION, OFFSET, FOCAL, DISTORTION, READOUT = (
     slice(0, 3),
@@ -44,7 +44,7 @@ _SETTLED = 1e-3
 class Calibrated:
     """``camera``, ``R_BC`` (3, 3), offset and readout s, bias (3,) rad/s; ``cov`` (11, 11), ``cost`` and the misfit px.
 
-    ``cov`` is in the order of the slices of this module; ``share_off`` is that of tracks beyond the robust scale.
+    ``log_focal`` is that of the focal length over the one begun with; ``cov`` is in the order of the module's slices.
     """
 
     camera: Camera
@@ -198,8 +198,10 @@ class Pairs:
         return r, n @ tangent / scale[..., None] * usable[..., None]
 
 
-def start_at(camera: Camera, R_BC: Float, bias_gyro_B: Float, offset_s: float) -> Calibrated:
-    return Calibrated(camera, R_BC, bias_gyro_B, offset_s, 0.0, 0.0, np.zeros((_SIZE, _SIZE)), np.inf, np.inf)
+def start_at(camera: CameraOnBody, R_BC: Float, bias_gyro_B: Float, offset_s: float) -> Calibrated:
+    """With the lens and the readout of ``camera``."""
+    cov = np.zeros((_SIZE, _SIZE))
+    return Calibrated(camera.model, R_BC, bias_gyro_B, offset_s, camera.readout_s, 0.0, cov, np.inf, np.inf)
 
 
 def _moved(start: Calibrated, x: Float) -> Calibrated:
