@@ -19,8 +19,8 @@ _HEAD = """\
 
 <!-- Written by docs/make_cli_reference.py; change the help texts in the code and run it again. -->
 
-Bad input ends with one line on stderr and exit code 2, a `run` that never initialised and a `check` that found something wrong with
-1, Ctrl-C with 130, SIGTERM with 143; `--debug` shows a traceback.
+Bad input ends with one line on stderr and exit code 2, Ctrl-C with 130, SIGTERM with 143; `--debug` shows a traceback.
+A `run` that never initialised and a `check` that found something wrong end with 1.
 
 The shell completes commands, options and the names of parts with this line in its start-up file (or with `zsh_source`):
 `eval "$(_VIOFRAME_COMPLETE=bash_source vioframe)"`.
