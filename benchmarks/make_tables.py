@@ -25,7 +25,7 @@ _DOCS = ROOT / "docs"
 PAGES = (
     ROOT / "README.md",
     HERE / "README.md",
-    *(_DOCS / name for name in ("data.md", "keypointnet.md", "montecarlo.md")),
+    *(_DOCS / name for name in ("check.md", "data.md", "keypointnet.md", "montecarlo.md")),
 )
 BLOCK = re.compile(r"(<!-- figures: (\w+) -->\n).*?(<!-- end -->)", re.DOTALL)
 _RENDERED = "MH_05_difficult"
@@ -83,6 +83,22 @@ def stages() -> str:
         for stage, values in table.T.iterrows()
     ]
     return markdown(shown) + source(rows)
+
+
+def planted_faults() -> str:
+    """What is found first where a fault is planted, and that nothing is called wrong where there is none."""
+    rows = recorded("planted_faults.json")
+    bad, good = rows[rows["fault"] != "none"], rows[rows["fault"] == "none"]
+    shown = [
+        {"planted": row.fault, "into": row.recording, "found first": f"`{row.kind}`", "right": row.right}
+        for row in bad.itertuples()
+    ]
+    told = (
+        f"\nThe right cause is named first in {(bad['right'] == 'yes').sum()} of {len(bad)}; in "
+        f"{(good['right'] == 'yes').sum()} of {len(good)} recordings without a fault nothing is called wrong "
+        f"({', '.join(good['recording'])}).\n"
+    )
+    return markdown(shown) + told + source(rows)
 
 
 def at_rest() -> str:
@@ -350,7 +366,7 @@ FIGURES: dict[str, Callable[[], str]] = {
     make.__name__: make
     for make in (
         *(headline, real_images, stages, at_rest, landmarks, rendered, april, frontend, consistency, memory, push),
-        *(speed, quality, clean, comparison, stress, throughput, rolling_shutter),
+        *(speed, quality, clean, comparison, stress, throughput, rolling_shutter, planted_faults),
     )
 }
 
@@ -387,7 +403,9 @@ def suite_source(name: str) -> str:
     return f"\nFrom `{name}/` ({', '.join(commits)}) in `benchmarks/results`.\n"
 
 
-def _revision(commit: str) -> str:
+def _revision(commit: str | None) -> str:
+    if commit is None:  # made outside of a checkout
+        return "revision not recorded"
     revision, _, dirty = commit.partition("-")
     return revision[:8] + (" with changes" if dirty else "")
 
