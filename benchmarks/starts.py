@@ -40,7 +40,7 @@ FAULTS += ("rotation 10 deg", "rotation 90 deg", "focal +10 %", "focal -10 %")
 _AXIS = np.array([0.6, 0.64, 0.48])
 _LOOKED_AT_S, _RESET_S, _SCALE_S = 8.0, 10.0, 2.0
 # Motion is sufficient once a body has, within 1.5 s, gone so far, changed its velocity and turned by so much (rms).
-_WITHIN_S, _GONE_M, _CHANGED_M_S, _TURNED_RAD = 1.5, 0.15, 0.15, np.deg2rad(3.0)
+_WITHIN_S, _GONE_M, _CHANGED_M_S, _TURNED_RAD = 1.5, 0.1, 0.08, np.deg2rad(1.0)
 COLUMNS = {
     "recording": "",
     "fault": "",
@@ -206,7 +206,7 @@ def scale_of(states: list[NavState], truth: Trajectory) -> float | None:
         return None
     stamps, R, p = (np.array([getattr(s, name) for s in part]) for name in ("t_ns", "R_WB", "p_WB"))
     try:
-        return float(evaluate(Trajectory(stamps, R, p), truth).scale)
+        return evaluate(Trajectory(stamps, R, p), truth).scale
     except TrajectoryError:
         return None
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from vioframe.arrays import Bool, Float
-from vioframe.geometry import kernels
+from vioframe.geometry import kernels, so3
 from vioframe.jit import kernel
 from vioframe.types import FrameTracks
 
@@ -48,7 +48,9 @@ def turn_between(before: FrameTracks, now: FrameTracks, sigma: float) -> Turn | 
         return None
     some = np.linspace(0, len(i) - 1, min(len(i), _MOST_TRACKS)).astype(np.int64)
     f, g = _rays(before.xy_normalised[i[some]]), _rays(now.xy_normalised[j[some]])
-    R, H, b, misfit = _turn(f, g, sigma, _STAGES)
+    # To begin with, the rotation that explains it best without moving.
+    u, v = (rays / np.linalg.norm(rays, axis=1, keepdims=True) for rays in (f, g))
+    R, H, b, misfit = _turn(f, g, so3.project(u.T @ v), sigma, _STAGES)
     return Turn((before.t_ns, now.t_ns), R, H, b, misfit)
 
 
@@ -57,36 +59,25 @@ def _rays(xy: Float) -> Float:
 
 
 @kernel
-def _turn(f: Float, g: Float, sigma: float, stages: Float) -> tuple[Float, Float, Float, float]:
-    """R_C1C2, equations of [dtheta, dlog f] there, and the typical misfit; f and g (N, 3) on the z = 1 plane."""
-    # To begin with, the rotation that explains it best without moving.
-    M = np.zeros((3, 3))
-    for k in range(len(f)):
-        u = f[k] / math.sqrt(f[k] @ f[k])
-        v = g[k] / math.sqrt(g[k] @ g[k])
-        for a in range(3):
-            for c in range(3):
-                M[a, c] += u[a] * v[c]
-    U, _, Vt = np.linalg.svd(M)
-    if np.linalg.det(U @ Vt) < 0.0:
-        U[:, 2] = -U[:, 2]
-    R = U @ Vt
-    weight = np.ones(len(f))
+def _turn(f: Float, g: Float, R: Float, sigma: float, stages: Float) -> tuple[Float, Float, Float, float]:
+    """From ``R`` to R_C1C2, equations of [dtheta, dlog f] there, and the typical misfit; f, g (N, 3) with z = 1."""
+    weight, common = np.ones(len(f)), np.ones(len(f), dtype=np.bool_)
     H, b, distance = np.zeros((4, 4)), np.zeros(4), np.zeros(len(f))
     for s in range(len(stages)):
         for _ in range(int(stages[s, 0])):
-            linearise_pair(f, g, len(f), R, weight, sigma, stages[s, 1], H, b, distance)
+            linearise_pair(f, g, common, R, weight, sigma, stages[s, 1], H, b, distance)
             A = H[:3, :3].copy()
             for a in range(3):
                 A[a, a] += 1.0 / (_PRIOR * _PRIOR)
-            step = -np.linalg.solve(A, b[:3])
+            L = _inverse_cholesky(A)
+            step = -(L.T @ (L @ b[:3]))
             length = math.sqrt(step @ step)
             if length > _LARGEST_STEP:
                 step *= _LARGEST_STEP / length
-            R = R @ kernels.exp(step)  # type: ignore[arg-type]
+            R = R @ kernels.exp(step)
             if length < _SETTLED:
                 break
-    linearise_pair(f, g, len(f), R, weight, sigma, stages[-1, 1], H, b, distance)
+    linearise_pair(f, g, common, R, weight, sigma, stages[-1, 1], H, b, distance)
     return R, H, b, np.median(distance)
 
 
@@ -98,14 +89,9 @@ def linearise_pairs(
 
     ``weight`` (P, N) and ``distance`` are filled in where there is a track.
     """
-    count = len(f)
-    H, b = np.zeros((count, 4, 4)), np.zeros((count, 4))
-    for p in range(count):
-        rows = np.flatnonzero(common[p])
-        w, d = weight[p][rows], np.empty(len(rows))
-        linearise_pair(f[p][rows], g[p][rows], len(rows), R_C1C2[p], w, sigma, cauchy, H[p], b[p], d)
-        for k in range(len(rows)):
-            weight[p, rows[k]], distance[p, rows[k]] = w[k], d[k]
+    H, b = np.zeros((len(f), 4, 4)), np.zeros((len(f), 4))
+    for p in range(len(f)):
+        linearise_pair(f[p], g[p], common[p], R_C1C2[p], weight[p], sigma, cauchy, H[p], b[p], distance[p])
     return H, b
 
 
@@ -113,7 +99,7 @@ def linearise_pairs(
 def linearise_pair(
     f: Float,
     g: Float,
-    count: int,
+    common: Bool,
     R: Float,
     weight: Float,
     sigma: float,
@@ -125,12 +111,15 @@ def linearise_pair(
     """Gauss-Newton equations ``H`` (4, 4), ``b`` (4,) of [dtheta, dlog f] for the rotation ``R`` = R_C1C2 of a pair.
 
     The translation is the direction that the normals, weighed by ``weight`` (N,), are most perpendicular to, and is
-    eliminated. ``weight`` becomes that of the next call, ``distance`` (N,) each track's from its epipolar line, in
-    standard deviations. ``cauchy`` is the scale of the robust loss in standard deviations.
+    eliminated. Of the bearings (N, 3) those count that are ``common`` (N,). ``weight`` becomes that of the next call,
+    ``distance`` (N,) each track's from its epipolar line, in standard deviations, in which ``cauchy``, the scale of the
+    robust loss, is too.
     """
     N = np.zeros((3, 3))
     S_y, S_f = np.zeros((3, 3)), np.zeros((3, 3))
-    for k in range(count):
+    for k in range(len(f)):
+        if not common[k]:
+            continue
         w = weight[k]
         y0 = R[0, 0] * g[k, 0] + R[0, 1] * g[k, 1] + R[0, 2] * g[k, 2]
         y1 = R[1, 0] * g[k, 0] + R[1, 1] * g[k, 1] + R[1, 2] * g[k, 2]
@@ -158,7 +147,9 @@ def linearise_pair(
     E = np.zeros((6, 6))
     e = np.zeros(6)
     J = np.empty(6)
-    for k in range(count):
+    for k in range(len(f)):
+        if not common[k]:
+            continue
         g0, g1, g2 = g[k, 0], g[k, 1], g[k, 2]
         y0 = R[0, 0] * g0 + R[0, 1] * g1 + R[0, 2] * g2
         y1 = R[1, 0] * g0 + R[1, 1] * g1 + R[1, 2] * g2
@@ -226,7 +217,47 @@ def likeliest_translation(N: Float, S_y: Float, S_f: Float, R: Float) -> Float:
     trace = noise[0, 0] + noise[1, 1] + noise[2, 2]
     for k in range(3):
         noise[k, k] += 1e-6 * trace
-    W = np.linalg.inv(np.linalg.cholesky(noise))
-    t = W.T @ np.ascontiguousarray(np.linalg.eigh(W @ N @ W.T)[1][:, 0])
+    W = _inverse_cholesky(noise)
+    t = W.T @ _least_eigenvector(W @ N @ W.T)
     out: Float = t / math.sqrt(t @ t)
     return out
+
+
+@kernel
+def _inverse_cholesky(A: Float) -> Float:
+    """The inverse of the lower Cholesky factor of a positive definite A (3, 3)."""
+    l00 = math.sqrt(A[0, 0])
+    l10, l20 = A[1, 0] / l00, A[2, 0] / l00
+    l11 = math.sqrt(A[1, 1] - l10 * l10)
+    l21 = (A[2, 1] - l20 * l10) / l11
+    l22 = math.sqrt(A[2, 2] - l20 * l20 - l21 * l21)
+    out = np.zeros((3, 3))
+    out[0, 0], out[1, 1], out[2, 2] = 1.0 / l00, 1.0 / l11, 1.0 / l22
+    out[1, 0], out[2, 1] = -l10 * out[0, 0] * out[1, 1], -l21 * out[1, 1] * out[2, 2]
+    out[2, 0] = -(l20 * out[0, 0] + l21 * out[1, 0]) * out[2, 2]
+    return out
+
+
+@kernel
+def _least_eigenvector(A: Float) -> Float:
+    """(3,) of the least eigenvalue of a symmetric A (3, 3), by Jacobi's rotations (Golub, Van Loan, 8.5)."""
+    A, V = A.copy(), np.eye(3)
+    for _ in range(6):
+        for p, q in ((0, 1), (0, 2), (1, 2)):
+            if A[p, q] == 0.0:
+                continue
+            tau = (A[q, q] - A[p, p]) / (2.0 * A[p, q])
+            t = (1.0 if tau >= 0.0 else -1.0) / (abs(tau) + math.sqrt(1.0 + tau * tau))
+            c = 1.0 / math.sqrt(1.0 + t * t)
+            s = t * c
+            for k in range(3):
+                A[k, p], A[k, q] = c * A[k, p] - s * A[k, q], s * A[k, p] + c * A[k, q]
+            for k in range(3):
+                A[p, k], A[q, k] = c * A[p, k] - s * A[q, k], s * A[p, k] + c * A[q, k]
+            for k in range(3):
+                V[k, p], V[k, q] = c * V[k, p] - s * V[k, q], s * V[k, p] + c * V[k, q]
+    best = 0
+    for k in range(1, 3):
+        if A[k, k] < A[best, best]:
+            best = k
+    return V[:, best].copy()

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 
@@ -18,6 +19,7 @@ from vioframe.estimation.factors.landmarks import positions
 from vioframe.estimation.factors.problem import Problem, Variables
 from vioframe.estimation.factors.reprojection import CALIBRATION_SIZE, Calibrated
 from vioframe.estimation.factors.solver import Solution
+from vioframe.estimation.hand_eye import HandEye, Turns
 from vioframe.estimation.inertial.preintegration import Preintegrated, preintegrate
 from vioframe.estimation.initialization.bundle_adjustment import adjusted, adjustment, calibrated, covariance
 from vioframe.estimation.initialization.closed_form import (
@@ -40,9 +42,10 @@ from vioframe.estimation.initialization.window import (
     refuse_unless,
     spread_indices,
 )
+from vioframe.estimation.turns import turn_between
 from vioframe.geometry import so3
 from vioframe.geometry.so3 import level_rotation
-from vioframe.types import DP, DTHETA, DV, Calibration, ImuSegment, NavState, g_W
+from vioframe.types import DP, DTHETA, DV, Calibration, FrameTracks, ImuSegment, NavState, g_W
 
 _MIN_VIEWS = 4
 # Tracks farther off than this are not noise: standard deviations, typical over all views.
@@ -59,6 +62,8 @@ _MAX_INERTIAL = 9.0
 _MAX_BIAS_ACCEL = 4.0 * BIAS_ACCEL_SIGMA
 # Largest standard deviations that are accepted: of scale (relative), velocity on any axis, and gravity's direction.
 _SCALE_SIGMA, _VELOCITY_SIGMA, _TILT_SIGMA_DEG = 0.06, 0.05, 1.0
+# Beyond so many times these the first adjustment is not gone on with.
+_HOPELESS = 1.5
 
 
 def initialise(packets: Sequence[Packet], calibration: Calibration, sigma: Float) -> InitialEstimate:
@@ -83,6 +88,7 @@ def initialise(packets: Sequence[Packet], calibration: Calibration, sigma: Float
     refuse_unless(alignment.scale > 0.0, "the readings contradict the direction of the motion in the images")
     x = _start_of_adjustment(window.without_last(), structure, alignment, calibration)
     problem, solution = _adjusted(window.without_last(), x, calibration, sigma)
+    _check_uncertainty(solution.variables.states.p_WB, covariance(problem, solution.variables), _HOPELESS)
     keep = _explained(problem, solution.variables)
     window = window.only(keep)
     _require(window, "tracks fit the bundle adjustment")
@@ -242,19 +248,19 @@ def _newest(cov: Float) -> Float:
     return cov[-15 - CALIBRATION_SIZE : -CALIBRATION_SIZE, -15 - CALIBRATION_SIZE : -CALIBRATION_SIZE]
 
 
-def _check_uncertainty(p_WB: Float, cov: Float) -> None:
+def _check_uncertainty(p_WB: Float, cov: Float, factor: float = 1.0) -> None:
     """Velocity, gravity's direction and scale must be determined well; ``cov`` is of all states and the calibration.
 
-    ``p_WB`` (K, 3) is the path.
+    ``p_WB`` (K, 3) is the path; the limits are ``factor`` times as wide.
     """
     newest = _newest(cov)
     velocity = float(np.sqrt(np.linalg.eigvalsh(newest[DV, DV])[-1]))
     tilt = float(np.rad2deg(np.sqrt(np.linalg.eigvalsh(newest[DTHETA, DTHETA])[-1])))
     scale = scale_sigma(p_WB, cov)
     for unsure, what in (
-        (velocity > _VELOCITY_SIGMA, f"velocity known to {velocity:.3f} m/s only"),
-        (tilt > _TILT_SIGMA_DEG, f"gravity's direction known to {tilt:.2f} deg only"),
-        (scale > _SCALE_SIGMA, f"scale known to {100.0 * scale:.0f} % only"),
+        (velocity > factor * _VELOCITY_SIGMA, f"velocity known to {velocity:.3f} m/s only"),
+        (tilt > factor * _TILT_SIGMA_DEG, f"gravity's direction known to {tilt:.2f} deg only"),
+        (scale > factor * _SCALE_SIGMA, f"scale known to {100.0 * scale:.0f} % only"),
     ):
         if unsure:
             raise UnsureError(f"{what} (standard deviation)")
@@ -273,14 +279,17 @@ def scale_sigma(p_WB: Float, cov: Float) -> float:
 
 
 def warm_up(calibration: Calibration) -> None:
-    """Compile the kernels of the adjustment, or load them from the cache, so that the first attempt does not wait."""
+    """Compile the kernels of a start, or load them from the cache, so that the first attempt does not wait."""
     t_ns, half_ns = np.arange(4) * 100_000_000, np.arange(3) * 50_000_000
     xy = np.tile(np.random.default_rng(0).uniform(-0.3, 0.3, (20, 2)), (4, 1, 1))
     segments = tuple(ImuSegment(t + half_ns, np.zeros((3, 3)), np.tile(-g_W, (3, 1))) for t in t_ns[:-1])
     window = Window(t_ns, segments, np.arange(20), xy, np.ones((4, 20), bool), np.zeros((4, 20, 2)))
-    state = NavState(0, np.eye(3), *np.zeros((4, 3)))
-    x = Variables(
-        StateArrays.stack([state] * 4), calibrated(calibration.cameras[0]), np.column_stack([xy[0], np.full(20, 0.2)])
-    )
+    frames = [FrameTracks(int(t), window.ids, np.zeros_like(window.ids), xy[0], xy[0]) for t in t_ns]
+    turns = [turn for a, b in pairwise(frames) if (turn := turn_between(a, b, 1e-3)) is not None]
+    far_ns = np.arange(-10, 11) * 100_000_000
+    Turns(turns, far_ns, np.zeros((21, 3))).fit(HandEye(np.zeros(3), np.eye(3)), ())
+    _with_gyro_bias(window, calibration, 1e-3)
+    state, landmarks = NavState(0, np.eye(3), *np.zeros((4, 3))), np.column_stack([xy[0], np.full(20, 0.2)])
+    x = Variables(StateArrays.stack([state] * 4), calibrated(calibration.cameras[0]), landmarks)
     problem, solution = _adjusted(window, x, calibration, np.full(CALIBRATION_SIZE, 0.01))
     _explained(problem, solution.variables)

@@ -27,7 +27,7 @@ _STATIC_WINDOW_S = 1.0
 # The dynamic method is first tried when the window is this long, and looks back no farther than this; every so often.
 _SHORTEST_WINDOW_S, _USUAL_WINDOW_S, _LONGEST_WINDOW_S, _LONGER = 1.5, 3.0, 10.0, 1.2
 # Each attempt that is refused puts the next off by so much more, up to a longest wait.
-_SOON_S, _LATER_S, _LATEST_S = 0.1, 0.05, 0.5
+_SOON_S, _LATER_S, _LATEST_S = 0.1, 0.05, 0.6
 # Times ``imu_noise_factor`` in the dynamic method, which has no later readings to correct what vibration, scale and
 # alignment errors do over its seconds: with 8 in all its squared errors on EuRoC's flights are as its covariance says.
 # Readings that are smoother than their calibration has it count as such: this many times what they jump by.

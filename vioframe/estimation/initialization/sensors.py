@@ -141,7 +141,7 @@ class SensorCheck:
         if camera.rotation_known and _fits(turns, given, noise):
             return None
         best, parts, _, variance = _best(turns, given, camera.rotation_known)
-        if variance > (_BADLY * noise) ** 2 and (found := self._other_focal(readings, calibration)) is not None:
+        if variance > (_BADLY * noise) ** 2 and (found := self._other_focal(readings, calibration, best)) is not None:
             return found
         if not parts:
             return None
@@ -162,14 +162,17 @@ class SensorCheck:
             sigma.get("rotation"),
         )
 
-    def _other_focal(self, readings: Readings, calibration: Calibration) -> Found | None:
-        """A focal length with which the turns fit well, and far better, if there is one; tried now and then."""
+    def _other_focal(self, readings: Readings, calibration: Calibration, start: HandEye) -> Found | None:
+        """A focal length with which the turns fit well, and far better, if there is one; tried now and then.
+
+        With each the turns are fitted anew from ``start``.
+        """
         now_ns = self._frames[-1].t_ns
         if self._focal_tried_ns is not None and now_ns - self._focal_tried_ns < _FOCAL_EVERY_NS:
             return None
         self._focal_tried_ns = now_ns
         camera = calibration.cameras[0]
-        given, sigma = HandEye(np.zeros(3), camera.R_BC), PIXEL_SIGMA / camera.model.focal_px
+        sigma = PIXEL_SIGMA / camera.model.focal_px
         some = [self._pairs[k] for k in np.unique(np.linspace(0, len(self._pairs) - 1, _FOCAL_TURNS).astype(int))]
         squares, fits_well = [], []
         for change in _FOCALS:
@@ -179,8 +182,8 @@ class SensorCheck:
             turns = Turns(found, readings.t_ns, readings.gyro_B)
             if len(turns) < _FEWEST_TURNS:
                 return None
-            *_, cost, variance = _best(turns, given, camera.rotation_known)
-            squares.append(cost * variance)
+            x, variance = turns.fit(start, ("rotation", "offset"))
+            squares.append(turns.cost(x, variance) * variance)
             fits_well.append(variance < (_BADLY * np.median([turn.misfit for turn in found]) / _MEDIAN) ** 2)
         best, as_given = int(np.argmin(squares)), len(_FOCALS) // 2
         if best in (0, len(squares) - 1) or not fits_well[best]:
