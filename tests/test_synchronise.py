@@ -97,6 +97,36 @@ def test_imu_stamps_move_to_the_camera_clock(offset_ns: int) -> None:
         np.testing.assert_allclose(imu.gyro_B, np.outer((imu.t_ns + offset_ns) * 1e-9, SLOPE), rtol=0.0, atol=1e-12)
 
 
+@pytest.mark.parametrize("wait_ms", [0.0, 50.0])
+@pytest.mark.parametrize("offset_ms", [-137, -3, 3, 137])
+def test_another_time_offset_counts_from_the_next_frame_on(offset_ms: int, wait_ms: float) -> None:
+    """What comes then is what would have come with that offset all along, and no reading is lost on the way."""
+    offset_ns = offset_ms * 1_000_000
+    expected = {frame.t_ns: imu for imu, frame in play(recording(), time_offset_ns=offset_ns)[0]}
+    incidents = Incidents()
+    synchroniser = Synchroniser(incidents, wait_ms=wait_ms)
+    packets: list[Packet] = []
+    retimed_after = None
+    for measurement in recording():
+        for packet in synchroniser.add(measurement):
+            packets.append(packet)
+            if len(packets) == 8:
+                retimed_after = packet[1].t_ns
+                synchroniser.retime(offset_ns)
+    packets += synchroniser.finish()
+    assert retimed_after is not None
+    (first, frame), *others = packets[8:]
+    assert first.t_ns[0] == min(retimed_after, retimed_after - offset_ns)
+    assert first.t_ns[-1] == frame.t_ns
+    np.testing.assert_allclose(first.gyro_B, SLOPE * (first.t_ns[:, None] + offset_ns) * 1e-9, atol=1e-12)
+    assert np.diff(first.t_ns).max() <= IMU_PERIOD_NS
+    assert others
+    for imu, frame in others:
+        np.testing.assert_array_equal(imu.t_ns, expected[frame.t_ns].t_ns)
+        np.testing.assert_allclose(imu.gyro_B, expected[frame.t_ns].gyro_B, atol=1e-12)
+    assert not set(incidents.counts) & {"imu_out_of_order", "imu_duplicate", "imu_gap"}
+
+
 def test_start_and_duration_count_from_the_first_frame() -> None:
     first_ns = recording()[3].t_ns
     packets, counts = play(recording(), start_s=0.2, duration_s=0.3)
