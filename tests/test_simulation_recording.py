@@ -346,7 +346,7 @@ def repeating_file(tmp_path: Path) -> Path:
         (["--world", "hell"], "did you mean 'hall'"),
         (["--imu", "nowhere"], "does not exist"),
         (["--imu", "nowhere", "--exact-imu"], "taken as they are"),
-        (["--duration", "-1"], "duration_s"),
+        (["--duration", "-1"], "--duration: Input should be greater than 0"),
         (["--start", "3"], "a flight begins at its beginning"),
         (["-o", "colour=red"], "no part has such an option"),
         (["-o", "world.images=nowhere"], "is not a folder"),
