@@ -194,6 +194,26 @@ def rolling_shutter() -> str:
     return markdown(shown) + source(rows)
 
 
+def starts() -> str:
+    """Starts anywhere, by recording and by what the calibration has wrong."""
+    rows = recorded("starts_*.json")
+    shown = [
+        {
+            "recording": str(row.recording),
+            "wrong": str(row.fault),
+            "starts": f"{row.starts:.0f}",
+            "in time": _number(row.in_time_percent, ".0f") + " %",
+            "after, median and longest": f"{_number(row.after_s, '.1f')} and {_number(row.slowest_s, '.1f')} s",
+            "never": _number(row.never, ".0f"),
+            "scale, median": f"{_number(row.scale_percent, '.1f')} %",
+            "worst": f"{_number(row.worst_scale_percent, '.1f')} %",
+            "bad": _number(row.bad, ".0f"),
+        }
+        for row in rows.itertuples()
+    ]
+    return markdown(shown) + source(rows)
+
+
 def frontend() -> str:
     """The front-end by detector and threads."""
     rows = recorded("frontend_speed*.json")
