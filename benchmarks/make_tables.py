@@ -386,7 +386,7 @@ FIGURES: dict[str, Callable[[], str]] = {
     make.__name__: make
     for make in (
         *(headline, real_images, stages, at_rest, landmarks, rendered, april, frontend, consistency, memory, push),
-        *(speed, quality, clean, comparison, stress, throughput, rolling_shutter, planted_faults),
+        *(speed, quality, clean, comparison, stress, throughput, rolling_shutter, planted_faults, starts),
     )
 }
 
