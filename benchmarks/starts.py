@@ -8,7 +8,7 @@ seconds later, or a reset within ten.
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import click
@@ -20,7 +20,6 @@ from threadpoolctl import threadpool_limits
 from vioframe.bench import Row
 from vioframe.bench.processes import installed, map_in_processes
 from vioframe.errors import TrajectoryError
-from vioframe.estimation.initialization.sensors import with_focal
 from vioframe.evaluation import evaluate
 from vioframe.frontend import Frontend, FrontendOptions
 from vioframe.geometry import so3
@@ -132,7 +131,7 @@ def faulty(calibration: Calibration, fault: str) -> Calibration:
         return calibration.with_camera(0, time_offset_ns=camera.time_offset_ns + round(value * 1e6))
     if kind == "rotation":
         return calibration.with_camera(0, R_BC=camera.R_BC @ so3.exp(np.deg2rad(value) * _AXIS))
-    return calibration.with_camera(0, model=with_focal(camera.model, 1.0 + value / 100.0))
+    return calibration.with_camera(0, model=camera.model.zoomed(1.0 + value / 100.0))
 
 
 def attempts(starts: Starts) -> Row:
@@ -159,8 +158,7 @@ def attempt(starts: Starts, begin_ns: int, motion_s: float) -> Row:
             continue
         frame = isinstance(measured, FrameTracks)
         if isinstance(measured, FrameTracks):
-            xy = told.cameras[0].model.undistort(measured.xy)
-            steps = odometry.add_tracks(replace(measured, xy_normalised=xy))
+            steps = odometry.add_tracks(measured.undistorted(told.cameras[0].model))
         else:
             steps = odometry.add(measured)
         for step in steps:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -92,7 +92,7 @@ def judge(estimate: InitialEstimate, truth: Motion, start_ns: int) -> Errors:
 
 def seen_by(packets: Sequence[Packet], camera: Camera) -> list[Packet]:
     """The same pixels, taken to the z = 1 plane by another camera model."""
-    return [(imu, replace(tracks, xy_normalised=camera.undistort(tracks.xy))) for imu, tracks in packets]
+    return [(imu, tracks.undistorted(camera)) for imu, tracks in packets]
 
 
 def without_points(tracks: FrameTracks) -> FrameTracks:

@@ -15,7 +15,7 @@ from vioframe import pipeline
 from vioframe.errors import ConfigError
 from vioframe.estimation.hand_eye import HandEye, Turns
 from vioframe.estimation.initialization import Initializer
-from vioframe.estimation.initialization.sensors import Found, with_focal
+from vioframe.estimation.initialization.sensors import Found
 from vioframe.estimation.lifecycle import LifeCycle
 from vioframe.estimation.turns import linearise_pairs, turn_between
 from vioframe.evaluation import evaluate
@@ -254,7 +254,7 @@ class TestFound:
     def test_a_focal_length_given_wrong(self, percent: float):
         s = simulated_sequence("figure_eight", duration_s=8.0, pixel_sigma=0.5, bias_gyro_B=BIAS_GYRO)
         true = s.calibration.cameras[0].model
-        wrong = with_focal(true, 1.0 + percent / 100.0)
+        wrong = true.zoomed(1.0 + percent / 100.0)
         found, _ = find(seen_by(s.packets, wrong), s.calibration.with_camera(0, model=wrong))
         assert found is not None
         assert abs(found.calibration.cameras[0].model.fx / true.fx - 1.0) < 0.04
@@ -424,7 +424,7 @@ class TestRealRecordings:
             "rotation unknown": unknown(dataset.calibration),
             "rotation 10 deg": turned(dataset.calibration, true.R_BC @ so3.exp([0.1, -0.1, 0.1])),
             "offset 60 ms": late(dataset.calibration, 60.0),
-            "focal length 10 %": dataset.calibration.with_camera(0, model=with_focal(true.model, 1.1)),
+            "focal length 10 %": dataset.calibration.with_camera(0, model=true.model.zoomed(1.1)),
         }[fault]
         odometry = Odometry(wrong, ShiTomasi(), "msckf")
         estimates = [step.estimate for step in pipeline.run(dataset, odometry, duration_s=8.0)]

@@ -143,7 +143,7 @@ def test_calibration_converges_to_the_truth_within_its_own_uncertainty():
     )
     flown = replace(CALIBRATION, cameras=(true,))
     sequence = simulated_sequence("aggressive", seed=3, duration_s=20.0, calibration=flown, pixel_sigma=1.0)
-    packets = tuple((imu, replace(t, xy_normalised=told.model.undistort(t.xy))) for imu, t in sequence.packets)
+    packets = tuple((imu, t.undistorted(told.model)) for imu, t in sequence.packets)
     sequence = replace(sequence, packets=packets, calibration=CALIBRATION)
     learned = fly(sequence, MsckfOptions(), 3).estimates[-1].calibration
     assert learned is not None

@@ -86,6 +86,7 @@ class Odometry:
         self._life = LifeCycle(backend, calibration, estimation, initial_state, name)
         self._synchroniser = Synchroniser(self.incidents, time_offset_ns=camera.time_offset_ns, wait_ms=wait_ms)
         self._waiting_tracks: dict[int, FrameTracks] = {}
+        self._given = camera.model
         self.calibration = calibration
         """What is known of the rig by now: as given at first, then as the back-end has learned it."""
 
@@ -138,6 +139,9 @@ class Odometry:
             # Those before it belong to frames that were dropped.
             self._waiting_tracks = {t_ns: kept for t_ns, kept in self._waiting_tracks.items() if t_ns > frames.t_ns}
             seconds: Mapping[str, float] = {}
+            model = self._life.calibration.cameras[0].model
+            if tracks is not None and model != self._given:
+                tracks = tracks.undistorted(model)
             if tracks is None:
                 tracks = self._frontend.track(imu, frames, self.calibration)
                 seconds = self._frontend.stage_seconds

@@ -134,6 +134,10 @@ class FrameTracks:
         """The features ``keep`` (N,)."""
         return FrameTracks(self.t_ns, self.ids[keep], self.camera[keep], self.xy[keep], self.xy_normalised[keep])
 
+    def undistorted(self, camera: Camera) -> FrameTracks:
+        """The same pixels as ``camera`` has them on the z = 1 plane."""
+        return replace(self, xy_normalised=camera.undistort(self.xy))
+
     def finite(self) -> FrameTracks:
         """Without the points that could not be undistorted."""
         good = np.asarray(np.isfinite(self.xy_normalised).all(axis=1))

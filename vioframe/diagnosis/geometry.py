@@ -239,10 +239,7 @@ def _with_other_model(
     """All anew, the coefficients taken for those of the other model."""
     other: DistortionModel = "equidistant" if camera.model.distortion_model == "radtan" else "radtan"
     camera = replace(camera, model=replace(camera.model, distortion_model=other))
-    seen = [
-        [replace(tracks, xy_normalised=camera.model.undistort(tracks.xy)) for tracks in stretch]
-        for stretch in stretches
-    ]
+    seen = [[tracks.undistorted(camera.model) for tracks in stretch] for stretch in stretches]
     coarse = _coarse(seen, camera, imu)
     if coarse is None or coarse.mirrored:
         return None

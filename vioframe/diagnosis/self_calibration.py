@@ -205,14 +205,9 @@ def start_at(camera: CameraOnBody, R_BC: Float, bias_gyro_B: Float, offset_s: fl
 
 
 def _moved(start: Calibrated, x: Float) -> Calibrated:
-    camera, focal = start.camera, float(np.exp(x[7]))
-    k1, k2, *others = camera.distortion
-    moved = replace(
-        camera,
-        fx=camera.fx * focal,
-        fy=camera.fy * focal,
-        distortion=(k1 + float(x[8]), k2 + float(x[9]), others[0], others[1]),
-    )
+    camera = start.camera.zoomed(float(np.exp(x[7])))
+    k1, k2, d3, d4 = camera.distortion
+    moved = replace(camera, distortion=(k1 + float(x[8]), k2 + float(x[9]), d3, d4))
     return replace(
         start,
         camera=moved,

@@ -69,13 +69,14 @@ class LifeCycle:
     def calibration(self) -> Calibration:
         """That which the next frame must come with: other than given, where something else was found while starting.
 
-        The readings count with its time offset, and reach back to where those of the frame before ended.
+        The readings count with its time offset, and reach back to where those of the frame before ended; its camera has
+        undistorted the points.
         """
         return self._initializer.calibration
 
     def process(self, imu: ImuSegment, tracks: FrameTracks) -> Estimate:
         """Begin, or follow one frame; where that fails it says so, and begins anew from where it was."""
-        tracks = self._initializer.undistorted(tracks).finite()
+        tracks = tracks.finite()
         still = self._standstill.sees_standstill(tracks) and self._options.zero_velocity_update
         if not self._following:
             return self._begin(imu, tracks)

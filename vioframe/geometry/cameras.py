@@ -6,7 +6,7 @@ distorted point. Pixels are (x, y) with integers at pixel centres.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Literal
 
@@ -52,6 +52,10 @@ class Camera:
     def focal_px(self) -> float:
         """Mean focal length, for turning pixels into normalised units."""
         return 0.5 * (self.fx + self.fy)
+
+    def zoomed(self, factor: float) -> Camera:
+        """The same with both focal lengths ``factor`` times as long."""
+        return replace(self, fx=factor * self.fx, fy=factor * self.fy)
 
     @cached_property
     def _focal(self) -> Float:

@@ -9,7 +9,7 @@ import numpy as np
 
 from vioframe.estimation.inertial.readings import Readings
 from vioframe.estimation.initialization import dynamic, static
-from vioframe.estimation.initialization.sensors import Found, SensorCheck, undistorted
+from vioframe.estimation.initialization.sensors import Found, SensorCheck
 from vioframe.estimation.initialization.window import (
     LARGEST_IMU_GAP_S,
     InitialEstimate,
@@ -49,7 +49,6 @@ class Initializer:
     def __init__(self, calibration: Calibration, imu_noise_factor: float = 4.0) -> None:
         self._factor = _IN_MOTION * imu_noise_factor
         self._calibration = calibration
-        self._given = calibration.cameras[0].model
         self._sensors = SensorCheck()
         self._found: Found | None = None
         self._refusals: dict[str, str] = {}
@@ -80,11 +79,6 @@ class Initializer:
     def refusal(self) -> str:
         """Why the last attempt of each method came to nothing, in one line; "" before the first and after a success."""
         return "; ".join(f"{method}: {reason}" for method, reason in self._refusals.items())
-
-    def undistorted(self, tracks: FrameTracks) -> FrameTracks:
-        """``tracks`` as the camera has them whose focal length was found, if another one was."""
-        model = self._calibration.cameras[0].model
-        return tracks if model == self._given else next(iter(undistorted([tracks], model)))
 
     def reset(self) -> None:
         """Forget everything seen, but not what was found of the calibration."""
@@ -186,7 +180,7 @@ class Initializer:
         self._readings.move(camera.time_offset_ns - before.time_offset_ns)
         frames = [*(tracks for _, tracks in self._packets), *self._waiting]
         if camera.model != before.model:
-            frames = undistorted(frames, camera.model)
+            frames = [tracks.undistorted(camera.model).finite() for tracks in frames]
             self._sensors.undistort(camera.model)
         self._packets, self._waiting = [], [f for f in frames if f.t_ns >= self._readings.t_ns[0]]
         self._cut()

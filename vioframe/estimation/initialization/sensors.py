@@ -7,7 +7,7 @@ offset, rotation or focal length leaves them further apart than others do, those
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -44,6 +44,9 @@ _FOCAL_BETTER, _FOCAL_VALLEY, _FOCAL_EVERY_NS, _FOCAL_TURNS, _FOCAL_SIGMA = 0.4,
 _LARGEST_UNEXPLAINED = 0.5
 # The median of |x| for x ~ N(0, 1).
 _MEDIAN = 0.6745
+
+
+_Pair = tuple[FrameTracks, FrameTracks, Turn]
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,7 +98,7 @@ class SensorCheck:
 
     def __init__(self) -> None:
         self._frames: deque[FrameTracks] = deque()
-        self._pairs: deque[tuple[FrameTracks, FrameTracks, Turn]] = deque()
+        self._pairs: deque[_Pair] = deque()
         self._focal_tried_ns: int | None = None
 
     def reset(self) -> None:
@@ -121,10 +124,8 @@ class SensorCheck:
 
     def undistort(self, camera: Camera) -> None:
         """Count with ``camera`` from here on."""
-        self._frames = deque(undistorted(self._frames, camera))
-        sigma = PIXEL_SIGMA / camera.focal_px
-        again = [(a, b, turn_between(a, b, sigma)) for a, b in (undistorted(pair, camera) for *pair, _ in self._pairs)]
-        self._pairs = deque((a, b, turn) for a, b, turn in again if turn is not None)
+        self._frames = deque(tracks.undistorted(camera).finite() for tracks in self._frames)
+        self._pairs = deque(_anew(((a, b) for a, b, _ in self._pairs), camera, PIXEL_SIGMA / camera.focal_px))
 
     def judge(self, readings: Readings, calibration: Calibration) -> Found | None:
         """What to take in place of ``calibration``; None where that fits, or nothing can be said.
@@ -176,9 +177,7 @@ class SensorCheck:
         some = [self._pairs[k] for k in np.unique(np.linspace(0, len(self._pairs) - 1, _FOCAL_TURNS).astype(int))]
         squares, fits_well = [], []
         for change in _FOCALS:
-            model = with_focal(camera.model, 1.0 + change)
-            seen = [turn_between(a, b, sigma) for a, b in (undistorted(pair, model) for *pair, _ in some)]
-            found = [turn for turn in seen if turn is not None]
+            found = [turn for *_, turn in _anew(((a, b) for a, b, _ in some), camera.model.zoomed(1.0 + change), sigma)]
             turns = Turns(found, readings.t_ns, readings.gyro_B)
             if len(turns) < _FEWEST_TURNS:
                 return None
@@ -195,7 +194,15 @@ class SensorCheck:
         a, b, c = np.log(squares[best - 1 : best + 2])
         step = _FOCALS[1] - _FOCALS[0]
         factor = 1.0 + _FOCALS[best] + 0.5 * step * (a - c) / (a - 2.0 * b + c)
-        return Found(calibration.with_camera(0, model=with_focal(camera.model, factor)), focal_sigma=_FOCAL_SIGMA)
+        return Found(calibration.with_camera(0, model=camera.model.zoomed(factor)), focal_sigma=_FOCAL_SIGMA)
+
+
+def _anew(pairs: Iterable[tuple[FrameTracks, FrameTracks]], camera: Camera, sigma: float) -> Iterator[_Pair]:
+    """The pairs with their points undistorted by ``camera``, and the turns they make then, where they make any."""
+    for pair in pairs:
+        before, now = (tracks.undistorted(camera).finite() for tracks in pair)
+        if (turn := turn_between(before, now, sigma)) is not None:
+            yield before, now, turn
 
 
 def _fits(turns: Turns, given: HandEye, noise: float) -> bool:
@@ -231,13 +238,3 @@ def _best(turns: Turns, given: HandEye, rotation_known: bool) -> tuple[HandEye, 
 def _is_near(x: HandEye, given: HandEye, parts: Sequence[Part]) -> bool:
     off = {"offset": abs(x.offset_s), "rotation": float(np.linalg.norm(so3.log(given.R_BC.T @ x.R_BC)))}
     return all(off[part] <= _NEAR[part] for part in parts)
-
-
-def with_focal(camera: Camera, factor: float) -> Camera:
-    """Both focal lengths times ``factor``."""
-    return replace(camera, fx=camera.fx * factor, fy=camera.fy * factor)
-
-
-def undistorted(frames: Iterable[FrameTracks], camera: Camera) -> list[FrameTracks]:
-    """The same pixels as ``camera`` has them on the z = 1 plane."""
-    return [replace(tracks, xy_normalised=camera.undistort(tracks.xy)).finite() for tracks in frames]
