@@ -15,8 +15,10 @@ from vioframe.estimation.factors.problem import STATE_SIZE, Prior, Problem, Vari
 from vioframe.estimation.factors.reprojection import (
     GLOBAL_SHUTTER,
     Calibrated,
+    Lens,
     Shutter,
     Sightings,
+    pixels_by_intrinsics,
     pixels_by_residual,
 )
 from vioframe.estimation.inertial.preintegration import join_segments, preintegrate
@@ -31,7 +33,7 @@ from vioframe.types import Float
 CAMERA = packaged_calibration("euroc").cameras[0].model
 NATURAL = np.repeat([0.01, 0.05, 0.1, 0.005, 0.05], 3)
 """Errors of a state that are large but linear enough: rad, m, m/s, rad/s, m/s^2."""
-NATURAL_CALIBRATION = np.repeat([0.005, 0.01, 0.002, 0.005], [3, 3, 1, 1])
+NATURAL_CALIBRATION = np.repeat([0.005, 0.01, 0.002, 0.005, 2.0, 0.01], [3, 3, 1, 1, 4, 4])
 
 
 def flown_window(
@@ -64,7 +66,7 @@ def flown_window(
         biases = np.zeros((2, 3)) if exact else rng.normal(size=(2, 3)) * [[0.002], [0.02]]
         readings.append(preintegrate(imu, *biases, sequence.calibration.imu))
     on_body = sequence.calibration.cameras[0]
-    calibrated = Calibrated(on_body.R_BC, on_body.p_BC, offset_s, readout_s)
+    calibrated = Calibrated(on_body.R_BC, on_body.p_BC, offset_s, readout_s, intrinsics_of(camera)[1])
     sightings, points = _sightings(states, calibrated, camera, landmarks, noise_px, on_sphere, rng)
     x = Variables(states, calibrated, points)
     prior = prior_on(x, 2, rng)
@@ -99,8 +101,9 @@ def without_sightings(problem: Problem) -> Problem:
 
 def only(sightings: Sightings, rows: slice | NDArray[np.bool_]) -> Sightings:
     s = sightings
-    s = s._replace(seen=s.seen[rows], xy=s.xy[rows], velocity=s.velocity[rows], to_px=s.to_px[rows])
-    return s if s.shutter is GLOBAL_SHUTTER else s._replace(shutter=s.shutter._replace(row=s.shutter.row[rows]))
+    lens = s.lens._replace(px=s.lens.px[rows])
+    s = s._replace(seen=s.seen[rows], xy=s.xy[rows], velocity=s.velocity[rows], to_px=s.to_px[rows], lens=lens)
+    return s._replace(shutter=s.shutter._replace(row=s.shutter.row[rows])) if s.shutter.rolling else s
 
 
 def moved(x: Variables, rng: np.random.Generator, scale: float) -> Variables:
@@ -112,8 +115,7 @@ def moved(x: Variables, rng: np.random.Generator, scale: float) -> Variables:
 
 def natural(x: Variables) -> Float:
     """(n,) natural sizes of the error of states and calibration."""
-    calibration = NATURAL_CALIBRATION if x.camera.readout_s else NATURAL_CALIBRATION[:-1]
-    return np.concatenate([np.tile(NATURAL, len(x.states)), calibration])
+    return np.concatenate([np.tile(NATURAL, len(x.states)), NATURAL_CALIBRATION])
 
 
 def retracted(x: Variables, d: Float) -> Variables:
@@ -135,7 +137,7 @@ def numeric(function: Callable[[Float], Float], sizes: Float, eps: float = 1e-4)
 def row_poses(states: StateArrays, camera: Calibrated, shutter: Shutter, row: int, frame: int) -> tuple[Float, Float]:
     """R_WC (3, 3) and p_WC (3,) when the landmark ``row`` was seen in ``frame``."""
     R_WB, p_WB = states.R_WB[frame], states.p_WB[frame]
-    if camera.readout_s:
+    if shutter.rolling:
         late_s = camera.readout_s * shutter.row[row, frame]
         p_WB = p_WB + R_WB @ shutter.velocity_B[frame] * late_s
         R_WB = R_WB @ so3.exp(shutter.rate_B[frame] * late_s)
@@ -159,7 +161,7 @@ def _sightings(
     shutter = GLOBAL_SHUTTER
     if calibrated.readout_s:
         own = np.random.default_rng(1)
-        shutter = Shutter(own.uniform(-0.5, 0.5, (drawn, frames)), *own.normal(size=(2, frames, 3)))
+        shutter = Shutter(True, own.uniform(-0.5, 0.5, (drawn, frames)), *own.normal(size=(2, frames, 3)))
     poses = [[row_poses(states, calibrated, shutter, i, f) for f in range(frames)] for i in range(drawn)]
     p_CF = np.array([[(p - p_WC) @ R_WC for R_WC, p_WC in own] for own, p in zip(poses, p_WF, strict=True)])
     in_view = (p_CF[..., 2] > 1.0) & (np.abs(p_CF[..., :2]) < 0.7 * p_CF[..., 2:]).all(axis=2)
@@ -176,8 +178,10 @@ def _sightings(
     xy[seen] = camera.undistort(pixels) + calibrated.offset_s * velocity[seen]
     to_px = np.zeros((count, frames, 2, 2))
     to_px[seen] = pixels_by_residual(*intrinsics_of(camera), xy[seen], on_sphere)
+    px = pixels_by_intrinsics(*intrinsics_of(camera), exact, seen)
+    lens = Lens(True, px, np.tile(calibrated.intrinsics, (frames, 1)))
     landmarks, in_front = in_hosts(states, calibrated, hosts, p_WF)
     assert in_front.all()
     if calibrated.readout_s:
         shutter = shutter._replace(row=shutter.row[chosen])
-    return Sightings(seen, xy, velocity, to_px, 0.8, 2.0, on_sphere, shutter), landmarks
+    return Sightings(seen, xy, velocity, to_px, 0.8, 2.0, on_sphere, shutter, lens), landmarks

@@ -11,10 +11,9 @@ from scipy.stats import chi2
 from vioframe.estimation.factors.inertial import StateArrays
 from vioframe.estimation.factors.landmarks import camera_poses, positions
 from vioframe.estimation.factors.problem import Problem, Variables
-from vioframe.estimation.factors.reprojection import Calibrated
 from vioframe.estimation.inertial.preintegration import Preintegrated, preintegrate
 from vioframe.estimation.initialization import static
-from vioframe.estimation.initialization.bundle_adjustment import adjusted, adjustment, covariance
+from vioframe.estimation.initialization.bundle_adjustment import adjusted, adjustment, calibrated, covariance
 from vioframe.estimation.initialization.closed_form import (
     _solve_on_gravity_sphere,
     align,
@@ -46,7 +45,7 @@ NOISE = ImuNoise(1.0e-3, 2.0e-2, 1.0e-4, 1.0e-2, 200.0)
 
 
 # Of the calibration, which is right here: rad, m, s.
-CALIBRATION_SIGMA = np.repeat([1e-5, 1e-5, 1e-6], [3, 3, 1])
+CALIBRATION_SIGMA = np.repeat([1e-5, 1e-5, 1e-6, 0.0], [3, 3, 1, 9])
 
 
 @dataclass(frozen=True)
@@ -106,7 +105,7 @@ def scene(
 
 def problem_of(s: Scene) -> tuple[Problem, Variables]:
     """The bundle adjustment of a scene, and its true values."""
-    camera = Calibrated(CAMERA.R_BC, CAMERA.p_BC)
+    camera = calibrated(CAMERA)
     R_WC, p_WC = camera_poses(s.truth, camera)
     host = s.window.seen.argmax(axis=0)
     p_C = np.einsum("lji,lj->li", R_WC[host], s.p_WF - p_WC[host])
@@ -238,7 +237,7 @@ class TestBundleAdjustment:
         points = truth.landmarks + rng.normal(0.0, [0.01, 0.01, 0.05], truth.landmarks.shape)
         start = replace(truth, states=start, landmarks=points)
         problem = adjustment(s.window, s.imu(), start, CAMERA, CALIBRATION_SIGMA)
-        solution = adjusted(problem, start)
+        solution = adjusted(problem, start, CALIBRATION_SIGMA)
         states = solution.variables.states
         assert solution.converged
         # The first state has not moved, nor turned about gravity.
@@ -258,8 +257,8 @@ class TestBundleAdjustment:
             bias_accel = np.random.default_rng(100 + seed).normal(0.0, 0.15, 3)
             s = scene(1.0, seed, noise=NOISE, bias_accel=bias_accel)
             problem, truth = problem_of(s)
-            x = adjusted(problem, truth).variables
-            cov = covariance(problem, x)
+            x = adjusted(problem, truth, CALIBRATION_SIGMA).variables
+            cov = covariance(problem, x, CALIBRATION_SIGMA)
             newest, true = x.states[-1:], s.truth[-1:]
             yaw = so3.log(newest.R_WB[0] @ true.R_WB[0].T)[2]
             turn = so3.exp([0.0, 0.0, yaw])

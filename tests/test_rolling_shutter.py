@@ -58,7 +58,7 @@ def test_a_known_readout_costs_nothing_and_an_unknown_one_does(make):
     run, known = flown(make(False), READOUT_S, READOUT_S)
     _, unknown = flown(make(False), READOUT_S, 0.0)
     assert known < 2.0 * still
-    assert unknown > 10.0 * known
+    assert unknown > 5.0 * known
     learned = run.estimates[-1].calibration
     assert learned is not None
     assert learned.calibration.cameras[0].readout_s == READOUT_S

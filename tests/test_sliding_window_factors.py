@@ -25,7 +25,7 @@ from vioframe.estimation.factors import reprojection
 from vioframe.estimation.factors.inertial import ImuFactors
 from vioframe.estimation.factors.landmarks import camera_poses, positions
 from vioframe.estimation.factors.problem import Prior, Problem, Variables, pose_columns
-from vioframe.estimation.factors.reprojection import Poses, Sightings
+from vioframe.estimation.factors.reprojection import CALIBRATION_SIZE, READOUT, Poses, Sightings
 from vioframe.geometry import so3
 from vioframe.geometry.cameras import Camera
 from vioframe.geometry.kernels import intrinsics_of
@@ -56,7 +56,8 @@ def residuals(x: Variables, s: Sightings) -> Float:
         r = (across(xy) @ (p_C / np.linalg.norm(p_C, axis=1, keepdims=True))[..., None])[..., 0]
     else:
         r = p_C[:, :2] / p_C[:, 2:] - xy
-    return (s.to_px[row, frame] @ r[..., None])[..., 0]
+    lens = s.lens.px[row, frame] @ (x.camera.intrinsics - s.lens.at[frame])[..., None]
+    return (s.to_px[row, frame] @ r[..., None] + lens)[..., 0]
 
 
 def sizes(x: Variables) -> Float:
@@ -75,11 +76,10 @@ def expected_normal(x: Variables, at: Variables, s: Sightings) -> tuple[Float, F
 def assembled(x: Variables, first: Variables, s: Sightings) -> tuple[Float, Float]:
     """The same as the kernels have it."""
     camera, n = x.camera, len(natural(x))
-    size = n - 15 * len(x.states)
     poses, first_poses = (Poses.of(v.states.R_WB, v.states.p_WB) for v in (x, first))
-    H_p, b_p, V, W, c = s.linearise(poses, first_poses, camera, x.landmarks, size)
+    H_p, b_p, V, W, c = s.linearise(poses, first_poses, camera, x.landmarks)
     total = n + 3 * len(x.landmarks)
-    H, b, columns = np.zeros((total, total)), np.zeros(total), pose_columns(len(x.states), size)
+    H, b, columns = np.zeros((total, total)), np.zeros(total), pose_columns(len(x.states))
     H[np.ix_(columns, columns)], b[columns] = H_p, b_p
     for i in range(len(V)):
         own = np.arange(n + 3 * i, n + 3 * i + 3)
@@ -109,10 +109,11 @@ def test_sightings_on_the_manifold(camera, on_sphere, readout_s):
     scale = sizes(x)
     np.testing.assert_allclose(H, H.T, rtol=1e-12, atol=1e-6)
     assert_normal((H,), (expected,), scale, 1e-9)
-    # No block is zero: poses of the host and the frame, extrinsics, time offset, readout, landmarks.
+    # No block is zero: poses of the host and the frame, the calibration, landmarks; all but the readout of no shutter.
     seen = np.diag(H) > 0.0
+    seen[15 * len(x.states) + READOUT] |= not readout_s
     assert seen[pose_columns(len(x.states))].all()
-    assert seen[15 * len(x.states) + 6 :].all()
+    assert seen[15 * len(x.states) :].all()
     # The sphere's residual is exact, so there is nothing to pull at.
     assert np.abs(b * scale).max() < 1e-6
 
@@ -134,6 +135,26 @@ def test_first_estimates_hold_the_jacobian_and_not_the_residual(on_sphere, reado
     assert_normal(actual, expected, scale, 1e-9)
     plain = assembled(x, x, s)[0]
     assert np.abs(plain - assembled(x, at, s)[0]).max() > 1e-3 * np.abs(plain).max()
+
+
+@pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS.keys())
+@pytest.mark.parametrize("on_sphere", [False, True], ids=["plane", "sphere"])
+def test_another_lens_moves_points_as_undistorting_them_anew(camera, on_sphere):
+    """To first order: a tenth of the change leaves a hundredth of the difference."""
+    problem, x = flown_window(on_sphere=on_sphere, noise_px=0.0, camera=camera, offset_s=0.0)
+    s = problem.sightings
+    change = np.array([4.0, -3.0, 2.0, 1.0, 0.01, -0.01, 0.001, 0.002])
+    left = []
+    for part in (1.0, 0.1):
+        other = camera.with_intrinsics(x.camera.intrinsics + part * change)
+        xy = np.zeros_like(s.xy)
+        xy[s.seen] = other.undistort(camera.distort(s.xy[s.seen]))
+        anew = s._replace(xy=xy).errors(x.poses, x.camera, x.landmarks)
+        moved_lens = s.errors(x.poses, x.camera._replace(intrinsics=intrinsics_of(other)[1]), x.landmarks)
+        assert anew.min() > 0.1 * part
+        left.append(np.abs(moved_lens - anew).max())
+    assert left[0] < 0.3
+    assert left[1] < 0.02 * left[0]
 
 
 def test_only_frozen_states_keep_their_first_estimates():
@@ -225,7 +246,7 @@ def test_prior_follows_the_window():
     prior, n = problem.prior, 60
     grown = prior.with_state(longer.states)
     assert grown.frozen.tolist() == [True, True, False, False, False]
-    index = np.r_[0:n, n + 15 : n + 22]
+    index = np.r_[0:n, n + 15 : n + 15 + CALIBRATION_SIZE]
     np.testing.assert_array_equal(grown.H[np.ix_(index, index)], prior.H)
     np.testing.assert_array_equal(grown.b[index], prior.b)
     assert not grown.H[n : n + 15].any()
@@ -243,9 +264,9 @@ def test_prior_on_one_state_is_its_covariance():
     rng = np.random.default_rng(0)
     A = rng.normal(size=(15, 15))
     state = replace(x.states[:1].unstack(np.zeros(1, np.int64))[0], cov=A @ A.T)
-    prior = Prior.of(state, x.camera, np.diag(np.arange(1.0, 8.0)))
+    prior = Prior.of(state, x.camera, np.sqrt(np.arange(1.0, 17.0)))
     np.testing.assert_allclose(prior.H[:15, :15] @ state.cov, np.eye(15), atol=1e-8)
-    np.testing.assert_allclose(np.diag(prior.H)[15:], 1.0 / np.arange(1.0, 8.0))
+    np.testing.assert_allclose(np.diag(prior.H)[15:], 1.0 / np.arange(1.0, 17.0))
     assert not prior.H[:15, 15:].any()
     assert prior.frozen.tolist() == [True]
 

@@ -86,7 +86,9 @@ def short_tracks(frames: int, noise_px: float = 2.0) -> tuple[Problem, Variables
 def part(problem: Problem, prior: Prior, frames: slice, readings: slice, rows: np.ndarray) -> Problem:
     """Some of the factors, over some of the states, with another prior on these."""
     s = only(problem.sightings, rows)
+    lens = s.lens._replace(px=s.lens.px[:, frames], at=s.lens.at[frames])
     s = s._replace(seen=s.seen[:, frames], xy=s.xy[:, frames], velocity=s.velocity[:, frames], to_px=s.to_px[:, frames])
+    s = s._replace(lens=lens)
     f = problem.readings
     some = ImuFactors(*(getattr(f, field.name)[readings] for field in fields(f)))
     still = {k - frames.start: still for k, still in problem.still.items() if frames.start <= k < frames.stop}

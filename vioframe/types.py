@@ -231,6 +231,10 @@ class CameraSigma:
     intrinsics: Float
     readout_s: float = 0.0
 
+    def stacked(self) -> Float:
+        """(16,) in the order [rotation position time_offset readout intrinsics]."""
+        return np.concatenate([self.rotation, self.position, [self.time_offset_s, self.readout_s], self.intrinsics])
+
 
 @dataclass(frozen=True, slots=True)
 class CalibrationEstimate:

@@ -12,8 +12,8 @@ import numpy as np
 from scipy.linalg import block_diag
 from scipy.stats import chi2
 
+from vioframe.estimation.inertial.noise import noise_over
 from vioframe.estimation.inertial.propagation import propagate
-from vioframe.estimation.recovery import noise_over
 from vioframe.estimation.standstill import Standstill
 from vioframe.geometry.so3 import exp, hat
 from vioframe.geometry.triangulation import triangulate
@@ -60,7 +60,15 @@ class TinyMsckf:
 
     def _propagate(self, imu: ImuSegment, t_ns: int) -> None:
         s = self._state
-        step = propagate(imu, s.R_WB, s.p_WB, s.v_WB, s.bias_gyro_B, s.bias_accel_B, noise_over(imu, self._noise))
+        step = propagate(
+            imu,
+            s.R_WB,
+            s.p_WB,
+            s.v_WB,
+            s.bias_gyro_B,
+            s.bias_accel_B,
+            noise_over(imu, self._noise_at_rest, self._noise),
+        )
         Phi = block_diag(step.transition, np.eye(len(self._P) - 15))
         self._P = Phi @ self._P @ Phi.T
         self._P[:15, :15] += step.noise

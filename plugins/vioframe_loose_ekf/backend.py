@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.stats import chi2
 
-from vioframe.estimation.recovery import noise_over
+from vioframe.estimation.inertial.noise import noise_over
 from vioframe.geometry import so3
 from vioframe.stopwatch import Stopwatch
 from vioframe.types import Estimate, Float, FrameTracks, ImuSegment, Start, Status
@@ -69,7 +69,7 @@ class LooseEkf:
             return Estimate(Status.TRACKING, fusion.nav_state(tracks.t_ns), stage_seconds=watch.seconds)
         watch.lap("standstill")
 
-        fusion.propagate(imu, noise_over(imu, self._noise))
+        fusion.propagate(imu, noise_over(imu, self._noise_at_rest, self._noise))
         watch.lap("propagate")
         fitted, events = self._fuse(fusion, sighting, tracks)
         watch.lap("update")

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from vioframe.estimation.factors.tracks import TrackTable
-from vioframe.estimation.recovery import noise_over
+from vioframe.estimation.inertial.noise import noise_over
 from vioframe.stopwatch import Stopwatch
 from vioframe.types import Estimate, FrameTracks, ImuSegment, Start, Status
 from vioframe_msckf.options import MsckfOptions
@@ -53,7 +53,7 @@ class Msckf:
             )
         watch.lap("standstill")
 
-        state.propagate(imu, noise_over(imu, self._noise), options.first_estimate_jacobians)
+        state.propagate(imu, noise_over(imu, self._noise_at_rest, self._noise), options.first_estimate_jacobians)
         state.augment_clone(imu.gyro_B[-1] - state.bias_gyro_B)
         observations.add_frame(tracks.only(~np.isin(tracks.ids, state.landmark_ids)))
         watch.lap("propagate")

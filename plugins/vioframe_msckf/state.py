@@ -150,14 +150,12 @@ class FilterState:
     def calibration(self) -> CalibrationEstimate:
         """What is believed of the calibration by now."""
         camera = self._given.cameras[0]
-        fx, fy, cx, cy, d1, d2, d3, d4 = self.intrinsics.tolist()
-        model = replace(camera.model, fx=fx, fy=fy, cx=cx, cy=cy, distortion=(d1, d2, d3, d4))
         offset_ns = camera.time_offset_ns + round(self.offset_s * NS_PER_S)
         sigma = np.sqrt(np.diag(self.cov)[self.calibrated])
         return CalibrationEstimate(
             self._given.with_camera(
                 0,
-                model=model,
+                model=camera.model.with_intrinsics(self.intrinsics),
                 R_BC=self.R_BC.copy(),
                 p_BC=self.p_BC.copy(),
                 time_offset_ns=offset_ns,

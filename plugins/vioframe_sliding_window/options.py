@@ -42,5 +42,7 @@ class SlidingWindowOptions:
     """Estimate what is left of the time offset between camera and IMU."""
     calibrate_readout: bool = False
     """Estimate the readout time of a rolling shutter."""
+    calibrate_intrinsics: bool = True
+    """Estimate focal lengths, principal point and distortion."""
     max_jump_m: PositiveFloat = 1.0
     """Most that images may move the newest position from where the readings put it."""

@@ -8,20 +8,26 @@ import numpy as np
 
 from vioframe.arrays import Bool
 from vioframe.estimation.factors.inertial import ImuFactors, StateArrays
-from vioframe.estimation.factors.landmarks import image_velocities, in_hosts, positions, triangulate_tracks
+from vioframe.estimation.factors.landmarks import image_velocities, in_hosts, in_images, positions, triangulate_tracks
 from vioframe.estimation.factors.problem import STATE_SIZE, Prior, Problem, Variables, marginalise_oldest
 from vioframe.estimation.factors.reprojection import (
     CALIBRATION_SIZE,
+    FIXED_LENS,
     GLOBAL_SHUTTER,
+    INTRINSICS,
+    OFFSET,
+    READOUT,
     Calibrated,
+    Lens,
     Shutter,
     Sightings,
+    pixels_by_intrinsics,
     pixels_by_residual,
 )
 from vioframe.estimation.factors.solver import solve, solve_positive
 from vioframe.estimation.factors.tracks import LandmarkTable, TrackTable
+from vioframe.estimation.inertial.noise import noise_over
 from vioframe.estimation.inertial.preintegration import Preintegrated, join_segments, preintegrate
-from vioframe.estimation.recovery import noise_over
 from vioframe.estimation.standstill import Standstill
 from vioframe.geometry.kernels import intrinsics_of
 from vioframe.types import (
@@ -51,22 +57,24 @@ class Window:
         state, calibration = start.state, start.calibration.calibration
         (camera,), (sigma,) = calibration.cameras, start.calibration.sigma
         self._given = calibration
-        self._noise = calibration.imu
+        self._noise_at_rest, self._noise = start.noise_at_rest, calibration.imu
         self._options = options
         self._focal_px = camera.model.focal_px
         self._sigma = options.pixel_sigma / self._focal_px
         self._t_ns = [state.t_ns]
         self._states = StateArrays.stack([state])
         self._gyro_B = start.imu.gyro_B[-1:]
-        self._camera = Calibrated(camera.R_BC, camera.p_BC, 0.0, camera.readout_s)
-        readout = [sigma.readout_s] if options.calibrate_readout else []
-        self._camera_sigma = np.concatenate([sigma.rotation, sigma.position, [sigma.time_offset_s], readout])
-        self._prior = Prior.of(state, self._camera, np.diag(self._camera_sigma**2))
+        self._camera_model, intrinsics = intrinsics_of(camera.model)
+        self._camera = Calibrated(camera.R_BC, camera.p_BC, 0.0, camera.readout_s, intrinsics)
+        known = sigma.stacked()
+        self._calibrated = _calibrated(options) & (known > 0.0)
+        self._camera_sigma = np.where(self._calibrated, known, 0.0)
+        self._prior = Prior.of(state, self._camera, self._camera_sigma)
         self._readings: list[Preintegrated] = []
         self._still: dict[int, Standstill] = {}
         self._newest_is_keyframe = True
         self._cov = state.cov
-        self._camera_model, self._intrinsics = intrinsics_of(camera.model)
+        self._undistorted_with = np.empty((0, 8))  # each frame's points
         self.tracks = LandmarkTable()
         self._add_tracks(start.tracks)
 
@@ -87,12 +95,15 @@ class Window:
         given, camera, sigma = self._given.cameras[0], self._camera, self._camera_sigma
         offset_ns = given.time_offset_ns + round(camera.offset_s * NS_PER_S)
         learned = self._given.with_camera(
-            0, R_BC=camera.R_BC, p_BC=camera.p_BC, time_offset_ns=offset_ns, readout_s=camera.readout_s
+            0,
+            model=given.model.with_intrinsics(camera.intrinsics),
+            R_BC=camera.R_BC,
+            p_BC=camera.p_BC,
+            time_offset_ns=offset_ns,
+            readout_s=camera.readout_s,
         )
-        readout_s = float(sigma[CALIBRATION_SIZE:].sum())
-        return CalibrationEstimate(
-            learned, (CameraSigma(sigma[:3], sigma[3:6], float(sigma[6]), np.zeros(8), readout_s),)
-        )
+        known = CameraSigma(sigma[:3], sigma[3:6], float(sigma[OFFSET]), sigma[INTRINSICS], float(sigma[READOUT]))
+        return CalibrationEstimate(learned, (known,))
 
     @property
     def prior(self) -> Prior:
@@ -104,8 +115,8 @@ class Window:
 
     def _integrated(self, imu: ImuSegment) -> Preintegrated:
         """The readings behind the newest state, at its biases."""
-        newest = self._states[-1:]
-        return preintegrate(imu, newest.bias_gyro_B[0], newest.bias_accel_B[0], noise_over(imu, self._noise))
+        newest, noise = self._states[-1:], noise_over(imu, self._noise_at_rest, self._noise)
+        return preintegrate(imu, newest.bias_gyro_B[0], newest.bias_accel_B[0], noise)
 
     def add_frame(self, imu: ImuSegment, predicted: NavState, tracks: FrameTracks) -> None:
         """Append the frame that ``imu`` leads to from the newest one, which gives way if it is no keyframe."""
@@ -121,8 +132,11 @@ class Window:
         self._newest_is_keyframe = False
 
     def _add_tracks(self, tracks: FrameTracks) -> None:
-        on_sphere = self._options.residual == "sphere"
-        to_px = pixels_by_residual(self._camera_model, self._intrinsics, tracks.xy_normalised, on_sphere)
+        on_sphere, intrinsics = self._options.residual == "sphere", self._camera.intrinsics
+        if self._varies_lens:
+            tracks = tracks.undistorted(self._given.cameras[0].model.with_intrinsics(intrinsics)).finite()
+        self._undistorted_with = np.concatenate([self._undistorted_with, intrinsics[None]])
+        to_px = pixels_by_residual(self._camera_model, intrinsics, tracks.xy_normalised, on_sphere)
         rows = self.tracks.add_frame(tracks)
         self.tracks.to_px[rows, -1] = to_px
 
@@ -156,6 +170,7 @@ class Window:
         self._t_ns.pop()
         self._readings.pop()
         self._states, self._gyro_B = self._states[:-1], self._gyro_B[:-1]
+        self._undistorted_with = self._undistorted_with[:-1]
         self._prior = self._prior.without_newest()
 
     def triangulate(self) -> None:
@@ -233,6 +248,7 @@ class Window:
         self._t_ns.pop(0)
         self._readings.pop(0)
         self._states, self._gyro_B = self._states[1:], self._gyro_B[1:]
+        self._undistorted_with = self._undistorted_with[1:]
         self._still = {k - 1: still for k, still in self._still.items() if k > 0}
         self._host_again(ids, p_WF)
 
@@ -264,9 +280,8 @@ class Window:
 
     def _sightings(self, rows: Int) -> Sightings:
         options, tracks = self._options, self.tracks
-        velocity = image_velocities(
-            self._states, self._camera, self._gyro_B, tracks.hosts[rows], tracks.landmarks[rows]
-        )
+        xy, depth = in_images(self._states, self._camera, tracks.hosts[rows], tracks.landmarks[rows])
+        velocity = image_velocities(self._states, self._camera, self._gyro_B, xy, depth)
         return Sightings(
             tracks.seen[rows],
             tracks.xy_normalised[rows],
@@ -276,6 +291,7 @@ class Window:
             options.cauchy_sigmas,
             options.residual == "sphere",
             self._shutter(rows),
+            self._lens(tracks.seen[rows], xy),
         )
 
     def _shutter(self, rows: Int) -> Shutter:
@@ -284,15 +300,21 @@ class Window:
         states = self._states
         velocity_B = np.einsum("kji,kj->ki", states.R_WB, states.v_WB)
         row = self._given.cameras[0].row(self.tracks.xy[rows, :, 1])
-        return Shutter(row, self._gyro_B - states.bias_gyro_B, velocity_B)
+        return Shutter(True, row, self._gyro_B - states.bias_gyro_B, velocity_B)
+
+    @property
+    def _varies_lens(self) -> bool:
+        return bool(self._calibrated[INTRINSICS].any())
+
+    def _lens(self, seen: Bool, xy: Float) -> Lens:
+        if not self._varies_lens:
+            return FIXED_LENS
+        px = pixels_by_intrinsics(self._camera_model, self._camera.intrinsics, xy, seen)
+        return Lens(True, px, self._undistorted_with)
 
     def _active(self) -> Int:
         """The entries of the error vector that are estimated."""
-        options, n = self._options, STATE_SIZE * len(self)
-        active = np.ones(n + self._prior.calibration_size, dtype=bool)
-        active[n : n + 6] = options.calibrate_extrinsics
-        active[n + 6] = options.calibrate_time_offset
-        return np.flatnonzero(active)
+        return np.flatnonzero(np.append(np.ones(STATE_SIZE * len(self), bool), self._calibrated))
 
     def _covariance(self, S: Float) -> tuple[Float, Float]:
         """Of the newest state (15, 15), and the standard deviations of the calibration, zero where it is fixed."""
@@ -301,10 +323,18 @@ class Window:
         unit = np.zeros((len(active), len(active) - at))
         unit[at:] = np.eye(len(active) - at)
         end = solve_positive(S[np.ix_(active, active)], unit)[at:]
-        sigma = np.zeros(self._prior.calibration_size)
+        sigma = np.zeros(CALIBRATION_SIZE)
         sigma[active[at + STATE_SIZE :] - at - STATE_SIZE] = np.sqrt(np.diag(end)[STATE_SIZE:])
         cov = end[:STATE_SIZE, :STATE_SIZE]
         return 0.5 * (cov + cov.T), sigma
+
+
+def _calibrated(options: SlidingWindowOptions) -> Bool:
+    """(16,) what of the calibration is to be estimated."""
+    out = np.empty(CALIBRATION_SIZE, bool)
+    out[:OFFSET], out[OFFSET] = options.calibrate_extrinsics, options.calibrate_time_offset
+    out[READOUT], out[INTRINSICS] = options.calibrate_readout, options.calibrate_intrinsics
+    return out
 
 
 def parallax(tracks: TrackTable, before: int, now: int, R_CbCn: Float) -> tuple[int, float]:

@@ -57,6 +57,11 @@ class Camera:
         """The same with both focal lengths ``factor`` times as long."""
         return replace(self, fx=factor * self.fx, fy=factor * self.fy)
 
+    def with_intrinsics(self, intrinsics: Float) -> Camera:
+        """The same with ``intrinsics`` (8,): fx fy cx cy and the distortion's coefficients."""
+        fx, fy, cx, cy, *distortion = intrinsics.tolist()
+        return replace(self, fx=fx, fy=fy, cx=cx, cy=cy, distortion=tuple(distortion))
+
     @cached_property
     def _focal(self) -> Float:
         return np.array([self.fx, self.fy])

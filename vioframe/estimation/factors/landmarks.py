@@ -35,23 +35,31 @@ def in_hosts(states: StateArrays, camera: Calibrated, hosts: Int, p_WF: Float) -
     return np.column_stack([p_C[:, 0] / z, p_C[:, 1] / z, 1.0 / z]), in_front
 
 
-def image_velocities(states: StateArrays, camera: Calibrated, gyro_B: Float, hosts: Int, landmarks: Float) -> Float:
-    """(L, K, 2) 1/s: how [x y rho] (L, 3) in the frames ``hosts`` (L,) move on the z = 1 plane of every frame.
+def in_images(states: StateArrays, camera: Calibrated, hosts: Int, landmarks: Float) -> tuple[Float, Float]:
+    """Where [x y rho] (L, 3) of the frames ``hosts`` (L,) are in every frame: (L, K, 2) on the z = 1 plane, depth m.
 
-    ``gyro_B`` (K, 3) rad/s are the readings at the frames. A fixed point moves by p_C' = -w x p_C - v as seen from a
-    camera that turns by w and flies at v. The difference of two observations would have their noise in it, and as it
-    multiplies a residual with the same noise, would pass for a time offset. Zero for points that are not in front.
-    It is that at the stamp: until the row of a rolling shutter is read it hardly changes.
+    Points that are not in front are at the centre, at an infinite depth.
     """
     R_WC, p_WC = camera_poses(states, camera)
     p_C = np.einsum("kji,lkj->lki", R_WC, positions(states, camera, hosts, landmarks)[:, None] - p_WC)
     in_front = p_C[..., 2] > MIN_DEPTH_M
-    z = np.where(in_front, p_C[..., 2], 1.0)[..., None]
-    ray = p_C / z
+    z = np.where(in_front, p_C[..., 2], np.inf)
+    return p_C[..., :2] / z[..., None], z
+
+
+def image_velocities(states: StateArrays, camera: Calibrated, gyro_B: Float, xy: Float, depth: Float) -> Float:
+    """(L, K, 2) 1/s: how points at ``xy`` (L, K, 2), ``depth`` (L, K) m, move on the z = 1 plane of every frame.
+
+    ``gyro_B`` (K, 3) rad/s are the readings at the frames. A fixed point moves by p_C' = -w x p_C - v as seen from a
+    camera that turns by w and flies at v. The difference of two observations would have their noise in it, and as it
+    multiplies a residual with the same noise, would pass for a time offset. It is that at the stamp: until the row of a
+    rolling shutter is read it hardly changes.
+    """
+    ray = np.concatenate([xy, np.ones((*depth.shape, 1))], axis=-1)
     rate_B = gyro_B - states.bias_gyro_B
     velocity_B = np.einsum("kji,kj->ki", states.R_WB, states.v_WB) + np.cross(rate_B, camera.p_BC)
-    moved = -np.cross(rate_B @ camera.R_BC, ray) - velocity_B @ camera.R_BC / z
-    return np.where(in_front[..., None], moved[..., :2] - ray[..., :2] * moved[..., 2:], 0.0)
+    moved = -np.cross(rate_B @ camera.R_BC, ray) - velocity_B @ camera.R_BC / depth[..., None]
+    return np.asarray(moved[..., :2] - ray[..., :2] * moved[..., 2:])
 
 
 def camera_poses(states: StateArrays, camera: Calibrated) -> tuple[Float, Float]:
@@ -78,7 +86,7 @@ def _triangulate_all(
     for i in range(count):
         views = np.flatnonzero(seen[i])
         R_views, p_views = R_WC[views], p_WC[views]
-        if camera.readout_s != 0.0:
+        if shutter.rolling:
             for j in range(len(views)):
                 f = views[j]
                 camera_at_row(camera, shutter, i, f, R_rowC, p_rowC)

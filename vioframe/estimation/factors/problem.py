@@ -1,7 +1,7 @@
 """What the solver minimises: prior, readings, standstill and sightings over the states of a window, and calibration.
 
-The error vector is [dtheta dp dv dbg dba] of every state, oldest first, then [dtheta_BC dp_BC d_offset], and d_readout
-where the prior has a place for it; landmarks are eliminated before it is solved for (Triggs et al., "Bundle Adjustment:
+The error vector is [dtheta dp dv dbg dba] of every state, oldest first, then [dtheta_BC dp_BC d_offset d_readout
+d_intrinsics(8)]; landmarks are eliminated before it is solved for (Triggs et al., "Bundle Adjustment:
 A Modern Synthesis", 2000, section 6.1). A state that has to go leaves all that its factors say about the others behind
 as the prior (Sibley, Matthies, Sukhatme, "Sliding window filter with application to planetary landing", J. Field
 Robotics 2010). Derivation: ``docs/derivations/sliding_window.md``.
@@ -17,7 +17,16 @@ from numpy.typing import NDArray
 
 from vioframe.arrays import Bool, Float
 from vioframe.estimation.factors.inertial import ImuFactors, StateArrays
-from vioframe.estimation.factors.reprojection import CALIBRATION_SIZE, Calibrated, Poses, Sightings, eliminate
+from vioframe.estimation.factors.reprojection import (
+    CALIBRATION_SIZE,
+    INTRINSICS,
+    OFFSET,
+    READOUT,
+    Calibrated,
+    Poses,
+    Sightings,
+    eliminate,
+)
 from vioframe.estimation.standstill import Standstill
 from vioframe.geometry import so3
 from vioframe.types import NavState
@@ -40,14 +49,15 @@ class Variables:
         return Poses.of(self.states.R_WB, self.states.p_WB)
 
     def retract(self, step: Float, landmark_step: Float) -> Variables:
-        """Moved by ``step`` (15 K + 7 or 8,) and ``landmark_step`` (L, 3)."""
+        """Moved by ``step`` (15 K + 16,) and ``landmark_step`` (L, 3)."""
         n = STATE_SIZE * len(self.states)
         camera, d = self.camera, step[n:]
         camera = Calibrated(
             camera.R_BC @ so3.exp(d[:3]),
             camera.p_BC + d[3:6],
-            float(camera.offset_s + d[6]),
-            float(camera.readout_s + d[CALIBRATION_SIZE:].sum()),
+            float(camera.offset_s + d[OFFSET]),
+            float(camera.readout_s + d[READOUT]),
+            camera.intrinsics + d[INTRINSICS],
         )
         states = self.states.retract(step[:n].reshape(-1, STATE_SIZE))
         return Variables(states, camera, self.landmarks + landmark_step)
@@ -68,19 +78,13 @@ class Prior:
     frozen: Bool
 
     @staticmethod
-    def of(state: NavState, camera: Calibrated, camera_cov: Float) -> Prior:
-        """On a single state with covariance, and on the calibration with covariance (7, 7), (8, 8) with readout."""
+    def of(state: NavState, camera: Calibrated, sigma: Float) -> Prior:
+        """On a single state with covariance, and on the calibration, of ``sigma`` (16,), zero where it is fixed."""
         assert state.cov is not None
-        n = STATE_SIZE + len(camera_cov)
-        H = np.zeros((n, n))
+        H = np.zeros((STATE_SIZE + CALIBRATION_SIZE, STATE_SIZE + CALIBRATION_SIZE))
         H[:STATE_SIZE, :STATE_SIZE] = np.linalg.inv(state.cov)
-        H[STATE_SIZE:, STATE_SIZE:] = np.linalg.inv(camera_cov)
+        H[STATE_SIZE:, STATE_SIZE:] = calibration_information(sigma)
         return Prior(H, np.zeros(len(H)), StateArrays.stack([state]), camera, np.ones(1, dtype=bool))
-
-    @property
-    def calibration_size(self) -> int:
-        """How many entries of the error vector are the calibration's."""
-        return len(self.b) - STATE_SIZE * len(self.frozen)
 
     def with_state(self, states: StateArrays) -> Prior:
         """The same on the window ``states`` (K + 1), of which it does not know the newest."""
@@ -101,10 +105,10 @@ class Prior:
         """``x`` beyond the first estimates, (n,); zero for states that the prior does not know."""
         d = x.states.difference(self.states)
         d[~self.frozen] = 0.0
-        rotation = so3.log(self.camera.R_BC.T @ x.camera.R_BC)
-        times = [x.camera.offset_s - self.camera.offset_s, x.camera.readout_s - self.camera.readout_s]
-        camera = np.concatenate([rotation, x.camera.p_BC - self.camera.p_BC, times])
-        return np.concatenate([d.ravel(), camera[: self.calibration_size]])
+        first, now = self.camera, x.camera
+        times = [now.offset_s - first.offset_s, now.readout_s - first.readout_s]
+        rotation, lens = so3.log(first.R_BC.T @ now.R_BC), now.intrinsics - first.intrinsics
+        return np.concatenate([d.ravel(), rotation, now.p_BC - first.p_BC, times, lens])
 
     def first(self, states: StateArrays) -> StateArrays:
         """``states``, with the first estimates of those that are frozen in their place."""
@@ -150,9 +154,8 @@ class Problem:
             b[at] += J.T @ residual
         poses = x.poses
         first_poses = Poses.of(first.R_WB, first.p_WB) if self.first_estimates else poses
-        size = self.prior.calibration_size
-        H_visual, b_visual, V, W, c = self.sightings.linearise(poses, first_poses, x.camera, x.landmarks, size)
-        columns = pose_columns(K, size)
+        H_visual, b_visual, V, W, c = self.sightings.linearise(poses, first_poses, x.camera, x.landmarks)
+        columns = pose_columns(K)
         H[np.ix_(columns, columns)] += H_visual
         b[columns] += b_visual
         return Normal(H, b, V, W, c, columns)
@@ -209,10 +212,15 @@ def _still_residual(still: Standstill, states: StateArrays, k: int) -> Float:
     return still.residual(states.R_WB[k], states.v_WB[k], states.bias_gyro_B[k], states.bias_accel_B[k])
 
 
-def pose_columns(K: int, calibration_size: int = CALIBRATION_SIZE) -> NDArray[np.intp]:
+def calibration_information(sigma: Float) -> Float:
+    """(16, 16) of standard deviations (16,); one for those that are zero and stay as they are."""
+    return np.diag(1.0 / np.where(sigma > 0.0, sigma, 1.0) ** 2)
+
+
+def pose_columns(K: int) -> NDArray[np.intp]:
     """Indices of [dtheta dp] of every state, and of the calibration, in the error vector of K states."""
     poses = (STATE_SIZE * np.arange(K)[:, None] + np.arange(6)).ravel()
-    return np.concatenate([poses, STATE_SIZE * K + np.arange(calibration_size)])
+    return np.concatenate([poses, STATE_SIZE * K + np.arange(CALIBRATION_SIZE)])
 
 
 def marginalise_oldest(problem: Problem, x: Variables) -> Prior:

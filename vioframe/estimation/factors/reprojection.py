@@ -6,8 +6,9 @@ A landmark m = [x y rho] of the host h is seen from the frame f at the direction
 
 with R_fh = R_WBf^T R_WBh and t_fh = R_WBf^T (p_WBh - p_WBf): rho times its position in the camera. Being polynomial in
 rho, it holds for points as far as one likes. With a rolling shutter, a frame's camera is where the body's motion has
-taken it by the time of the row: R_BC and p_BC in X, not in q, become Exp(w t) R_BC and Exp(w t) p_BC + v t. Residuals
-are evaluated at the estimate, Jacobians at the first estimates of poses that are in the prior. Derivation:
+taken it by the time of the row: R_BC and p_BC in X, not in q, become Exp(w t) R_BC and Exp(w t) p_BC + v t. Other
+intrinsics than a point was undistorted with move it in the image, to first order. Residuals are evaluated at the
+estimate, Jacobians at the first estimates of poses that are in the prior. Derivation:
 ``docs/derivations/sliding_window.md``.
 """
 
@@ -19,25 +20,31 @@ from typing import NamedTuple
 import numpy as np
 
 from vioframe.arrays import Bool, Float
-from vioframe.geometry.kernels import distort, exp
+from vioframe.geometry.kernels import distort, exp, intrinsics_jacobian
 from vioframe.jit import kernel
 
 # Depth in a frame over depth in the host: a landmark nearer than this is beside the camera, and cannot be seen.
 _LEAST_DEPTH_RATIO = 0.05
-CALIBRATION_SIZE = 7
-"""Error of the calibration: [dtheta_BC dp_BC d_offset]; one more with d_readout, where that is estimated."""
+CALIBRATION_SIZE = 16
+"""Error of the calibration: [dtheta_BC dp_BC d_offset d_readout d_intrinsics(8)]."""
+OFFSET, READOUT, INTRINSICS = 6, 7, slice(8, 16)
+"""Where in that error they are, behind the camera's pose on the body."""
 
 
 Linearised = tuple[Float, Float, Float, Float, Float]
 
 
 class Calibrated(NamedTuple):
-    """What may be estimated: the camera on the body, what is left of the time offset, s, and the readout, s."""
+    """What may be estimated: the camera on the body, what is left of the time offset, s, the readout, s, and the lens.
+
+    ``intrinsics`` (8,) are fx fy cx cy px and the four distortion coefficients.
+    """
 
     R_BC: Float
     p_BC: Float
     offset_s: float = 0.0
     readout_s: float = 0.0
+    intrinsics: Float = np.zeros(8)
 
 
 class Poses(NamedTuple):
@@ -62,16 +69,33 @@ class Shutter(NamedTuple):
     """When the rows are read, and how the body moves meanwhile, which is constant while a window is solved for.
 
     ``row`` (L, K) is that of a sighting, from -1/2 for the first to 1/2 for the last; ``rate_B`` (K, 3) rad/s and
-    ``velocity_B`` (K, 3) m/s are the body's in every frame, in its own axes.
+    ``velocity_B`` (K, 3) m/s are the body's in every frame, in its own axes. Where it is not ``rolling``, and stays so,
+    nothing is asked of the rest.
     """
 
+    rolling: bool
     row: Float
     rate_B: Float
     velocity_B: Float
 
 
-GLOBAL_SHUTTER = Shutter(np.zeros((1, 1)), np.zeros((1, 3)), np.zeros((1, 3)))
-"""Where the readout is zero and stays so, nothing is asked of the shutter."""
+GLOBAL_SHUTTER = Shutter(False, np.zeros((1, 1)), np.zeros((1, 3)), np.zeros((1, 3)))
+
+
+class Lens(NamedTuple):
+    """How sightings move with the intrinsics: ``px`` (L, K, 2, 8) by intrinsics, and ``at`` (K, 8), each frame's.
+
+    The former is taken where the landmarks are, not where they were seen: the noise of a sighting would be in both the
+    Jacobian and the residual, and pass for a longer focal length. The latter are those with which the points of a frame
+    were undistorted. Where the lens is not ``varied``, nothing is asked of the rest.
+    """
+
+    varied: bool
+    px: Float
+    at: Float
+
+
+FIXED_LENS = Lens(False, np.zeros((1, 1, 2, 8)), np.zeros((1, 8)))
 
 
 class Sightings(NamedTuple):
@@ -90,6 +114,7 @@ class Sightings(NamedTuple):
     cauchy: float
     on_sphere: bool = False
     shutter: Shutter = GLOBAL_SHUTTER
+    lens: Lens = FIXED_LENS
 
     def cost(self, poses: Poses, camera: Calibrated, landmarks: Float) -> float:
         """Half the robust sum of squares."""
@@ -99,20 +124,13 @@ class Sightings(NamedTuple):
         """(L,) root mean square residual of each landmark, standard deviations; infinite behind a camera."""
         return _evaluate(poses, camera, self, landmarks)[1]
 
-    def linearise(
-        self,
-        poses: Poses,
-        first: Poses,
-        camera: Calibrated,
-        landmarks: Float,
-        calibration_size: int = CALIBRATION_SIZE,
-    ) -> Linearised:
+    def linearise(self, poses: Poses, first: Poses, camera: Calibrated, landmarks: Float) -> Linearised:
         """H (n, n), b (n,) of poses and calibration, and V (L, 3, 3), W (L, 3, n), c (L, 3) of the landmarks.
 
-        n = 6 K + ``calibration_size``: [dtheta dp] of every frame, then the calibration. The gradient is [b c], the
-        Gauss-Newton matrix [H W^T; W V], with the robust weights in them. Jacobians are taken at the poses ``first``.
+        n = 6 K + 16: [dtheta dp] of every frame, then the calibration. The gradient is [b c], the Gauss-Newton matrix
+        [H W^T; W V], with the robust weights in them. Jacobians are taken at the poses ``first``.
         """
-        return _linearise(poses, first, camera, self, landmarks, calibration_size)
+        return _linearise(poses, first, camera, self, landmarks)
 
 
 @kernel
@@ -132,6 +150,17 @@ def pixels_by_residual(model: int, k: Float, xy: Float, on_sphere: bool) -> Floa
                 S[0, j], S[1, j] = length * (T[j, 0] - x * T[j, 2]), length * (T[j, 1] - y * T[j, 2])
             J = J @ S
         out[i] = J
+    return out
+
+
+@kernel
+def pixels_by_intrinsics(model: int, k: Float, xy: Float, seen: Bool) -> Float:
+    """(L, K, 2, 8) px of the image by the intrinsics, where ``seen`` (L, K), at points (L, K, 2) of the z = 1 plane."""
+    out = np.zeros((*seen.shape, 2, 8))
+    for i in range(len(seen)):
+        for f in range(seen.shape[1]):
+            if seen[i, f]:
+                out[i, f] = intrinsics_jacobian(model, k, xy[i, f, 0], xy[i, f, 1])
     return out
 
 
@@ -228,6 +257,15 @@ def _residual(X: Float, x: float, y: float, to_px: Float, on_sphere: bool, T: Fl
 
 
 @kernel
+def _add_lens(lens: Lens, i: int, f: int, intrinsics: Float, r: Float) -> None:
+    """To ``r`` (2,) px what other intrinsics than it was undistorted with move the sighting by."""
+    for k in range(8):
+        change = intrinsics[k] - lens.at[f, k]
+        r[0] += lens.px[i, f, 0, k] * change
+        r[1] += lens.px[i, f, 1, k] * change
+
+
+@kernel
 def _residual_jacobian(
     X: Float, vx: float, vy: float, to_px: Float, on_sphere: bool, T: Float, D: Float, by_offset: Float
 ) -> None:
@@ -276,8 +314,8 @@ def _times(A: Float, M: Float, out: Float) -> None:
 @kernel
 def _evaluate(poses: Poses, camera: Calibrated, s: Sightings, landmarks: Float) -> tuple[float, Float]:
     """Half the robust sum of squares, and each landmark's root mean square residual."""
-    R_BC, p_BC, offset_s, readout_s = camera
-    seen, xy, velocity, to_px, sigma, cauchy, on_sphere, shutter = s
+    R_BC, p_BC, offset_s, _, intrinsics = camera
+    seen, xy, velocity, to_px, sigma, cauchy, on_sphere, shutter, lens = s
     R_rowC, p_rowC = R_BC.copy(), p_BC.copy()
     q, b, X, r, T = np.empty(3), np.empty(3), np.empty(3), np.empty(2), np.empty((2, 3))
     count, frames = seen.shape
@@ -290,10 +328,12 @@ def _evaluate(poses: Poses, camera: Calibrated, s: Sightings, landmarks: Float) 
                 continue
             host = f if host < 0 else host
             x, y = xy[i, f, 0] - offset_s * velocity[i, f, 0], xy[i, f, 1] - offset_s * velocity[i, f, 1]
-            if readout_s != 0.0:
+            if shutter.rolling:
                 camera_at_row(camera, shutter, i, f, R_rowC, p_rowC)
             _in_camera(poses.R_fh[f, host], poses.t_fh[f, host], R_rowC, p_rowC, landmarks[i, 2], q, b, X)
             _residual(X, x, y, to_px[i, f], on_sphere, T, r)
+            if lens.varied:
+                _add_lens(lens, i, f, intrinsics, r)
             squared = r[0] * r[0] + r[1] * r[1]
             cost += 0.5 * cauchy * cauchy * math.log(1.0 + squared / (sigma * sigma * cauchy * cauchy))
             total += squared / (sigma * sigma)
@@ -305,10 +345,10 @@ def _evaluate(poses: Poses, camera: Calibrated, s: Sightings, landmarks: Float) 
 
 
 @kernel
-def _linearise(poses: Poses, first: Poses, camera: Calibrated, s: Sightings, landmarks: Float, size: int) -> Linearised:
-    R_BC, p_BC, offset_s, readout_s = camera
-    seen, xy, velocity, to_px, sigma, cauchy, on_sphere, shutter = s
-    rolling = readout_s != 0.0
+def _linearise(poses: Poses, first: Poses, camera: Calibrated, s: Sightings, landmarks: Float) -> Linearised:
+    R_BC, p_BC, offset_s, _, intrinsics = camera
+    seen, xy, velocity, to_px, sigma, cauchy, on_sphere, shutter, lens = s
+    rolling, size = shutter.rolling, CALIBRATION_SIZE
     R_rowC, p_rowC = R_BC.copy(), p_BC.copy()
     count, frames = seen.shape
     n = 6 * frames + size
@@ -318,7 +358,8 @@ def _linearise(poses: Poses, first: Poses, camera: Calibrated, s: Sightings, lan
     D, A, B, C, E = np.empty((2, 3)), np.empty((2, 3)), np.empty((2, 3)), np.empty((2, 3)), np.empty((2, 3))
     A_row = np.empty((2, 3))
     by_offset, p_row = np.empty(2), np.empty(3)
-    J = np.empty((2, 12 + size))  # host, frame, calibration
+    J = np.zeros((2, 12 + size))  # host, frame, calibration
+    end = 12 + size if lens.varied else 12 + READOUT + 1
     J_m = np.empty((2, 3))
     columns = np.empty(12 + size, np.int64)
     for k in range(size):
@@ -339,6 +380,8 @@ def _linearise(poses: Poses, first: Poses, camera: Calibrated, s: Sightings, lan
                 camera_at_row(camera, shutter, i, f, R_rowC, p_rowC)
             _in_camera(poses.R_fh[f, host], poses.t_fh[f, host], R_rowC, p_rowC, rho, q, b, X)
             _residual(X, x, y, to_px[i, f], on_sphere, T, r)
+            if lens.varied:
+                _add_lens(lens, i, f, intrinsics, r)
             weight = 1.0 / (1.0 + (r[0] * r[0] + r[1] * r[1]) / (sigma * sigma * cauchy * cauchy))
             scale = math.sqrt(weight) / sigma
 
@@ -371,23 +414,27 @@ def _linearise(poses: Poses, first: Poses, camera: Calibrated, s: Sightings, lan
                     by_rho += A[a, k] * first.t_fh[f, host, k] + (B[a, k] - A[a, k]) * p_BC[k]
                     by_rho -= A[a, k] * (p_rowC[k] - p_BC[k])
                 J[a, 18] = scale * by_offset[a]
-                if size > CALIBRATION_SIZE:
+                if rolling:
                     rate, velocity_B = shutter.rate_B[f], shutter.velocity_B[f]
                     for k in range(3):
                         i1, i2 = (k + 1) % 3, (k + 2) % 3
                         by_readout -= A_row[a, k] * (rate[i1] * p_row[i2] - rate[i2] * p_row[i1])
                         by_readout -= rho * A[a, k] * velocity_B[k]
                     J[a, 19] = scale * by_readout * shutter.row[i, f]
+                if lens.varied:
+                    for k in range(8):
+                        J[a, 20 + k] = scale * lens.px[i, f, a, k]
                 J_m[a, 0], J_m[a, 1] = scale * C[a, 0], scale * C[a, 1]
                 J_m[a, 2] = scale * by_rho if apart else 0.0
             for k in range(6):
                 columns[k], columns[6 + k] = 6 * host + k, 6 * f + k
 
             begin = 0 if host != f else 12
-            for u in range(begin, 12 + size):
+            for u in range(begin, end):
                 cu = columns[u]
                 g[cu] += J[0, u] * r[0] + J[1, u] * r[1]
-                for v in range(begin, 12 + size):
+                # The host is the first that saw it: columns ascend, and the upper half will do.
+                for v in range(u, end):
                     H[cu, columns[v]] += J[0, u] * J[0, v] + J[1, u] * J[1, v]
                 for k in range(3):
                     W[i, k, cu] += J_m[0, k] * J[0, u] + J_m[1, k] * J[1, u]
@@ -395,4 +442,7 @@ def _linearise(poses: Poses, first: Poses, camera: Calibrated, s: Sightings, lan
                 c[i, k] += J_m[0, k] * r[0] + J_m[1, k] * r[1]
                 for v in range(3):
                     V[i, k, v] += J_m[0, k] * J_m[0, v] + J_m[1, k] * J_m[1, v]
+    for u in range(n):
+        for v in range(u):
+            H[u, v] = H[v, u]
     return H, g, V, W, c

@@ -10,14 +10,25 @@ from dataclasses import replace
 
 import numpy as np
 
-from vioframe.arrays import Float
+from vioframe.arrays import Float, Int
 from vioframe.estimation.factors.inertial import ImuFactors, StateArrays
-from vioframe.estimation.factors.landmarks import image_velocities
-from vioframe.estimation.factors.problem import STATE_SIZE, Prior, Problem, Variables
-from vioframe.estimation.factors.reprojection import CALIBRATION_SIZE, GLOBAL_SHUTTER, Calibrated, Shutter, Sightings
+from vioframe.estimation.factors.landmarks import image_velocities, in_images
+from vioframe.estimation.factors.problem import STATE_SIZE, Prior, Problem, Variables, calibration_information
+from vioframe.estimation.factors.reprojection import (
+    CALIBRATION_SIZE,
+    GLOBAL_SHUTTER,
+    READOUT,
+    Calibrated,
+    Lens,
+    Shutter,
+    Sightings,
+    pixels_by_intrinsics,
+    pixels_by_residual,
+)
 from vioframe.estimation.factors.solver import Solution, solve, solve_positive
 from vioframe.estimation.inertial.preintegration import Preintegrated
 from vioframe.estimation.initialization.window import BIAS_ACCEL_SIGMA, BIAS_GYRO_SIGMA, PIXEL_SIGMA, Window
+from vioframe.geometry.kernels import intrinsics_of
 from vioframe.types import DBA, DBG, DP, DTHETA, CameraOnBody
 
 _CAUCHY = 2.0  # standard deviations
@@ -31,22 +42,25 @@ _HELD, _FIXED = 1e4, 1e8
 def adjustment(window: Window, imu: list[Preintegrated], x: Variables, camera: CameraOnBody, sigma: Float) -> Problem:
     """All factors of ``window``, whose readings are ``imu``, about the values ``x``; the first state is held.
 
-    ``sigma`` (7,) is how well the pose of ``camera`` on the body and its time offset are known.
+    ``sigma`` (16,) is how well the calibration of ``camera`` is known.
     """
     seen = np.ascontiguousarray(window.seen.T)
-    xy = window.xy
-    if camera.readout_s:
+    gyro_B = np.stack([imu[0].imu.gyro_B[0], *(m.imu.gyro_B[-1] for m in imu)])
+    xy, rolling = window.xy, bool(camera.readout_s or sigma[READOUT])
+    if rolling:
         xy = camera.model.undistort(window.xy_px.reshape(-1, 2)).reshape(xy.shape)
     xy = np.ascontiguousarray(np.where(seen[..., None], np.swapaxes(xy, 0, 1), 0.0))
-    to_px = np.tile(camera.model.focal_px * np.eye(2), (*seen.shape, 1, 1))
-    gyro_B = np.stack([imu[0].imu.gyro_B[0], *(m.imu.gyro_B[-1] for m in imu)])
-    velocity = image_velocities(x.states, x.camera, gyro_B, seen.argmax(axis=1), x.landmarks)
+    model, intrinsics = intrinsics_of(camera.model)
+    to_px = pixels_by_residual(model, intrinsics, xy.reshape(-1, 2), False).reshape(*seen.shape, 2, 2)
+    at, depth = in_images(x.states, x.camera, seen.argmax(axis=1), x.landmarks)
+    lens = Lens(True, pixels_by_intrinsics(model, intrinsics, at, seen), np.tile(intrinsics, (len(gyro_B), 1)))
+    velocity = image_velocities(x.states, x.camera, gyro_B, at, depth)
     shutter = GLOBAL_SHUTTER
-    if camera.readout_s:
+    if rolling:
         row = camera.row(np.ascontiguousarray(window.xy_px[..., 1].T))
         velocity_B = np.einsum("kji,kj->ki", x.states.R_WB, x.states.v_WB)
-        shutter = Shutter(row, gyro_B - x.states.bias_gyro_B, velocity_B)
-    sightings = Sightings(seen, xy, velocity, to_px, PIXEL_SIGMA, _CAUCHY, shutter=shutter)
+        shutter = Shutter(True, row, gyro_B - x.states.bias_gyro_B, velocity_B)
+    sightings = Sightings(seen, xy, velocity, to_px, PIXEL_SIGMA, _CAUCHY, shutter=shutter, lens=lens)
     return Problem(
         _prior(x, 0, _HELD, calibrated(camera), sigma), ImuFactors.stack(imu), {}, sightings, first_estimates=False
     )
@@ -55,29 +69,35 @@ def adjustment(window: Window, imu: list[Preintegrated], x: Variables, camera: C
 def calibrated(camera: CameraOnBody) -> Calibrated:
     """``camera`` as it is given, where the adjustment begins."""
     # Contiguous, as what the solver makes of it is: kernels are compiled for each layout that they meet.
-    return Calibrated(np.ascontiguousarray(camera.R_BC), np.ascontiguousarray(camera.p_BC), 0.0, camera.readout_s)
+    R_BC, p_BC = np.ascontiguousarray(camera.R_BC), np.ascontiguousarray(camera.p_BC)
+    return Calibrated(R_BC, p_BC, 0.0, camera.readout_s, intrinsics_of(camera.model)[1])
 
 
-def adjusted(problem: Problem, x: Variables) -> Solution:
+def adjusted(problem: Problem, x: Variables, sigma: Float) -> Solution:
     """Minimise from ``x``."""
-    active = np.arange(STATE_SIZE * len(x.states) + CALIBRATION_SIZE)
-    return solve(problem, x, active, _MAX_ITERATIONS, _RELATIVE_DECREASE)
+    return solve(problem, x, _active(x, sigma), _MAX_ITERATIONS, _RELATIVE_DECREASE)
 
 
-def covariance(problem: Problem, x: Variables) -> Float:
-    """Of all states and the calibration (15 K + 7, 15 K + 7) at the minimum ``x``.
+def covariance(problem: Problem, x: Variables, sigma: Float) -> Float:
+    """Of all states and the calibration (15 K + 16, 15 K + 16) at the minimum ``x``; zero where ``sigma`` (16,) is.
 
     Position and yaw are pinned at the *newest* state.
     """
-    sigma = 1.0 / np.sqrt(np.diag(problem.prior.H)[-CALIBRATION_SIZE:])
     prior = _prior(x, len(x.states) - 1, _FIXED, problem.prior.camera, sigma)
     S, _, _ = replace(problem, prior=prior).linearise(x).reduced(0.0)
-    cov = solve_positive(S, np.eye(len(S)))
+    active = _active(x, sigma)
+    at, cov = np.ix_(active, active), np.zeros(S.shape)
+    cov[at] = solve_positive(S[at], np.eye(len(active)))
     return 0.5 * (cov + cov.T)
 
 
+def _active(x: Variables, sigma: Float) -> Int:
+    """The entries of the error vector that are estimated: those of the calibration that are not known for sure."""
+    return np.flatnonzero(np.append(np.ones(STATE_SIZE * len(x.states), bool), sigma > 0.0))
+
+
 def _prior(x: Variables, held: int, information: float, given: Calibrated, sigma: Float) -> Prior:
-    """The first state's biases about zero, the calibration about ``given`` with ``sigma`` (7,).
+    """The first state's biases about zero, the calibration about ``given`` with ``sigma`` (16,).
 
     And that state ``held`` neither moves nor turns about gravity.
     """
@@ -91,5 +111,5 @@ def _prior(x: Variables, held: int, information: float, given: Calibrated, sigma
     own[DP, DP] = information * np.eye(3)
     zero = np.zeros((K, 3))
     about = StateArrays(states.R_WB, states.p_WB, states.v_WB, zero, zero)
-    H[-CALIBRATION_SIZE:, -CALIBRATION_SIZE:] = np.diag(1.0 / sigma**2)
+    H[-CALIBRATION_SIZE:, -CALIBRATION_SIZE:] = calibration_information(sigma)
     return Prior(H, np.zeros(len(H)), about, given, np.isin(np.arange(K), (0, held)))

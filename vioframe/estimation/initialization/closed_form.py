@@ -104,12 +104,14 @@ def _relative_rotations(imu: Sequence[Preintegrated], bias: Float, first: Int, s
 
     ``imu`` holds the measurements between consecutive frames, ``first`` and ``second`` (P,) the frames of each pair.
     """
+    by_bias = np.stack([m.bias_jacobian[:3, :3] for m in imu])
+    correction = (by_bias @ (bias - np.stack([m.bias_gyro_B for m in imu]))[..., None])[..., 0]
+    steps = np.stack([m.dR for m in imu]) @ so3.exp(correction)
+    turned_by = so3.right_jacobian(correction) @ by_bias
     R, J = [np.eye(3)], [np.zeros((3, 3))]
-    for m in imu:
-        correction = m.bias_jacobian[:3, :3] @ (bias - m.bias_gyro_B)
-        step = m.dR @ so3.exp(correction)
+    for step, by in zip(steps, turned_by, strict=True):
         R.append(R[-1] @ step)
-        J.append(step.T @ J[-1] + so3.right_jacobian(correction) @ m.bias_jacobian[:3, :3])
+        J.append(step.T @ J[-1] + by)
     R_0, J_0 = np.stack(R), np.stack(J)
     R_ij = np.swapaxes(R_0[first], -1, -2) @ R_0[second]
     return R_ij, J_0[second] - np.swapaxes(R_ij, -1, -2) @ J_0[first]
@@ -189,12 +191,14 @@ def _null_vector(Q: Float, use: Bool) -> tuple[Float, Float]:
     V_inv = np.zeros((L, 3, 3))
     V_inv[use] = np.linalg.inv(Q[:, use].sum(axis=0))
     Q = Q * use[:, None, None]
-    S = -np.einsum("klij,nljm->kinm", Q @ V_inv, Q)
+    # By camera and its axes, by landmark and its axes.
+    left, right = ((M.swapaxes(1, 2)).reshape(3 * K, 3 * L) for M in (Q @ V_inv, Q))
+    S = -(left @ right.T).reshape(K, 3, K, 3)
     S[np.arange(K), :, np.arange(K)] += Q.sum(axis=1)
     S = S.reshape(3 * K, 3 * K)[3:, 3:]
     c = np.zeros((K, 3))
     c[1:] = np.linalg.eigh(S)[1][:, 0].reshape(K - 1, 3)
-    return c, (V_inv @ np.einsum("klij,kj->li", Q, c)[..., None])[..., 0]
+    return c, (V_inv @ (right.T @ c.ravel()).reshape(L, 3, 1))[..., 0]
 
 
 @dataclass(frozen=True, slots=True)

@@ -44,6 +44,7 @@ from vioframe.estimation.initialization.window import (
 )
 from vioframe.estimation.turns import turn_between
 from vioframe.geometry import so3
+from vioframe.geometry.cameras import Camera
 from vioframe.geometry.so3 import level_rotation
 from vioframe.types import DP, DTHETA, DV, Calibration, FrameTracks, ImuSegment, NavState, g_W
 
@@ -52,7 +53,7 @@ _MIN_VIEWS = 4
 _EPIPOLAR_LIMIT, _STRUCTURE_LIMIT, _ADJUSTED_LIMIT = 3.0, 10.0, 3.0
 _FARTHEST_M = 200.0
 # Frames of the window that are estimated, tracks that are used, the longest first, and how few refuse the attempt.
-_KEYFRAMES, _MOST_LANDMARKS, _FEWEST_LANDMARKS = 10, 100, 20
+_KEYFRAMES, _MOST_LANDMARKS, _FEWEST_LANDMARKS = 14, 100, 20
 # The newest part of the window is predicted from the rest to test the estimate.
 _LOOKAHEAD_S, _LARGEST_LOOKAHEAD_PX, _FEWEST_COMMON = 0.2, 3.0, 8
 # Least median parallax, with the rotation taken out; most that the observations may disagree with the estimate (RMS).
@@ -69,7 +70,7 @@ _HOPELESS = 1.5
 def initialise(packets: Sequence[Packet], calibration: Calibration, sigma: Float) -> InitialEstimate:
     """Estimate from consecutive ``packets``, the newest last; raises :class:`RefusalError`.
 
-    ``sigma`` (7,) is how well the camera on the body and the time offset of ``calibration`` are known.
+    ``sigma`` (16,) is how well the camera of ``calibration`` is known.
     """
     t_ns = np.array([tracks.t_ns for _, tracks in packets])
     held_out = int((t_ns > t_ns[-1] - _LOOKAHEAD_S * 1e9).sum())
@@ -88,7 +89,7 @@ def initialise(packets: Sequence[Packet], calibration: Calibration, sigma: Float
     refuse_unless(alignment.scale > 0.0, "the readings contradict the direction of the motion in the images")
     x = _start_of_adjustment(window.without_last(), structure, alignment, calibration)
     problem, solution = _adjusted(window.without_last(), x, calibration, sigma)
-    _check_uncertainty(solution.variables.states.p_WB, covariance(problem, solution.variables), _HOPELESS)
+    _check_uncertainty(solution.variables.states.p_WB, covariance(problem, solution.variables, sigma), _HOPELESS)
     keep = _explained(problem, solution.variables)
     window = window.only(keep)
     _require(window, "tracks fit the bundle adjustment")
@@ -99,13 +100,13 @@ def initialise(packets: Sequence[Packet], calibration: Calibration, sigma: Float
     x = solution.variables
     predicted = _predict(packets[-held_out:], x.states.unstack(window.t_ns[:-1])[-1], calibration)
     p_WF = _positions(problem, x)
-    _check_lookahead(predicted, packets[-held_out:], x.camera, window.ids, p_WF, calibration.cameras[0].model.focal_px)
+    _check_lookahead(predicted, packets[-held_out:], x.camera, window.ids, p_WF, calibration.cameras[0].model)
 
     x = replace(x, states=x.states.append(StateArrays.stack(predicted[-1:])))
     problem, solution = _adjusted(window, x, calibration, sigma)
     _check_fit(problem, solution)
     x = solution.variables
-    cov = covariance(problem, x)
+    cov = covariance(problem, x, sigma)
     _check_uncertainty(x.states.p_WB, cov)
     keep = _explained(problem, x)
     return _estimate(window.only(keep), x.states, cov, _positions(problem, x)[keep])
@@ -160,7 +161,7 @@ def _adjusted(window: Window, x: Variables, calibration: Calibration, sigma: Flo
     biases = zip(x.states.bias_gyro_B[:-1], x.states.bias_accel_B[:-1], strict=True)
     imu = [preintegrate(segment, *bias, calibration.imu) for segment, bias in zip(window.segments, biases, strict=True)]
     problem = adjustment(window, imu, x, calibration.cameras[0], sigma)
-    return problem, adjusted(problem, x)
+    return problem, adjusted(problem, x, sigma)
 
 
 def _explained(problem: Problem, x: Variables) -> Bool:
@@ -229,17 +230,22 @@ def _check_lookahead(
     camera: Calibrated,
     ids: Int,
     p_WF: Float,
-    focal_px: float,
+    given: Camera,
 ) -> None:
-    """States predicted by the readings must see the landmarks ``ids`` (L,), ``p_WF`` (L, 3) where the frames do."""
+    """States predicted by the readings must see the landmarks ``ids`` (L,), ``p_WF`` (L, 3) where the frames do.
+
+    Points were undistorted with the camera ``given``.
+    """
+    found = given.with_intrinsics(camera.intrinsics)
     for state, (imu, tracks) in zip(predicted, packets, strict=True):
         _, a, b = np.intersect1d(ids, tracks.ids, return_indices=True)
         refuse_unless(len(a) >= _FEWEST_COMMON, f"only {len(a)} landmarks were still tracked in the frames held back")
         turned = so3.exp((imu.gyro_B[-1] - state.bias_gyro_B) * camera.offset_s)
         p_WB = state.p_WB + state.v_WB * camera.offset_s
         p_C = ((p_WF[a] - p_WB) @ (state.R_WB @ turned) - camera.p_BC) @ camera.R_BC
-        error = np.linalg.norm(p_C[:, :2] / p_C[:, 2:] - tracks.xy_normalised[b], axis=1)
-        px = float(np.median(np.where(p_C[:, 2] > 0.0, error, np.inf))) * focal_px
+        z = np.where(p_C[:, 2] > 0.0, p_C[:, 2], np.nan)
+        error = found.distort(p_C[:, :2] / z[:, None]) - given.distort(tracks.xy_normalised[b])
+        px = float(np.median(np.nan_to_num(np.linalg.norm(error, axis=1), nan=np.inf)))
         refuse_unless(px <= _LARGEST_LOOKAHEAD_PX, f"the prediction misses a later frame by {px:.1f} px")
 
 

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from vioframe.estimation.inertial.noise import jumps
 from vioframe.estimation.inertial.readings import Readings
 from vioframe.estimation.initialization import dynamic, static
 from vioframe.estimation.initialization.sensors import Found, SensorCheck
@@ -146,8 +147,8 @@ class Initializer:
             self._take_over(found)
             if self._packets[-1][1].t_ns != newest_ns:
                 return None
-        known = self.camera_sigma
-        sigma = np.concatenate([known.rotation, known.position, [known.time_offset_s]])
+        # Few frames tell little of a readout; it is taken as given.
+        sigma = replace(self.camera_sigma, readout_s=0.0).stacked()
         calibration = replace(self._calibration, imu=self._noise_in_motion())
         try:
             return dynamic.initialise(self._last(self._window_s), calibration, sigma)
@@ -161,11 +162,7 @@ class Initializer:
     def _noise_in_motion(self) -> ImuNoise:
         """What the readings of the window are off by: white noise by how they jump, within what is given."""
         given, readings = self._calibration.imu, self._readings
-        dt_s = float(np.median(np.diff(readings.t_ns))) * 1e-9
-        gyro, accel = (
-            _JUMPS * float(np.sqrt(0.5 * (np.diff(values, axis=0) ** 2).mean() * dt_s))
-            for values in (readings.gyro_B, readings.accel_B)
-        )
+        gyro, accel = (_JUMPS * jumps(readings.t_ns, values) for values in (readings.gyro_B, readings.accel_B))
         return replace(
             given,
             gyro_density=min(gyro, self._factor * given.gyro_density),
