@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 from math import inf
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from vioframe.arrays import Bool
 from vioframe.errors import ImageSizeError
@@ -38,7 +39,7 @@ _STRETCH_S, _MOST_STRETCHES, _MOST_FRAMES_A_STRETCH = 2.0, 16, 64
 # A stretch takes the place of the poorest that is kept where it turns by so many times as much.
 _WORTH_IT = 1.3
 _POINTS = 120
-# A close look takes as long as following points; what ails images ails many.
+# What ails images ails many: some of them tell.
 _LOOK_EVERY = 3
 _SATURATED = 250
 
@@ -201,11 +202,18 @@ def sharpness_of(image: Image) -> float:
     smooth = [cv2.GaussianBlur(size, (0, 0), 0.8) for size in (image, small)]
     ratios = []
     for order in ((2, 0), (0, 2)):
-        fine, coarse = (
-            float(np.percentile(np.abs(cv2.Sobel(i, cv2.CV_32F, *order, scale=0.25)), 99.0)) for i in smooth
-        )
+        bends = (cv2.Sobel(i, cv2.CV_32F, *order, scale=0.25) for i in smooth)
+        # At the same places of both: to look everywhere takes ten times as long and tells no more.
+        fine, coarse = (_sharpest(bend[::step, ::step]) for bend, step in zip(bends, (4, 1), strict=True))
         ratios.append(fine / max(coarse, 1.0))
     return min(ratios)
+
+
+def _sharpest(bend: ArrayLike) -> float:
+    """The size that one in a hundred exceeds."""
+    sizes = np.abs(bend).ravel()
+    place = int(0.99 * (len(sizes) - 1))
+    return float(np.partition(sizes, place)[place])
 
 
 def _look(image: Image) -> tuple[float, float, float, float]:
