@@ -14,9 +14,9 @@ import numpy as np
 
 from vioframe.arrays import Bool
 from vioframe.diagnosis.recording import Readings
-from vioframe.geometry import kernels, so3
+from vioframe.estimation.inertial.gyro_path import GyroPath
+from vioframe.geometry import so3
 from vioframe.geometry.cameras import Camera
-from vioframe.jit import kernel
 from vioframe.types import NS_PER_S, CameraOnBody, Float, FrameTracks, Int
 
 BIAS, ROTATION, OFFSET, FOCAL, DISTORTION, READOUT = (
@@ -148,8 +148,7 @@ class Pairs:
         xy = x.camera.undistort(self.xy.reshape(-1, 2)).reshape(self.xy.shape)
         usable = self.common & np.isfinite(xy).all(axis=(0, 3))
         rays = np.concatenate([np.nan_to_num(xy), np.ones((*xy.shape[:-1], 1))], axis=-1)
-        rate_B = self._gyro_B - x.bias_gyro_B
-        R, rate = self._attitudes(rate_B, self.t_s.T + x.offset_s)
+        R, rate = GyroPath(self._imu_s, self._gyro_B - x.bias_gyro_B).at(self.t_s.T + x.offset_s)
         if x.readout_s:
             delay = x.readout_s * ((self.xy[..., 1] + 0.5) / height - 0.5)
             rate_C = rate @ x.R_BC
@@ -158,16 +157,6 @@ class Pairs:
         turned = rays[1] @ np.swapaxes(R_C1C2, -1, -2)
         sigma = _PIXEL_SIGMA / x.camera.focal_px
         return (rays[0], turned, R_C1C2, sigma), np.asarray(usable)
-
-    def _attitudes(self, rate_B: Float, t_s: Float) -> tuple[Float, Float]:
-        """R_B0B (..., 3, 3) and the rate (..., 3) at times ``t_s``, by the midpoint rule along readings."""
-        dt = np.diff(self._imu_s)
-        path = _path(rate_B, dt)
-        k = np.clip(np.searchsorted(self._imu_s, t_s, side="right") - 1, 0, len(dt) - 1)
-        after = t_s - self._imu_s[k]
-        slope = (rate_B[k + 1] - rate_B[k]) / dt[k][..., None]
-        rate = rate_B[k] + slope * after[..., None]
-        return path[k] @ so3.exp(0.5 * (rate_B[k] + rate) * after[..., None]), rate
 
     @staticmethod
     def _translations(rays: tuple[Float, Float, Float, float], weight: Float) -> Float:
@@ -232,16 +221,6 @@ def _reduced(J: Float, by_t: Float, r: Float, robust: Float) -> tuple[Float, Flo
 
 def _moments(v: Float, weight: Float) -> Float:
     return np.asarray(np.swapaxes(v * weight[..., None], -1, -2) @ v)
-
-
-@kernel
-def _path(rate_B: Float, dt: Float) -> Float:
-    """R_B0B (N, 3, 3) along readings free of bias."""
-    out = np.empty((len(rate_B), 3, 3))
-    out[0] = np.eye(3)
-    for k in range(len(dt)):
-        out[k + 1] = out[k] @ kernels.exp(0.5 * dt[k] * (rate_B[k] + rate_B[k + 1]))
-    return out
 
 
 def _spaced(stretch: Sequence[FrameTracks]) -> list[tuple[FrameTracks, FrameTracks]]:
