@@ -15,9 +15,10 @@ import numpy as np
 from vioframe.arrays import Bool
 from vioframe.diagnosis.recording import Readings
 from vioframe.estimation.inertial.gyro_path import GyroPath
+from vioframe.estimation.turns import common_tracks, likeliest_translations
 from vioframe.geometry import so3
 from vioframe.geometry.cameras import Camera
-from vioframe.types import NS_PER_S, CameraOnBody, Float, FrameTracks, Int
+from vioframe.types import NS_PER_S, CameraOnBody, Float, FrameTracks
 
 BIAS, ROTATION, OFFSET, FOCAL, DISTORTION, READOUT = (
     slice(0, 3),
@@ -80,7 +81,7 @@ class Pairs:
         self.xy = np.zeros((2, len(chosen), _MOST_TRACKS, 2))
         self.common = np.zeros((len(chosen), _MOST_TRACKS), bool)
         for p, (a, b) in enumerate(chosen):
-            i, j = _common(a, b)
+            i, j = common_tracks(a, b, _MOST_TRACKS)
             self.xy[0, p, : len(i)], self.xy[1, p, : len(i)], self.common[p, : len(i)] = a.xy[i], b.xy[j], True
 
     def __len__(self) -> int:
@@ -104,7 +105,7 @@ class Pairs:
         for cauchy, iterations in _STAGES:
             for _ in range(iterations):
                 rays, usable = self._rays(_moved(origin, x))
-                t = self._translations(rays, weight * usable)
+                t = likeliest_translations(*rays[:3], weight, usable)
                 r, by_t = self._residuals(rays, t, usable)
                 J = np.zeros((*r.shape, len(active)))
                 for column, k in enumerate(active):
@@ -125,7 +126,7 @@ class Pairs:
                 if (np.abs(step) < _SETTLED * _LARGEST_STEP[active]).all():
                     break
         rays, usable = self._rays(_moved(origin, x))
-        r, _ = self._residuals(rays, self._translations(rays, weight * usable), usable)
+        r, _ = self._residuals(rays, likeliest_translations(*rays[:3], weight, usable), usable)
         squared = np.where(usable, r * r, 0.0)
         count = max(int(self.common.sum()), 1)
         # What cannot be undistorted is as bad as what is far off.
@@ -157,22 +158,6 @@ class Pairs:
         turned = rays[1] @ np.swapaxes(R_C1C2, -1, -2)
         sigma = _PIXEL_SIGMA / x.camera.focal_px
         return (rays[0], turned, R_C1C2, sigma), np.asarray(usable)
-
-    @staticmethod
-    def _translations(rays: tuple[Float, Float, Float, float], weight: Float) -> Float:
-        """(P, 3) the likeliest directions of the translations (Kanatani 2005): see vioframe.estimation.turns."""
-        f, y, R, _ = rays
-        n = np.cross(f, y)
-        moments, noise = _moments(n, weight), np.zeros_like(R)
-        for other, across in ((y, so3.hat([0.0, 0.0, 1.0])), (f, so3.hat(R[..., 2]))):
-            S = _moments(other, weight)
-            noise += np.trace(S, axis1=-2, axis2=-1)[:, None, None] * np.eye(3) - S
-            noise -= across @ S @ np.swapaxes(across, -1, -2)
-        trace = np.trace(noise, axis1=-2, axis2=-1)[:, None, None]
-        whitener = np.linalg.inv(np.linalg.cholesky(noise + (1e-6 * trace + 1e-12) * np.eye(3)))
-        transposed = np.swapaxes(whitener, -1, -2)
-        t = (transposed @ np.linalg.eigh(whitener @ moments @ transposed)[1][..., :1])[..., 0]
-        return np.asarray(t / np.linalg.norm(t, axis=1, keepdims=True))
 
     @staticmethod
     def _residuals(rays: tuple[Float, Float, Float, float], t: Float, usable: Bool) -> tuple[Float, Float]:
@@ -219,10 +204,6 @@ def _reduced(J: Float, by_t: Float, r: Float, robust: Float) -> tuple[Float, Flo
     return (H - H_xt @ eliminated[..., :-1]).sum(axis=0), (b - (H_xt @ eliminated[..., -1:])[..., 0]).sum(axis=0)
 
 
-def _moments(v: Float, weight: Float) -> Float:
-    return np.asarray(np.swapaxes(v * weight[..., None], -1, -2) @ v)
-
-
 def _spaced(stretch: Sequence[FrameTracks]) -> list[tuple[FrameTracks, FrameTracks]]:
     """Pairs about each of the spacings apart, that share enough tracks, ever second frame being a first one."""
     t_s = np.array([tracks.t_ns for tracks in stretch]) / NS_PER_S
@@ -233,14 +214,7 @@ def _spaced(stretch: Sequence[FrameTracks]) -> list[tuple[FrameTracks, FrameTrac
             if (
                 j > i
                 and abs(t_s[j] - t_s[i] - spacing) < 0.5 * spacing
-                and len(_common(stretch[i], stretch[j])[0]) >= (_FEWEST_TRACKS)
+                and len(common_tracks(stretch[i], stretch[j], _MOST_TRACKS)[0]) >= _FEWEST_TRACKS
             ):
                 out.append((stretch[i], stretch[j]))
     return out
-
-
-def _common(a: FrameTracks, b: FrameTracks) -> tuple[Int, Int]:
-    """Where the tracks of both are in each, at most so many, spread over the age of the tracks."""
-    _, i, j = np.intersect1d(a.ids, b.ids, assume_unique=True, return_indices=True)
-    some = np.linspace(0, len(i) - 1, min(len(i), _MOST_TRACKS)).astype(int)
-    return i[some], j[some]
