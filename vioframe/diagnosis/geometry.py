@@ -73,7 +73,7 @@ def look_at_geometry(recording: Recording) -> Geometry:
     imu = Readings(imu.t_ns, imu.gyro_B / factor, imu.accel_B)
     if coarse.mirrored and _is_certain_of_handedness(coarse):
         return Geometry((*findings, _mirrored(coarse, imu, camera)))
-    pairs = Pairs(recording.stretches, imu, 0.1 + abs(coarse.offset_s))
+    pairs = Pairs(recording.stretches, camera, imu, 0.1 + abs(coarse.offset_s))
     if len(pairs) < _FEWEST_PAIRS:
         return Geometry(tuple(findings))
     start = start_at(camera, so3.project(coarse.M), coarse.bias_gyro_B / factor, coarse.offset_s)

@@ -65,7 +65,9 @@ class Calibrated:
 class Pairs:
     """Pairs of frames and the pixels of their common tracks, with the readings to turn one into the other."""
 
-    def __init__(self, stretches: Sequence[Sequence[FrameTracks]], imu: Readings, margin_s: float) -> None:
+    def __init__(
+        self, stretches: Sequence[Sequence[FrameTracks]], camera: CameraOnBody, imu: Readings, margin_s: float
+    ) -> None:
         chosen = [pair for stretch in stretches for pair in _spaced(stretch)]
         margin_ns = round(margin_s * NS_PER_S)
         begin, end = imu.t_ns[0] + margin_ns, imu.t_ns[-1] - margin_ns
@@ -83,6 +85,7 @@ class Pairs:
         for p, (a, b) in enumerate(chosen):
             i, j = common_tracks(a, b, _MOST_TRACKS)
             self.xy[0, p, : len(i)], self.xy[1, p, : len(i)], self.common[p, : len(i)] = a.xy[i], b.xy[j], True
+        self._row = camera.row(self.xy[..., 1])
 
     def __len__(self) -> int:
         return len(self.t_s)
@@ -93,7 +96,8 @@ class Pairs:
         out._imu_s, out._gyro_B = self._imu_s, self._gyro_B
         middle = np.median(self.t_s[:, 0]) if len(self) else 0.0
         of_half = (self.t_s[:, 0] > middle) == later
-        out.t_s, out.xy, out.common = self.t_s[of_half], self.xy[:, of_half], self.common[of_half]
+        out.t_s, out.common = self.t_s[of_half], self.common[of_half]
+        out.xy, out._row = self.xy[:, of_half], self._row[:, of_half]
         return out
 
     def calibrate(self, start: Calibrated, free: Sequence[slice]) -> Calibrated:
@@ -145,15 +149,13 @@ class Pairs:
 
         Of a rolling shutter each ray is turned to the instant of the frame's stamp, which is that of its middle row.
         """
-        height = x.camera.resolution[1]
         xy = x.camera.undistort(self.xy.reshape(-1, 2)).reshape(self.xy.shape)
         usable = self.common & np.isfinite(xy).all(axis=(0, 3))
         rays = np.concatenate([np.nan_to_num(xy), np.ones((*xy.shape[:-1], 1))], axis=-1)
         R, rate = GyroPath(self._imu_s, self._gyro_B - x.bias_gyro_B).at(self.t_s.T + x.offset_s)
         if x.readout_s:
-            delay = x.readout_s * ((self.xy[..., 1] + 0.5) / height - 0.5)
-            rate_C = rate @ x.R_BC
-            rays = rays + np.cross(rate_C[:, :, None], rays) * delay[..., None]
+            rate_C, delay_s = rate @ x.R_BC, x.readout_s * self._row
+            rays = rays + np.cross(rate_C[:, :, None], rays) * delay_s[..., None]
         R_C1C2 = x.R_BC.T @ np.swapaxes(R[0], -1, -2) @ R[1] @ x.R_BC
         turned = rays[1] @ np.swapaxes(R_C1C2, -1, -2)
         sigma = _PIXEL_SIGMA / x.camera.focal_px
