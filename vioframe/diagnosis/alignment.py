@@ -8,7 +8,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from vioframe.diagnosis.recording import Readings
+from vioframe.diagnosis.recording import ImuSamples
 from vioframe.estimation.turns import Turn, turn_between
 from vioframe.types import NS_PER_S, Float, FrameTracks
 
@@ -55,7 +55,7 @@ class Alignment:
     third_turn: float
 
 
-def align(turns: Sequence[Turn], imu: Readings, near_s: float) -> Alignment | None:
+def align(turns: Sequence[Turn], imu: ImuSamples, near_s: float) -> Alignment | None:
     """The best of all offsets within :data:`LARGEST_OFFSET_S` of ``near_s``; None where there are too few turns."""
     from vioframe.geometry import so3
 

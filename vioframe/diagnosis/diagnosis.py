@@ -12,7 +12,7 @@ from vioframe.diagnosis.images import look_at_images
 from vioframe.diagnosis.inertial import look_at_imu, smoothed
 from vioframe.diagnosis.motion import look_at_motion, moving_windows
 from vioframe.diagnosis.recording import Recording
-from vioframe.diagnosis.self_calibration import OFFSET, ROTATION, Calibrated
+from vioframe.diagnosis.self_calibration import OFFSET, ROTATION, SelfCalibration
 from vioframe.diagnosis.stamps import look_at_stamps, overlap_s, rate_hz, span_s
 from vioframe.geometry import so3
 from vioframe.types import NS_PER_S, CameraOnBody
@@ -52,7 +52,7 @@ def diagnose(recording: Recording) -> Diagnosis:
     return Diagnosis(tuple(unique.values()), _facts(recording, found))
 
 
-def _facts(recording: Recording, found: Calibrated | None) -> dict[str, str]:
+def _facts(recording: Recording, found: SelfCalibration | None) -> dict[str, str]:
     imu, look, camera = recording.imu.sorted(), recording.look, recording.calibration.cameras[0]
     facts = {}
     if len(imu.t_ns) > 2 and span_s(imu.t_ns) > 0.0:
@@ -76,7 +76,7 @@ def _facts(recording: Recording, found: Calibrated | None) -> dict[str, str]:
     return facts
 
 
-def _measured(found: Calibrated, camera: CameraOnBody) -> str:
+def _measured(found: SelfCalibration, camera: CameraOnBody) -> str:
     offset = f"time offset {1e3 * found.offset_s:.1f} +- {1e3 * found.sigma(OFFSET):.1f} ms"
     offset += f" (given {1e3 * camera.time_offset_ns / NS_PER_S:.1f})"
     if not camera.rotation_known:

@@ -45,18 +45,18 @@ _SATURATED = 250
 
 
 @dataclass(frozen=True, slots=True)
-class Readings:
+class ImuSamples:
     """The IMU's, in the order in which they came: ``t_ns`` (N,), ``gyro_B`` (N, 3) and ``accel_B`` (N, 3)."""
 
     t_ns: Int
     gyro_B: Float
     accel_B: Float
 
-    def sorted(self) -> Readings:
+    def sorted(self) -> ImuSamples:
         """Those that are numbers, in the order of their stamps, of one stamp the first."""
         good = np.isfinite(self.gyro_B).all(axis=1) & np.isfinite(self.accel_B).all(axis=1)
         t_ns, first = np.unique(self.t_ns[good], return_index=True)
-        return Readings(t_ns, self.gyro_B[good][first], self.accel_B[good][first])
+        return ImuSamples(t_ns, self.gyro_B[good][first], self.accel_B[good][first])
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,7 +85,7 @@ class Recording:
     """
 
     calibration: Calibration
-    imu: Readings
+    imu: ImuSamples
     look: Look
     stretches: tuple[tuple[FrameTracks, ...], ...] = ()
     unreadable: Counter[str] = field(default_factory=Counter)
@@ -140,7 +140,7 @@ class Gatherer:
     ) -> Recording:
         """What was gathered until now."""
         values = np.array(self._readings).reshape(-1, 6)
-        imu = Readings(np.array(self._imu_ns), values[:, :3], values[:, 3:])
+        imu = ImuSamples(np.array(self._imu_ns), values[:, :3], values[:, 3:])
         brightness, contrast, bright_share, sharpness = np.array(self._looks, np.float64).reshape(-1, 4).T
         look = Look(
             np.array(self._frames_ns, np.int64),

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from vioframe.arrays import Bool
-from vioframe.diagnosis.recording import Readings
+from vioframe.diagnosis.recording import ImuSamples
 from vioframe.estimation.inertial.gyro_path import GyroPath
 from vioframe.estimation.turns import common_tracks, likeliest_translations
 from vioframe.geometry import so3
@@ -42,7 +42,7 @@ _SETTLED = 1e-3
 
 
 @dataclass(frozen=True, slots=True)
-class Calibrated:
+class SelfCalibration:
     """``camera``, ``R_BC`` (3, 3), offset and readout s, bias (3,) rad/s; ``cov`` (11, 11), ``cost`` and the misfit px.
 
     ``log_focal`` is that of the focal length over the one begun with; ``cov`` is in the order of the module's slices.
@@ -66,7 +66,7 @@ class Pairs:
     """Pairs of frames and the pixels of their common tracks, with the readings to turn one into the other."""
 
     def __init__(
-        self, stretches: Sequence[Sequence[FrameTracks]], camera: CameraOnBody, imu: Readings, margin_s: float
+        self, stretches: Sequence[Sequence[FrameTracks]], camera: CameraOnBody, imu: ImuSamples, margin_s: float
     ) -> None:
         chosen = [pair for stretch in stretches for pair in _spaced(stretch)]
         margin_ns = round(margin_s * NS_PER_S)
@@ -100,7 +100,7 @@ class Pairs:
         out.xy, out._row = self.xy[:, of_half], self._row[:, of_half]
         return out
 
-    def calibrate(self, start: Calibrated, free: Sequence[slice]) -> Calibrated:
+    def calibrate(self, start: SelfCalibration, free: Sequence[slice]) -> SelfCalibration:
         """From ``start`` to where tracks and gyroscope agree best in the parts that are ``free``, and the bias."""
         active = np.r_[tuple(np.arange(_SIZE)[part] for part in (BIAS, *free))]
         x, origin = np.zeros(_SIZE), start
@@ -144,7 +144,7 @@ class Pairs:
         found = _moved(origin, x)
         return replace(found, cov=cov, cost=cost, misfit_px=misfit * _PIXEL_SIGMA)
 
-    def _rays(self, x: Calibrated) -> tuple[tuple[Float, Float, Float, float], Bool]:
+    def _rays(self, x: SelfCalibration) -> tuple[tuple[Float, Float, Float, float], Bool]:
         """Rays of the first frame, those of the second turned into it, R_C1C2 (P, 3, 3), the noise, and which are good.
 
         Of a rolling shutter each ray is turned to the instant of the frame's stamp, which is that of its middle row.
@@ -174,13 +174,13 @@ class Pairs:
         return r, n @ tangent / scale[..., None] * usable[..., None]
 
 
-def start_at(camera: CameraOnBody, R_BC: Float, bias_gyro_B: Float, offset_s: float) -> Calibrated:
+def start_at(camera: CameraOnBody, R_BC: Float, bias_gyro_B: Float, offset_s: float) -> SelfCalibration:
     """With the lens and the readout of ``camera``."""
     cov = np.zeros((_SIZE, _SIZE))
-    return Calibrated(camera.model, R_BC, bias_gyro_B, offset_s, camera.readout_s, 0.0, cov, np.inf, np.inf)
+    return SelfCalibration(camera.model, R_BC, bias_gyro_B, offset_s, camera.readout_s, 0.0, cov, np.inf, np.inf)
 
 
-def _moved(start: Calibrated, x: Float) -> Calibrated:
+def _moved(start: SelfCalibration, x: Float) -> SelfCalibration:
     camera = start.camera.zoomed(float(np.exp(x[7])))
     k1, k2, d3, d4 = camera.distortion
     moved = replace(camera, distortion=(k1 + float(x[8]), k2 + float(x[9]), d3, d4))
