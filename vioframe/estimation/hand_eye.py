@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
@@ -132,10 +133,8 @@ class Turns:
 
         With each offset the bias is eliminated, which leaves an orthogonal Procrustes problem for the rotation.
         """
-        offsets = np.arange(-LARGEST_OFFSET_S, LARGEST_OFFSET_S + 1e-9, _GRID_S)
-        path = GyroPath(self._t_s, self._gyro_B)
-        R_1, R_2 = (path.at(t + offsets[:, None])[0] for t in (self._first, self._second))
-        beta, gamma, dt = so3.log(np.swapaxes(R_1, -1, -2) @ R_2), so3.log(self.R_C1C2), self._dt
+        offsets, beta = self._on_grid
+        gamma, dt = so3.log(self.R_C1C2), self._dt
         known = np.linalg.norm(self._whitener, axis=(1, 2))
         weight = np.tile(known**2, (len(offsets), 1))
         for _ in range(_GRID_ITERATIONS):
@@ -152,6 +151,14 @@ class Turns:
             weight = known**2 / (1.0 + (far / np.maximum(1.5 * typical, 1e-3)[:, None]) ** 2)
         best = int(np.argmin(typical))
         return HandEye(bias[best], R_BC[best], float(offsets[best]))
+
+    @cached_property
+    def _on_grid(self) -> tuple[Float, Float]:
+        """Offsets (G,), and the gyroscope's turns (G, P, 3) with each, its bias left in them."""
+        offsets = np.arange(-LARGEST_OFFSET_S, LARGEST_OFFSET_S + 1e-9, _GRID_S)
+        path = GyroPath(self._t_s, self._gyro_B)
+        R_1, R_2 = (path.at(t + offsets[:, None])[0] for t in (self._first, self._second))
+        return offsets, so3.log(np.swapaxes(R_1, -1, -2) @ R_2)
 
     def _linearise(self, x: HandEye) -> tuple[Float, Float]:
         """Whitened residuals (P, 3) and Jacobian (P, 3, 8) by [bias rotation offset log_focal]."""
