@@ -173,3 +173,12 @@ class Turns:
         J[:, :, 6] = (rate_2 - (R_B2B1 @ rate_1[..., None])[..., 0]) @ x.R_BC
         J[:, :, 7] = -self._by_focal
         return (self._whitener @ off[..., None])[..., 0], self._whitener @ J
+
+
+def top_beside(values: Float, best: int) -> float:
+    """How far beside the largest of ``values`` (N,) the top of the parabola through its neighbours is, in places."""
+    if not 0 < best < len(values) - 1:
+        return 0.0
+    before, at, after = values[best - 1 : best + 2]
+    bend = before - 2.0 * at + after
+    return float(0.5 * (before - after) / bend) if bend < 0.0 else 0.0

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from vioframe.estimation.hand_eye import HandEye, Part, Turns
+from vioframe.estimation.hand_eye import HandEye, Part, Turns, top_beside
 from vioframe.estimation.inertial.readings import Readings
 from vioframe.estimation.initialization.window import PIXEL_SIGMA, refuse_unless
 from vioframe.estimation.turns import Turn, turn_between
@@ -192,9 +192,7 @@ class SensorCheck:
         between = best + int(np.sign(as_given - best))
         if squares[best] > _FOCAL_BETTER * squares[as_given] or squares[between] > _FOCAL_VALLEY * squares[as_given]:
             return None
-        a, b, c = np.log(squares[best - 1 : best + 2])
-        step = _FOCALS[1] - _FOCALS[0]
-        factor = 1.0 + _FOCALS[best] + 0.5 * step * (a - c) / (a - 2.0 * b + c)
+        factor = 1.0 + _FOCALS[best] + (_FOCALS[1] - _FOCALS[0]) * top_beside(-np.log(squares), best)
         return Found(calibration.with_camera(0, model=camera.model.zoomed(factor)), focal_sigma=_FOCAL_SIGMA)
 
 
