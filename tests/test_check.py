@@ -95,6 +95,11 @@ def test_what_is_planted_is_named_first(kind):
     assert found.findings[0].severity is Severity.WRONG
 
 
+def test_images_that_are_there_but_cannot_be_read_are_not_sought_elsewhere():
+    found = looked_at(with_frames(lambda m: Unreadable(m.t_ns, "frame_unreadable", "damaged")))
+    assert str(found.findings[0]).startswith("there are no images that can be read; copy the recording again")
+
+
 @pytest.mark.parametrize(("end", "expected"), [(12.5, True), (99.0, False)])
 def test_readings_at_the_end_of_a_range_are_told_from_large_ones(end, expected):
     shaken = with_imu(lambda m: replace(m, accel_B=np.minimum(m.accel_B * [1.25, 1, 1], end)))

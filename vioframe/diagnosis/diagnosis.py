@@ -17,8 +17,8 @@ from vioframe.diagnosis.stamps import look_at_stamps, overlap_s, rate_hz, span_s
 from vioframe.geometry import so3
 from vioframe.types import NS_PER_S, CameraOnBody
 
-# Without these there is nothing to compare camera and IMU by.
-_HOPELESS = {"imu_missing", "images_missing", "stamps_zero", "stamp_units", "clocks_apart"}
+HOPELESS = {"imu_missing", "images_missing", "stamps_zero", "stamp_units", "clocks_apart"}
+"""Kinds of findings with which there is nothing to compare camera and IMU by, nor to estimate from."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,7 +40,7 @@ def diagnose(recording: Recording) -> Diagnosis:
     if recording.wrong_size is None:  # a reader stops at the first such image
         findings += look_at_stamps(recording)
     found = None
-    if recording.wrong_size is None and not _HOPELESS & {finding.kind for finding in findings}:
+    if recording.wrong_size is None and not HOPELESS & {finding.kind for finding in findings}:
         findings += look_at_motion(recording)
         geometry = look_at_geometry(recording)
         found = geometry.found
