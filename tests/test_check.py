@@ -15,6 +15,7 @@ from rendered_flight import CALIBRATION, rendered_flight
 from vioframe.cli import main
 from vioframe.diagnosis import CAUSES, Certainty, Diagnosis, Finding, Gatherer, Severity, diagnose
 from vioframe.diagnosis.findings import ranked
+from vioframe.diagnosis.motion import moving_windows
 from vioframe.runs.folder import RunFolder
 from vioframe.types import Calibration, FrameSet, ImuSample, Measurement, Unreadable
 
@@ -95,6 +96,11 @@ def test_what_is_planted_is_named_first(kind):
     assert found.findings[0].severity is Severity.WRONG
 
 
+def test_images_that_are_there_but_cannot_be_read_are_not_sought_elsewhere():
+    found = looked_at(with_frames(lambda m: Unreadable(m.t_ns, "frame_unreadable", "damaged")))
+    assert str(found.findings[0]).startswith("there are no images that can be read; copy the recording again")
+
+
 @pytest.mark.parametrize(("end", "expected"), [(12.5, True), (99.0, False)])
 def test_readings_at_the_end_of_a_range_are_told_from_large_ones(end, expected):
     shaken = with_imu(lambda m: replace(m, accel_B=np.minimum(m.accel_B * [1.25, 1, 1], end)))
@@ -115,6 +121,16 @@ def test_images_that_repeat_count_only_while_the_body_turns():
     assert "images_frozen" not in [f.kind for f in looked_at(at_rest).findings]
     for_long = with_frames(lambda m: replace(first, t_ns=m.t_ns) if m.t_ns > 103_000_000_000 else m)
     assert looked_at(for_long).findings[0].kind == "images_frozen"
+
+
+def test_one_stamp_from_far_off_makes_no_years_of_windows():
+    gatherer = Gatherer(CALIBRATION)
+    for m in rendered_flight().measurements:
+        gatherer.add(m)
+        if m.t_ns in FLIGHT_NS and isinstance(m, FrameSet):
+            gatherer.add(replace(m, t_ns=-(10**14)))
+    t_s, moving = moving_windows(gatherer.recording())
+    assert len(t_s) == len(moving) < 100
 
 
 def test_a_run_listens_for_its_first_part_only():

@@ -12,7 +12,7 @@ import pytest
 from rendered_flight import CALIBRATION, rendered_flight
 
 from vioframe.diagnosis import Diagnosis, Finding, Recording, diagnose, gather
-from vioframe.diagnosis.recording import Readings
+from vioframe.diagnosis.recording import ImuSamples
 from vioframe.geometry import so3
 from vioframe.types import Float
 
@@ -25,7 +25,7 @@ def recording() -> Recording:
 def with_imu(gyro: Float, accel: Float, late_ms: float = 0.0) -> Recording:
     """The gyroscope's and accelerometer's readings in axes of their own, or late."""
     imu = recording().imu
-    changed = Readings(imu.t_ns + round(1e6 * late_ms), imu.gyro_B @ gyro.T, imu.accel_B @ accel.T)
+    changed = ImuSamples(imu.t_ns + round(1e6 * late_ms), imu.gyro_B @ gyro.T, imu.accel_B @ accel.T)
     return replace(recording(), imu=changed)
 
 

@@ -323,7 +323,7 @@ def test_clocks_apart_are_said_with_both_spans(toy):
     late = PARTS.replace("yield FrameSet(10**9 +", "yield FrameSet(10**12 +")
     Path("site/toy_parts.py").write_text("from vioframe.parts.hooks import hookimpl\n" + late)
     line = error_line("run", toy, "--backend", "still")
-    assert "camera (1000.000 .. 1002.950 s) and IMU (1.000 .. 4.195 s) overlap nowhere" in line
+    assert "overlap nowhere: the camera speaks from 1000.000 to 1002.950 s and the IMU from 1.000 to 4.195 s" in line
 
 
 def test_cameras_left_aside_are_named(toy):

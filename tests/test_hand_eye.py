@@ -17,7 +17,7 @@ from vioframe.estimation.hand_eye import HandEye, Turns
 from vioframe.estimation.initialization import Initializer
 from vioframe.estimation.initialization.sensors import Found
 from vioframe.estimation.lifecycle import LifeCycle
-from vioframe.estimation.turns import linearise_pairs, turn_between
+from vioframe.estimation.turns import likeliest_translations, linearise_pairs, turn_between
 from vioframe.evaluation import evaluate
 from vioframe.geometry import so3
 from vioframe.geometry.trajectory import Trajectory
@@ -106,6 +106,16 @@ class TestTurns:
             H, b = linearise_pairs(f, g, common, R, weight, 1e-3, 1e6, distance)
             R = R @ so3.exp(-np.linalg.solve(H[:, :3, :3], b[:, :3, None])[..., 0])
         np.testing.assert_allclose(R, R_12, atol=1e-9)
+
+    def test_the_likeliest_translation_lies_in_every_epipolar_plane(self):
+        f, g, common, R_12 = random_pairs(np.random.default_rng(1))
+        y = g @ np.swapaxes(R_12, -1, -2)
+        common[0] = False
+        t = likeliest_translations(f, y, R_12, np.ones(common.shape), common)
+        off = (np.cross(f, y) @ t[..., None])[..., 0]
+        np.testing.assert_allclose(off[common], 0.0, atol=1e-6)
+        np.testing.assert_allclose(np.linalg.norm(t, axis=1), 1.0)
+        np.testing.assert_array_equal(t[0], [0.0, 0.0, 1.0])  # where nothing tells
 
     def test_small_parallax_does_not_pull_the_rotation(self):
         """Motion of a pixel or two under a pixel of noise: the mean over many pairs is still the truth."""

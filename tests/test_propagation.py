@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
+from vioframe.estimation.inertial.gyro_path import GyroPath
 from vioframe.estimation.inertial.propagation import Propagation, propagate, yaw_consistent_transition
 from vioframe.geometry import so3
 from vioframe.types import DBA, DBG, DP, DTHETA, DV, NS_PER_S, Float, ImuNoise, ImuSegment, g_W
@@ -231,3 +232,13 @@ def test_yaw_consistent_transition_carries_the_unobservable_directions_over():
     assert (step.transition == plain).all()
     np.testing.assert_allclose(consistent @ unobservable(*begin), unobservable(*end), atol=1e-12)
     assert np.abs(plain @ unobservable(*begin) - unobservable(*end)).max() > 1e-2
+
+
+def test_the_path_of_a_gyroscope_is_exact_where_its_rate_grows_evenly_about_one_axis():
+    axis = np.array([0.6, -0.48, 0.64])
+    t_s = np.linspace(0.0, 1.0, 21)
+    path = GyroPath(t_s, (0.3 + 2.0 * t_s)[:, None] * axis)
+    asked_s = np.random.default_rng(0).uniform(-0.02, 1.02, (4, 3))  # of any shape, and a little beyond the ends
+    R_B0B, rate_B = path.at(asked_s)
+    np.testing.assert_allclose(rate_B, (0.3 + 2.0 * asked_s)[..., None] * axis, atol=1e-12)
+    np.testing.assert_allclose(R_B0B, so3.exp((0.3 * asked_s + asked_s**2)[..., None] * axis), atol=1e-12)

@@ -5,6 +5,7 @@ The command line and the benchmarks both come through here; :class:`vioframe.odo
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from itertools import chain
@@ -12,9 +13,8 @@ from pathlib import Path
 from time import perf_counter
 from typing import Any
 
-import numpy as np
-
-from vioframe.diagnosis import Diagnosis, Gatherer, diagnose, gather
+from vioframe.diagnosis import HOPELESS, Certainty, Diagnosis, Gatherer, diagnose, gather
+from vioframe.diagnosis.stamps import span_s
 from vioframe.errors import DatasetError, PluginError, RunError
 from vioframe.geometry.trajectory import Trajectory
 from vioframe.incidents import Incidents
@@ -28,7 +28,7 @@ from vioframe.parts.config import Config
 from vioframe.parts.registry import BACKEND, DATASET, DETECTOR, LOOP_CLOSER, Registry
 from vioframe.runs import machine
 from vioframe.runs.recorder import Recorder, new_run_folder, write_json
-from vioframe.types import NS_PER_S, FrameSet, ImuSample, LoopClosure, Measurement, Step, Unreadable
+from vioframe.types import LoopClosure, Measurement, Step
 
 # A run looks at stamps and readings of its first minute, and at every so manieth image of it.
 _LOOK_S, _LOOK_EVERY = 60.0, 10
@@ -192,26 +192,18 @@ def record(
 
 
 def _why_none(experiment: Experiment) -> str:
-    """Why not one frame got as far as the estimator, told by the stamps."""
-    for finding in diagnose(experiment.gatherer.recording()).findings:
-        if finding.kind in ("stamps_zero", "stamp_units"):
-            return str(finding)
-    stamps: dict[type, list[int]] = {FrameSet: [], ImuSample: [], Unreadable: []}
+    """Why not one frame got as far as the estimator.
+
+    Told by all of the recording: what was played may have ended where clocks are apart, and a run listens to a part.
+    """
+    gatherer = Gatherer(experiment.dataset.calibration, look_every=sys.maxsize)
     for measurement in experiment.dataset.measurements():
-        stamps[type(measurement)].append(measurement.t_ns)
-    frames_ns, imu_ns = np.array(stamps[FrameSet], np.int64), np.array(stamps[ImuSample], np.int64)
-    if not len(frames_ns) or not len(imu_ns):
-        what = "no IMU sample" if len(frames_ns) else "no image"
-        return f"{what} can be read; look at its files, or copy it again"
-    frames_ns += experiment.dataset.calibration.cameras[0].time_offset_ns
-    if frames_ns.max() < imu_ns.min() or imu_ns.max() < frames_ns.min():
-        spans = (f"{t_ns.min() / NS_PER_S:.3f} .. {t_ns.max() / NS_PER_S:.3f} s" for t_ns in (frames_ns, imu_ns))
-        camera, imu = spans
-        return (
-            f"the times of camera ({camera}) and IMU ({imu}) overlap nowhere; put both on one clock, or state the "
-            "camera's time offset in the calibration"
-        )
-    length_s = (frames_ns.max() - frames_ns.min()) / NS_PER_S
+        gatherer.add(measurement)
+    recording = gatherer.recording()
+    for finding in diagnose(recording).findings:
+        if finding.kind in HOPELESS and finding.certainty is Certainty.CERTAIN:
+            return str(finding)
+    length_s = span_s(recording.look.t_ns)
     return f"its images span {length_s:.1f} s, of which --start and --duration leave none that the IMU covers"
 
 

@@ -301,16 +301,16 @@ def test_a_clock_set_back_ends_the_flight_there_and_what_came_after_is_counted(r
 
 # What no frame gets through: stamps that mean nothing.
 REFUSED = {
-    "image stamps all zero": everywhere(CAMERA, lambda t: 0),
-    "imu stamps all zero": everywhere(IMU, lambda t: 0),
-    "imu clock ahead": everywhere(IMU, lambda t: t + HOUR),
-    "imu clock behind": everywhere(IMU, lambda t: t - 60 * NS_PER_S),
+    "image stamps all zero": (everywhere(CAMERA, lambda t: 0), r"stamps of the camera are 0"),
+    "imu stamps all zero": (everywhere(IMU, lambda t: 0), r"stamps of the IMU are 0"),
+    "imu clock ahead": (everywhere(IMU, lambda t: t + HOUR), r"camera and IMU overlap nowhere"),
+    "imu clock behind": (everywhere(IMU, lambda t: t - 60 * NS_PER_S), r"camera and IMU overlap nowhere"),
 }
 
 
-@pytest.mark.parametrize("disturb", REFUSED.values(), ids=REFUSED)
-def test_it_is_refused(rendered, disturb, tmp_path):
-    with pytest.raises(DatasetError, match=r"times of camera .* and IMU .* overlap nowhere"):
+@pytest.mark.parametrize(("disturb", "why"), REFUSED.values(), ids=REFUSED)
+def test_it_is_refused(rendered, disturb, why, tmp_path):
+    with pytest.raises(DatasetError, match=why):
         rendered.fly(disturb, tmp_path / "run")
     assert not (tmp_path / "run").exists()
 

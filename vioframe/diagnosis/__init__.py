@@ -6,8 +6,19 @@
 kinds of findings.
 """
 
-from vioframe.diagnosis.diagnosis import Diagnosis, diagnose
+from vioframe.diagnosis.diagnosis import HOPELESS, Diagnosis, diagnose
 from vioframe.diagnosis.findings import CAUSES, Certainty, Finding, Severity
 from vioframe.diagnosis.recording import Gatherer, Recording, gather
 
-__all__ = ["CAUSES", "Certainty", "Diagnosis", "Finding", "Gatherer", "Recording", "Severity", "diagnose", "gather"]
+__all__ = [
+    "CAUSES",
+    "HOPELESS",
+    "Certainty",
+    "Diagnosis",
+    "Finding",
+    "Gatherer",
+    "Recording",
+    "Severity",
+    "diagnose",
+    "gather",
+]

@@ -8,7 +8,8 @@ from itertools import pairwise
 
 import numpy as np
 
-from vioframe.diagnosis.recording import Readings
+from vioframe.diagnosis.recording import ImuSamples
+from vioframe.estimation.hand_eye import top_beside
 from vioframe.estimation.turns import Turn, turn_between
 from vioframe.types import NS_PER_S, Float, FrameTracks
 
@@ -55,7 +56,7 @@ class Alignment:
     third_turn: float
 
 
-def align(turns: Sequence[Turn], imu: Readings, near_s: float) -> Alignment | None:
+def align(turns: Sequence[Turn], imu: ImuSamples, near_s: float) -> Alignment | None:
     """The best of all offsets within :data:`LARGEST_OFFSET_S` of ``near_s``; None where there are too few turns."""
     from vioframe.geometry import so3
 
@@ -82,7 +83,7 @@ def align(turns: Sequence[Turn], imu: Readings, near_s: float) -> Alignment | No
     fits = _fit(beta, gamma, covered * (known / known.max()))
     best = int(np.argmax(np.where(usable, np.maximum(fits.proper, fits.improper), -np.inf)))
     mirrored = bool(fits.improper[best] > fits.proper[best])
-    offset = offsets[best] + _GRID_S * _parabola((fits.improper if mirrored else fits.proper), best)
+    offset = offsets[best] + _GRID_S * top_beside(fits.improper if mirrored else fits.proper, best)
     U, Vt = fits.U[best], fits.Vt[best]
     flip = np.diag([1.0, 1.0, np.linalg.det(U @ Vt) * (-1.0 if mirrored else 1.0)])
     M = U @ flip @ Vt
@@ -146,12 +147,3 @@ def _fit(beta: Float, gamma: Float, known: Float) -> _Fits:
         typical = np.array([np.median(r[c]) if c.any() else 1.0 for r, c in zip(off, covered, strict=True)])
         weight = known / (1.0 + (off / (_CAUCHY * np.maximum(typical, 1e-6))[:, None]) ** 2)
     return _Fits(explained[0], explained[1], (scales[0], scales[1]), U, Vt, weight, gamma_moments)
-
-
-def _parabola(values: Float, best: int) -> float:
-    """How far beside the largest value the top of the parabola through its neighbours is, in places."""
-    if not 0 < best < len(values) - 1:
-        return 0.0
-    before, at, after = values[best - 1 : best + 2]
-    bend = before - 2.0 * at + after
-    return float(0.5 * (before - after) / bend) if bend < 0.0 else 0.0

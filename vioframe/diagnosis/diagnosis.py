@@ -12,13 +12,13 @@ from vioframe.diagnosis.images import look_at_images
 from vioframe.diagnosis.inertial import look_at_imu, smoothed
 from vioframe.diagnosis.motion import look_at_motion, moving_windows
 from vioframe.diagnosis.recording import Recording
-from vioframe.diagnosis.self_calibration import OFFSET, ROTATION, Calibrated
+from vioframe.diagnosis.self_calibration import OFFSET, ROTATION, SelfCalibration
 from vioframe.diagnosis.stamps import look_at_stamps, overlap_s, rate_hz, span_s
 from vioframe.geometry import so3
 from vioframe.types import NS_PER_S, CameraOnBody
 
-# Without these there is nothing to compare camera and IMU by.
-_HOPELESS = {"imu_missing", "images_missing", "stamps_zero", "stamp_units", "clocks_apart"}
+HOPELESS = {"imu_missing", "images_missing", "stamps_zero", "stamp_units", "clocks_apart"}
+"""Kinds of findings with which there is nothing to compare camera and IMU by, nor to estimate from."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,7 +40,7 @@ def diagnose(recording: Recording) -> Diagnosis:
     if recording.wrong_size is None:  # a reader stops at the first such image
         findings += look_at_stamps(recording)
     found = None
-    if recording.wrong_size is None and not _HOPELESS & {finding.kind for finding in findings}:
+    if recording.wrong_size is None and not HOPELESS & {finding.kind for finding in findings}:
         findings += look_at_motion(recording)
         geometry = look_at_geometry(recording)
         found = geometry.found
@@ -52,7 +52,7 @@ def diagnose(recording: Recording) -> Diagnosis:
     return Diagnosis(tuple(unique.values()), _facts(recording, found))
 
 
-def _facts(recording: Recording, found: Calibrated | None) -> dict[str, str]:
+def _facts(recording: Recording, found: SelfCalibration | None) -> dict[str, str]:
     imu, look, camera = recording.imu.sorted(), recording.look, recording.calibration.cameras[0]
     facts = {}
     if len(imu.t_ns) > 2 and span_s(imu.t_ns) > 0.0:
@@ -76,7 +76,7 @@ def _facts(recording: Recording, found: Calibrated | None) -> dict[str, str]:
     return facts
 
 
-def _measured(found: Calibrated, camera: CameraOnBody) -> str:
+def _measured(found: SelfCalibration, camera: CameraOnBody) -> str:
     offset = f"time offset {1e3 * found.offset_s:.1f} +- {1e3 * found.sigma(OFFSET):.1f} ms"
     offset += f" (given {1e3 * camera.time_offset_ns / NS_PER_S:.1f})"
     if not camera.rotation_known:

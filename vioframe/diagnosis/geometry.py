@@ -11,15 +11,15 @@ import numpy as np
 from vioframe.diagnosis.alignment import Alignment, align, camera_turns
 from vioframe.diagnosis.findings import Certainty, Finding, Severity
 from vioframe.diagnosis.inertial import gyro_in_degrees
-from vioframe.diagnosis.recording import Readings, Recording
+from vioframe.diagnosis.recording import ImuSamples, Recording
 from vioframe.diagnosis.self_calibration import (
     DISTORTION,
     FOCAL,
     OFFSET,
     READOUT,
     ROTATION,
-    Calibrated,
     Pairs,
+    SelfCalibration,
     start_at,
 )
 from vioframe.diagnosis.stamps import overlap_s, rate_hz
@@ -56,7 +56,7 @@ class Geometry:
     """What was found of the first camera: in ``found``, where there was motion enough, with ``findings``."""
 
     findings: tuple[Finding, ...]
-    found: Calibrated | None = None
+    found: SelfCalibration | None = None
 
 
 def look_at_geometry(recording: Recording) -> Geometry:
@@ -70,10 +70,10 @@ def look_at_geometry(recording: Recording) -> Geometry:
         return Geometry(arm)
     findings = [*arm, *_units(coarse)]
     factor = 180.0 / np.pi if findings[len(arm) :] else 1.0
-    imu = Readings(imu.t_ns, imu.gyro_B / factor, imu.accel_B)
+    imu = ImuSamples(imu.t_ns, imu.gyro_B / factor, imu.accel_B)
     if coarse.mirrored and _is_certain_of_handedness(coarse):
         return Geometry((*findings, _mirrored(coarse, imu, camera)))
-    pairs = Pairs(recording.stretches, imu, 0.1 + abs(coarse.offset_s))
+    pairs = Pairs(recording.stretches, camera, imu, 0.1 + abs(coarse.offset_s))
     if len(pairs) < _FEWEST_PAIRS:
         return Geometry(tuple(findings))
     start = start_at(camera, so3.project(coarse.M), coarse.bias_gyro_B / factor, coarse.offset_s)
@@ -95,7 +95,7 @@ def look_at_geometry(recording: Recording) -> Geometry:
     return Geometry(tuple(findings), found)
 
 
-def _coarse(stretches: Sequence[Sequence[FrameTracks]], camera: CameraOnBody, imu: Readings) -> Alignment | None:
+def _coarse(stretches: Sequence[Sequence[FrameTracks]], camera: CameraOnBody, imu: ImuSamples) -> Alignment | None:
     turns = camera_turns(stretches, 1.0 / camera.model.focal_px)
     return align(turns, imu, camera.time_offset_ns / NS_PER_S)
 
@@ -116,7 +116,7 @@ def _is_certain_of_handedness(coarse: Alignment) -> bool:
     return coarse.explained - coarse.other_explained > _MIRRORED and coarse.third_turn > _THIRD_TURN
 
 
-def _mirrored(coarse: Alignment, imu: Readings, camera: CameraOnBody) -> Finding:
+def _mirrored(coarse: Alignment, imu: ImuSamples, camera: CameraOnBody) -> Finding:
     """The camera's turns and the gyroscope's are those of frames of different handedness."""
     D = min(_AXES[-1], key=lambda D: float(np.linalg.norm(D @ camera.R_BC - coarse.M)))
     alone, names = _gyroscope_alone(imu, D), _say(D)
@@ -131,7 +131,7 @@ def _mirrored(coarse: Alignment, imu: Readings, camera: CameraOnBody) -> Finding
     )
 
 
-def _rotation(found: Calibrated, camera: CameraOnBody, imu: Readings) -> Iterator[Finding]:
+def _rotation(found: SelfCalibration, camera: CameraOnBody, imu: ImuSamples) -> Iterator[Finding]:
     if not camera.rotation_known:
         return
     off = _angle_deg(found.R_BC, camera.R_BC)
@@ -180,7 +180,7 @@ def _rotation(found: Calibrated, camera: CameraOnBody, imu: Readings) -> Iterato
         )
 
 
-def _offset(found: Calibrated, camera: CameraOnBody) -> Iterator[Finding]:
+def _offset(found: SelfCalibration, camera: CameraOnBody) -> Iterator[Finding]:
     given = camera.time_offset_ns / NS_PER_S
     off, sigma = found.offset_s - given, found.sigma(OFFSET)
     if abs(off) > max(_OFFSET_S, _SIGMAS * sigma):
@@ -195,7 +195,7 @@ def _offset(found: Calibrated, camera: CameraOnBody) -> Iterator[Finding]:
         )
 
 
-def _drift(found: Calibrated, pairs: Pairs) -> Iterator[Finding]:
+def _drift(found: SelfCalibration, pairs: Pairs) -> Iterator[Finding]:
     halves = [pairs.half(later) for later in (False, True)]
     if min(map(len, halves)) < _FEWEST_PAIRS:
         return
@@ -215,7 +215,7 @@ def _drift(found: Calibrated, pairs: Pairs) -> Iterator[Finding]:
         )
 
 
-def _lens(found: Calibrated, given: Camera, pairs: Pairs) -> Finding | None:
+def _lens(found: SelfCalibration, given: Camera, pairs: Pairs) -> Finding | None:
     """A distortion other than the one given."""
     bend = _bend_px(given, found.camera, pairs.xy[:, pairs.common].reshape(-1, 2))
     of_none = not any(given.distortion) and given.distortion_model == "radtan"
@@ -234,8 +234,8 @@ def _lens(found: Calibrated, given: Camera, pairs: Pairs) -> Finding | None:
 
 
 def _with_other_model(
-    stretches: Sequence[Sequence[FrameTracks]], camera: CameraOnBody, imu: Readings, pairs: Pairs
-) -> Calibrated | None:
+    stretches: Sequence[Sequence[FrameTracks]], camera: CameraOnBody, imu: ImuSamples, pairs: Pairs
+) -> SelfCalibration | None:
     """All anew, the coefficients taken for those of the other model."""
     other: DistortionModel = "equidistant" if camera.model.distortion_model == "radtan" else "radtan"
     camera = replace(camera, model=replace(camera.model, distortion_model=other))
@@ -255,7 +255,7 @@ def _as_other_model(given: Camera) -> Finding:
     )
 
 
-def _focal(found: Calibrated, given: Camera, pairs: Pairs) -> Finding | None:
+def _focal(found: SelfCalibration, given: Camera, pairs: Pairs) -> Finding | None:
     """A focal length other than the one given, with the distortion that is: one may stand for the other."""
     if abs(found.log_focal) < 0.5 * _FOCAL:
         return None
@@ -274,7 +274,7 @@ def _focal(found: Calibrated, given: Camera, pairs: Pairs) -> Finding | None:
     )
 
 
-def _shutter(found: Calibrated, camera: CameraOnBody) -> Iterator[Finding]:
+def _shutter(found: SelfCalibration, camera: CameraOnBody) -> Iterator[Finding]:
     off, sigma = abs(found.readout_s - camera.readout_s), found.sigma(READOUT)
     if off > max(_READOUT_S, _SIGMAS * sigma) and abs(found.readout_s) < _LONGEST_READOUT_S:
         yield Finding(
@@ -300,7 +300,7 @@ def _lever_arm(camera: CameraOnBody) -> Iterator[Finding]:
         )
 
 
-def _gyroscope_alone(imu: Readings, D: Float) -> bool:
+def _gyroscope_alone(imu: ImuSamples, D: Float) -> bool:
     """Whether the gyroscope's axes are ``D`` (3, 3) times those they should have, and the accelerometer's are right.
 
     Gravity stands still: seen from the body it changes over a window by accel x rate, acceleration averaging out. That

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from vioframe.diagnosis.findings import Certainty, Finding, Severity
-from vioframe.diagnosis.recording import Readings, Recording
+from vioframe.diagnosis.recording import ImuSamples, Recording
 from vioframe.diagnosis.stamps import rate_hz
 from vioframe.types import GRAVITY_M_S2, NS_PER_S, Float
 
@@ -64,7 +64,7 @@ def _constant(recording: Recording) -> Iterator[Finding]:
             )
 
 
-def _forces(imu: Readings) -> Iterator[Finding]:
+def _forces(imu: ImuSamples) -> Iterator[Finding]:
     length = np.linalg.norm(smoothed(imu.accel_B, rate_hz(imu.t_ns)), axis=1)
     usual = float(np.median(length))
     spread = float(np.percentile(length, 75.0) - np.percentile(length, 25.0)) / max(usual, 1e-9)
@@ -99,7 +99,7 @@ def _forces(imu: Readings) -> Iterator[Finding]:
         )
 
 
-def _rates(imu: Readings) -> Iterator[Finding]:
+def _rates(imu: ImuSamples) -> Iterator[Finding]:
     usual = float(np.sqrt((smoothed(imu.gyro_B, rate_hz(imu.t_ns)) ** 2).sum(axis=1).mean()))
     if usual > _FASTEST_MEAN_RATE:
         yield gyro_in_degrees(f"the body would turn at {usual:.0f} rad/s all the time", Certainty.LIKELY)
@@ -114,7 +114,7 @@ def gyro_in_degrees(why: str, certainty: Certainty = Certainty.CERTAIN) -> Findi
     )
 
 
-def _saturated(imu: Readings) -> Iterator[Finding]:
+def _saturated(imu: ImuSamples) -> Iterator[Finding]:
     for kind, name, values, least, unit, range_unit, factor in (
         ("gyro_saturated", "gyroscope", imu.gyro_B, _LEAST_RATE_END, "rad/s", "deg/s", 180.0 / np.pi),
         ("accel_saturated", "accelerometer", imu.accel_B, _LEAST_FORCE_END, "m/s^2", "g", 1.0 / GRAVITY_M_S2),
@@ -136,7 +136,7 @@ def _saturated(imu: Readings) -> Iterator[Finding]:
             break
 
 
-def _noise(imu: Readings, recording: Recording) -> Iterator[Finding]:
+def _noise(imu: ImuSamples, recording: Recording) -> Iterator[Finding]:
     """By differences from one reading to the next, which motion hardly enters, in the quietest stretches."""
     hz, noise = rate_hz(imu.t_ns), recording.calibration.imu
     width = max(10, round(_NOISE_WINDOW_S * hz))

@@ -36,7 +36,10 @@ def look_at_motion(recording: Recording) -> Iterator[Finding]:
 
 
 def moving_windows(recording: Recording) -> tuple[Float, Bool]:
-    """Windows of half a second while the camera looks: seconds after the first frame (W,), and which move (W,)."""
+    """Windows of half a second while the camera looks: seconds after the first frame (W,), and which move (W,).
+
+    Those with readings only: one wild stamp makes years of it.
+    """
     imu, frames_ns = recording.imu.sorted(), recording.look.t_ns
     if not len(frames_ns) or len(imu.t_ns) < 10:
         return np.empty(0), np.empty(0, bool)
@@ -45,8 +48,8 @@ def moving_windows(recording: Recording) -> tuple[Float, Bool]:
     if len(inside) < 10:
         return np.empty(0), np.empty(0, bool)
     number = ((imu.t_ns[inside] - begin) / NS_PER_S / _WINDOW_S).astype(int)
+    windows, number, count = np.unique(number, return_inverse=True, return_counts=True)
     gyro = imu.gyro_B[inside] - np.median(imu.gyro_B[inside], axis=0)
-    count = np.maximum(np.bincount(number), 1)
     means = [
         np.stack([np.bincount(number, values[:, k]) / count for k in range(3)], axis=1)
         for values in (gyro, imu.accel_B[inside])
@@ -54,4 +57,4 @@ def moving_windows(recording: Recording) -> tuple[Float, Bool]:
     length = np.linalg.norm(means[1], axis=1)
     turning = np.linalg.norm(means[0], axis=1) > _TURNING
     accelerating = np.abs(length - np.median(length)) > _ACCELERATING
-    return np.asarray(np.arange(len(count)) * _WINDOW_S), np.asarray(turning | accelerating)
+    return np.asarray(windows * _WINDOW_S), np.asarray(turning | accelerating)

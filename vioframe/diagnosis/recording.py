@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 from math import inf
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from vioframe.arrays import Bool
 from vioframe.errors import ImageSizeError
@@ -38,24 +39,24 @@ _STRETCH_S, _MOST_STRETCHES, _MOST_FRAMES_A_STRETCH = 2.0, 16, 64
 # A stretch takes the place of the poorest that is kept where it turns by so many times as much.
 _WORTH_IT = 1.3
 _POINTS = 120
-# A close look takes as long as following points; what ails images ails many.
+# What ails images ails many: some of them tell.
 _LOOK_EVERY = 3
 _SATURATED = 250
 
 
 @dataclass(frozen=True, slots=True)
-class Readings:
+class ImuSamples:
     """The IMU's, in the order in which they came: ``t_ns`` (N,), ``gyro_B`` (N, 3) and ``accel_B`` (N, 3)."""
 
     t_ns: Int
     gyro_B: Float
     accel_B: Float
 
-    def sorted(self) -> Readings:
+    def sorted(self) -> ImuSamples:
         """Those that are numbers, in the order of their stamps, of one stamp the first."""
         good = np.isfinite(self.gyro_B).all(axis=1) & np.isfinite(self.accel_B).all(axis=1)
         t_ns, first = np.unique(self.t_ns[good], return_index=True)
-        return Readings(t_ns, self.gyro_B[good][first], self.accel_B[good][first])
+        return ImuSamples(t_ns, self.gyro_B[good][first], self.accel_B[good][first])
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,7 +85,7 @@ class Recording:
     """
 
     calibration: Calibration
-    imu: Readings
+    imu: ImuSamples
     look: Look
     stretches: tuple[tuple[FrameTracks, ...], ...] = ()
     unreadable: Counter[str] = field(default_factory=Counter)
@@ -139,7 +140,7 @@ class Gatherer:
     ) -> Recording:
         """What was gathered until now."""
         values = np.array(self._readings).reshape(-1, 6)
-        imu = Readings(np.array(self._imu_ns), values[:, :3], values[:, 3:])
+        imu = ImuSamples(np.array(self._imu_ns), values[:, :3], values[:, 3:])
         brightness, contrast, bright_share, sharpness = np.array(self._looks, np.float64).reshape(-1, 4).T
         look = Look(
             np.array(self._frames_ns, np.int64),
@@ -201,11 +202,18 @@ def sharpness_of(image: Image) -> float:
     smooth = [cv2.GaussianBlur(size, (0, 0), 0.8) for size in (image, small)]
     ratios = []
     for order in ((2, 0), (0, 2)):
-        fine, coarse = (
-            float(np.percentile(np.abs(cv2.Sobel(i, cv2.CV_32F, *order, scale=0.25)), 99.0)) for i in smooth
-        )
+        bends = (cv2.Sobel(i, cv2.CV_32F, *order, scale=0.25) for i in smooth)
+        # At the same places of both: to look everywhere takes ten times as long and tells no more.
+        fine, coarse = (_sharpest(bend[::step, ::step]) for bend, step in zip(bends, (4, 1), strict=True))
         ratios.append(fine / max(coarse, 1.0))
     return min(ratios)
+
+
+def _sharpest(bend: ArrayLike) -> float:
+    """The size that one in a hundred exceeds."""
+    sizes = np.abs(bend).ravel()
+    place = int(0.99 * (len(sizes) - 1))
+    return float(np.partition(sizes, place)[place])
 
 
 def _look(image: Image) -> tuple[float, float, float, float]:

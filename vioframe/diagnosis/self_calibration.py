@@ -13,11 +13,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from vioframe.arrays import Bool
-from vioframe.diagnosis.recording import Readings
-from vioframe.geometry import kernels, so3
+from vioframe.diagnosis.recording import ImuSamples
+from vioframe.estimation.inertial.gyro_path import GyroPath
+from vioframe.estimation.turns import common_tracks, likeliest_translations
+from vioframe.geometry import so3
 from vioframe.geometry.cameras import Camera
-from vioframe.jit import kernel
-from vioframe.types import NS_PER_S, CameraOnBody, Float, FrameTracks, Int
+from vioframe.types import NS_PER_S, CameraOnBody, Float, FrameTracks
 
 BIAS, ROTATION, OFFSET, FOCAL, DISTORTION, READOUT = (
     slice(0, 3),
@@ -41,7 +42,7 @@ _SETTLED = 1e-3
 
 
 @dataclass(frozen=True, slots=True)
-class Calibrated:
+class SelfCalibration:
     """``camera``, ``R_BC`` (3, 3), offset and readout s, bias (3,) rad/s; ``cov`` (11, 11), ``cost`` and the misfit px.
 
     ``log_focal`` is that of the focal length over the one begun with; ``cov`` is in the order of the module's slices.
@@ -64,7 +65,9 @@ class Calibrated:
 class Pairs:
     """Pairs of frames and the pixels of their common tracks, with the readings to turn one into the other."""
 
-    def __init__(self, stretches: Sequence[Sequence[FrameTracks]], imu: Readings, margin_s: float) -> None:
+    def __init__(
+        self, stretches: Sequence[Sequence[FrameTracks]], camera: CameraOnBody, imu: ImuSamples, margin_s: float
+    ) -> None:
         chosen = [pair for stretch in stretches for pair in _spaced(stretch)]
         margin_ns = round(margin_s * NS_PER_S)
         begin, end = imu.t_ns[0] + margin_ns, imu.t_ns[-1] - margin_ns
@@ -80,8 +83,9 @@ class Pairs:
         self.xy = np.zeros((2, len(chosen), _MOST_TRACKS, 2))
         self.common = np.zeros((len(chosen), _MOST_TRACKS), bool)
         for p, (a, b) in enumerate(chosen):
-            i, j = _common(a, b)
+            i, j = common_tracks(a, b, _MOST_TRACKS)
             self.xy[0, p, : len(i)], self.xy[1, p, : len(i)], self.common[p, : len(i)] = a.xy[i], b.xy[j], True
+        self._row = camera.row(self.xy[..., 1])
 
     def __len__(self) -> int:
         return len(self.t_s)
@@ -92,10 +96,11 @@ class Pairs:
         out._imu_s, out._gyro_B = self._imu_s, self._gyro_B
         middle = np.median(self.t_s[:, 0]) if len(self) else 0.0
         of_half = (self.t_s[:, 0] > middle) == later
-        out.t_s, out.xy, out.common = self.t_s[of_half], self.xy[:, of_half], self.common[of_half]
+        out.t_s, out.common = self.t_s[of_half], self.common[of_half]
+        out.xy, out._row = self.xy[:, of_half], self._row[:, of_half]
         return out
 
-    def calibrate(self, start: Calibrated, free: Sequence[slice]) -> Calibrated:
+    def calibrate(self, start: SelfCalibration, free: Sequence[slice]) -> SelfCalibration:
         """From ``start`` to where tracks and gyroscope agree best in the parts that are ``free``, and the bias."""
         active = np.r_[tuple(np.arange(_SIZE)[part] for part in (BIAS, *free))]
         x, origin = np.zeros(_SIZE), start
@@ -104,7 +109,7 @@ class Pairs:
         for cauchy, iterations in _STAGES:
             for _ in range(iterations):
                 rays, usable = self._rays(_moved(origin, x))
-                t = self._translations(rays, weight * usable)
+                t = likeliest_translations(*rays[:3], weight, usable)
                 r, by_t = self._residuals(rays, t, usable)
                 J = np.zeros((*r.shape, len(active)))
                 for column, k in enumerate(active):
@@ -125,7 +130,7 @@ class Pairs:
                 if (np.abs(step) < _SETTLED * _LARGEST_STEP[active]).all():
                     break
         rays, usable = self._rays(_moved(origin, x))
-        r, _ = self._residuals(rays, self._translations(rays, weight * usable), usable)
+        r, _ = self._residuals(rays, likeliest_translations(*rays[:3], weight, usable), usable)
         squared = np.where(usable, r * r, 0.0)
         count = max(int(self.common.sum()), 1)
         # What cannot be undistorted is as bad as what is far off.
@@ -139,51 +144,22 @@ class Pairs:
         found = _moved(origin, x)
         return replace(found, cov=cov, cost=cost, misfit_px=misfit * _PIXEL_SIGMA)
 
-    def _rays(self, x: Calibrated) -> tuple[tuple[Float, Float, Float, float], Bool]:
+    def _rays(self, x: SelfCalibration) -> tuple[tuple[Float, Float, Float, float], Bool]:
         """Rays of the first frame, those of the second turned into it, R_C1C2 (P, 3, 3), the noise, and which are good.
 
         Of a rolling shutter each ray is turned to the instant of the frame's stamp, which is that of its middle row.
         """
-        height = x.camera.resolution[1]
         xy = x.camera.undistort(self.xy.reshape(-1, 2)).reshape(self.xy.shape)
         usable = self.common & np.isfinite(xy).all(axis=(0, 3))
         rays = np.concatenate([np.nan_to_num(xy), np.ones((*xy.shape[:-1], 1))], axis=-1)
-        rate_B = self._gyro_B - x.bias_gyro_B
-        R, rate = self._attitudes(rate_B, self.t_s.T + x.offset_s)
+        R, rate = GyroPath(self._imu_s, self._gyro_B - x.bias_gyro_B).at(self.t_s.T + x.offset_s)
         if x.readout_s:
-            delay = x.readout_s * ((self.xy[..., 1] + 0.5) / height - 0.5)
-            rate_C = rate @ x.R_BC
-            rays = rays + np.cross(rate_C[:, :, None], rays) * delay[..., None]
+            rate_C, delay_s = rate @ x.R_BC, x.readout_s * self._row
+            rays = rays + np.cross(rate_C[:, :, None], rays) * delay_s[..., None]
         R_C1C2 = x.R_BC.T @ np.swapaxes(R[0], -1, -2) @ R[1] @ x.R_BC
         turned = rays[1] @ np.swapaxes(R_C1C2, -1, -2)
         sigma = _PIXEL_SIGMA / x.camera.focal_px
         return (rays[0], turned, R_C1C2, sigma), np.asarray(usable)
-
-    def _attitudes(self, rate_B: Float, t_s: Float) -> tuple[Float, Float]:
-        """R_B0B (..., 3, 3) and the rate (..., 3) at times ``t_s``, by the midpoint rule along readings."""
-        dt = np.diff(self._imu_s)
-        path = _path(rate_B, dt)
-        k = np.clip(np.searchsorted(self._imu_s, t_s, side="right") - 1, 0, len(dt) - 1)
-        after = t_s - self._imu_s[k]
-        slope = (rate_B[k + 1] - rate_B[k]) / dt[k][..., None]
-        rate = rate_B[k] + slope * after[..., None]
-        return path[k] @ so3.exp(0.5 * (rate_B[k] + rate) * after[..., None]), rate
-
-    @staticmethod
-    def _translations(rays: tuple[Float, Float, Float, float], weight: Float) -> Float:
-        """(P, 3) the likeliest directions of the translations (Kanatani 2005): see vioframe.estimation.turns."""
-        f, y, R, _ = rays
-        n = np.cross(f, y)
-        moments, noise = _moments(n, weight), np.zeros_like(R)
-        for other, across in ((y, so3.hat([0.0, 0.0, 1.0])), (f, so3.hat(R[..., 2]))):
-            S = _moments(other, weight)
-            noise += np.trace(S, axis1=-2, axis2=-1)[:, None, None] * np.eye(3) - S
-            noise -= across @ S @ np.swapaxes(across, -1, -2)
-        trace = np.trace(noise, axis1=-2, axis2=-1)[:, None, None]
-        whitener = np.linalg.inv(np.linalg.cholesky(noise + (1e-6 * trace + 1e-12) * np.eye(3)))
-        transposed = np.swapaxes(whitener, -1, -2)
-        t = (transposed @ np.linalg.eigh(whitener @ moments @ transposed)[1][..., :1])[..., 0]
-        return np.asarray(t / np.linalg.norm(t, axis=1, keepdims=True))
 
     @staticmethod
     def _residuals(rays: tuple[Float, Float, Float, float], t: Float, usable: Bool) -> tuple[Float, Float]:
@@ -198,13 +174,13 @@ class Pairs:
         return r, n @ tangent / scale[..., None] * usable[..., None]
 
 
-def start_at(camera: CameraOnBody, R_BC: Float, bias_gyro_B: Float, offset_s: float) -> Calibrated:
+def start_at(camera: CameraOnBody, R_BC: Float, bias_gyro_B: Float, offset_s: float) -> SelfCalibration:
     """With the lens and the readout of ``camera``."""
     cov = np.zeros((_SIZE, _SIZE))
-    return Calibrated(camera.model, R_BC, bias_gyro_B, offset_s, camera.readout_s, 0.0, cov, np.inf, np.inf)
+    return SelfCalibration(camera.model, R_BC, bias_gyro_B, offset_s, camera.readout_s, 0.0, cov, np.inf, np.inf)
 
 
-def _moved(start: Calibrated, x: Float) -> Calibrated:
+def _moved(start: SelfCalibration, x: Float) -> SelfCalibration:
     camera = start.camera.zoomed(float(np.exp(x[7])))
     k1, k2, d3, d4 = camera.distortion
     moved = replace(camera, distortion=(k1 + float(x[8]), k2 + float(x[9]), d3, d4))
@@ -230,20 +206,6 @@ def _reduced(J: Float, by_t: Float, r: Float, robust: Float) -> tuple[Float, Flo
     return (H - H_xt @ eliminated[..., :-1]).sum(axis=0), (b - (H_xt @ eliminated[..., -1:])[..., 0]).sum(axis=0)
 
 
-def _moments(v: Float, weight: Float) -> Float:
-    return np.asarray(np.swapaxes(v * weight[..., None], -1, -2) @ v)
-
-
-@kernel
-def _path(rate_B: Float, dt: Float) -> Float:
-    """R_B0B (N, 3, 3) along readings free of bias."""
-    out = np.empty((len(rate_B), 3, 3))
-    out[0] = np.eye(3)
-    for k in range(len(dt)):
-        out[k + 1] = out[k] @ kernels.exp(0.5 * dt[k] * (rate_B[k] + rate_B[k + 1]))
-    return out
-
-
 def _spaced(stretch: Sequence[FrameTracks]) -> list[tuple[FrameTracks, FrameTracks]]:
     """Pairs about each of the spacings apart, that share enough tracks, ever second frame being a first one."""
     t_s = np.array([tracks.t_ns for tracks in stretch]) / NS_PER_S
@@ -254,14 +216,7 @@ def _spaced(stretch: Sequence[FrameTracks]) -> list[tuple[FrameTracks, FrameTrac
             if (
                 j > i
                 and abs(t_s[j] - t_s[i] - spacing) < 0.5 * spacing
-                and len(_common(stretch[i], stretch[j])[0]) >= (_FEWEST_TRACKS)
+                and len(common_tracks(stretch[i], stretch[j], _MOST_TRACKS)[0]) >= _FEWEST_TRACKS
             ):
                 out.append((stretch[i], stretch[j]))
     return out
-
-
-def _common(a: FrameTracks, b: FrameTracks) -> tuple[Int, Int]:
-    """Where the tracks of both are in each, at most so many, spread over the age of the tracks."""
-    _, i, j = np.intersect1d(a.ids, b.ids, assume_unique=True, return_indices=True)
-    some = np.linspace(0, len(i) - 1, min(len(i), _MOST_TRACKS)).astype(int)
-    return i[some], j[some]

@@ -60,16 +60,16 @@ def rate_hz(t_ns: Int) -> float:
 
 
 def _missing(recording: Recording) -> Iterator[Finding]:
-    for count, kind, what in (
-        (len(recording.imu.t_ns), "imu_missing", "readings of the IMU"),
-        (len(recording.look.t_ns), "images_missing", "images"),
+    for count, kind, what, unreadable in (
+        (len(recording.imu.t_ns), "imu_missing", "readings of the IMU", "imu_unreadable"),
+        (len(recording.look.t_ns), "images_missing", "images", "frame_unreadable"),
     ):
-        if count < _FEWEST:
-            yield Finding(
-                kind,
-                f"there are {count or 'no'} {what}",
-                "record both, or name the right topic with the reader's options (`vioframe plugins READER`)",
-            )
+        if count >= _FEWEST:
+            continue
+        remedy = "record both, or name the right topic with the reader's options (`vioframe plugins READER`)"
+        if recording.unreadable[unreadable]:
+            what, remedy = f"{what} that can be read", "copy the recording again, or look at its disk"
+        yield Finding(kind, f"there are {count or 'no'} {what}", remedy)
 
 
 def _stuck(imu_ns: Int, frames_ns: Int) -> Iterator[Finding]:

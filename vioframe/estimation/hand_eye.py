@@ -11,17 +11,17 @@ Translation plays no part, so that neither scale, gravity nor the lever arm need
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
 
 from vioframe.arrays import Float, Int
+from vioframe.estimation.inertial.gyro_path import GyroPath
 from vioframe.estimation.turns import Turn
 from vioframe.geometry import so3
-from vioframe.jit import kernel
 from vioframe.types import NS_PER_S
 
 Part = Literal["offset", "rotation", "focal"]
@@ -133,10 +133,8 @@ class Turns:
 
         With each offset the bias is eliminated, which leaves an orthogonal Procrustes problem for the rotation.
         """
-        offsets = np.arange(-LARGEST_OFFSET_S, LARGEST_OFFSET_S + 1e-9, _GRID_S)
-        R = _path(self._t_s, self._gyro_B)
-        R_1, R_2 = (self._at(R, self._gyro_B, t + offsets[:, None])[0] for t in (self._first, self._second))
-        beta, gamma, dt = so3.log(np.swapaxes(R_1, -1, -2) @ R_2), so3.log(self.R_C1C2), self._dt
+        offsets, beta = self._on_grid
+        gamma, dt = so3.log(self.R_C1C2), self._dt
         known = np.linalg.norm(self._whitener, axis=(1, 2))
         weight = np.tile(known**2, (len(offsets), 1))
         for _ in range(_GRID_ITERATIONS):
@@ -154,12 +152,18 @@ class Turns:
         best = int(np.argmin(typical))
         return HandEye(bias[best], R_BC[best], float(offsets[best]))
 
+    @cached_property
+    def _on_grid(self) -> tuple[Float, Float]:
+        """Offsets (G,), and the gyroscope's turns (G, P, 3) with each, its bias left in them."""
+        offsets = np.arange(-LARGEST_OFFSET_S, LARGEST_OFFSET_S + 1e-9, _GRID_S)
+        path = GyroPath(self._t_s, self._gyro_B)
+        R_1, R_2 = (path.at(t + offsets[:, None])[0] for t in (self._first, self._second))
+        return offsets, so3.log(np.swapaxes(R_1, -1, -2) @ R_2)
+
     def _linearise(self, x: HandEye) -> tuple[Float, Float]:
         """Whitened residuals (P, 3) and Jacobian (P, 3, 8) by [bias rotation offset log_focal]."""
-        rate_B = self._gyro_B - x.bias_gyro_B
-        R = _path(self._t_s, rate_B)
-        R_1, rate_1 = self._at(R, rate_B, self._first + x.offset_s)
-        R_2, rate_2 = self._at(R, rate_B, self._second + x.offset_s)
+        path = GyroPath(self._t_s, self._gyro_B - x.bias_gyro_B)
+        (R_1, rate_1), (R_2, rate_2) = (path.at(t + x.offset_s) for t in (self._first, self._second))
         R_B2B1 = np.swapaxes(R_2, -1, -2) @ R_1
         R_C1C2 = x.R_BC.T @ np.swapaxes(R_B2B1, -1, -2) @ x.R_BC
         off = so3.log(np.swapaxes(self.R_C1C2, -1, -2) @ R_C1C2) - self._by_focal * x.log_focal
@@ -170,36 +174,11 @@ class Turns:
         J[:, :, 7] = -self._by_focal
         return (self._whitener @ off[..., None])[..., 0], self._whitener @ J
 
-    def _at(self, R: Float, rate_B: Float, t_s: Float) -> tuple[Float, Float]:
-        """The path ``R`` (N, 3, 3) and the rate at times of any shape."""
-        k = np.clip(np.searchsorted(self._t_s, t_s, side="right") - 1, 0, len(self._t_s) - 2)
-        after = t_s - self._t_s[k]
-        slope = (rate_B[k + 1] - rate_B[k]) / (self._t_s[k + 1] - self._t_s[k])[..., None]
-        rate = rate_B[k] + slope * after[..., None]
-        return R[k] @ so3.exp(0.5 * (rate_B[k] + rate) * after[..., None]), rate
 
-
-@kernel
-def _path(t_s: Float, rate_B: Float) -> Float:
-    """R_B0B (N, 3, 3) along readings free of bias, by unit quaternions."""
-    R = np.empty((len(t_s), 3, 3))
-    w, x, y, z = 1.0, 0.0, 0.0, 0.0
-    for k in range(len(t_s)):
-        if k:
-            half = 0.25 * (t_s[k] - t_s[k - 1])
-            a = half * (rate_B[k, 0] + rate_B[k - 1, 0])
-            b = half * (rate_B[k, 1] + rate_B[k - 1, 1])
-            c = half * (rate_B[k, 2] + rate_B[k - 1, 2])
-            angle = math.sqrt(a * a + b * b + c * c)
-            s = math.sin(angle) / angle if angle > 1e-8 else 1.0
-            a, b, c, d = s * a, s * b, s * c, math.cos(angle)
-            w, x, y, z = (
-                w * d - x * a - y * b - z * c,
-                w * a + x * d + y * c - z * b,
-                w * b - x * c + y * d + z * a,
-                w * c + x * b - y * a + z * d,
-            )
-        R[k, 0, 0], R[k, 0, 1], R[k, 0, 2] = 1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)
-        R[k, 1, 0], R[k, 1, 1], R[k, 1, 2] = 2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)
-        R[k, 2, 0], R[k, 2, 1], R[k, 2, 2] = 2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)
-    return R
+def top_beside(values: Float, best: int) -> float:
+    """How far beside the largest of ``values`` (N,) the top of the parabola through its neighbours is, in places."""
+    if not 0 < best < len(values) - 1:
+        return 0.0
+    before, at, after = values[best - 1 : best + 2]
+    bend = before - 2.0 * at + after
+    return float(0.5 * (before - after) / bend) if bend < 0.0 else 0.0

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vioframe.arrays import Bool, Float
+from vioframe.arrays import Bool, Float, Int
 from vioframe.geometry import kernels, so3
 from vioframe.jit import kernel
 from vioframe.types import FrameTracks
@@ -43,15 +43,21 @@ class Turn:
 
 def turn_between(before: FrameTracks, now: FrameTracks, sigma: float) -> Turn | None:
     """From the tracks that both frames share, with noise ``sigma`` on the z = 1 plane; None where they are too few."""
-    _, i, j = np.intersect1d(before.ids, now.ids, assume_unique=True, return_indices=True)
+    i, j = common_tracks(before, now, _MOST_TRACKS)
     if len(i) < FEWEST_TRACKS:
         return None
-    some = np.linspace(0, len(i) - 1, min(len(i), _MOST_TRACKS)).astype(np.int64)
-    f, g = _rays(before.xy_normalised[i[some]]), _rays(now.xy_normalised[j[some]])
+    f, g = _rays(before.xy_normalised[i]), _rays(now.xy_normalised[j])
     # To begin with, the rotation that explains it best without moving.
     u, v = (rays / np.linalg.norm(rays, axis=1, keepdims=True) for rays in (f, g))
     R, H, b, misfit = _turn(f, g, so3.project(u.T @ v), sigma, _STAGES)
     return Turn((before.t_ns, now.t_ns), R, H, b, misfit)
+
+
+def common_tracks(a: FrameTracks, b: FrameTracks, most: int) -> tuple[Int, Int]:
+    """Where the tracks of both frames are in each; at most so many, spread over the age of the tracks."""
+    _, i, j = np.intersect1d(a.ids, b.ids, assume_unique=True, return_indices=True)
+    some = np.linspace(0, len(i) - 1, min(len(i), most)).astype(np.int64)
+    return i[some], j[some]
 
 
 def _rays(xy: Float) -> Float:
@@ -115,23 +121,12 @@ def linearise_pair(
     ``distance`` (N,) each track's from its epipolar line, in standard deviations, in which ``cauchy``, the scale of the
     robust loss, is too.
     """
-    N = np.zeros((3, 3))
-    S_y, S_f = np.zeros((3, 3)), np.zeros((3, 3))
+    y = np.empty((len(f), 3))
     for k in range(len(f)):
-        if not common[k]:
-            continue
-        w = weight[k]
-        y0 = R[0, 0] * g[k, 0] + R[0, 1] * g[k, 1] + R[0, 2] * g[k, 2]
-        y1 = R[1, 0] * g[k, 0] + R[1, 1] * g[k, 1] + R[1, 2] * g[k, 2]
-        y2 = R[2, 0] * g[k, 0] + R[2, 1] * g[k, 1] + R[2, 2] * g[k, 2]
-        f0, f1, f2 = f[k, 0], f[k, 1], f[k, 2]
-        n0, n1, n2 = f1 * y2 - f2 * y1, f2 * y0 - f0 * y2, f0 * y1 - f1 * y0
-        _add_outer(N, n0, n1, n2, w)
-        _add_outer(S_y, y0, y1, y2, w)
-        _add_outer(S_f, f0, f1, f2, w)
-    for M in (N, S_y, S_f):
-        M[1, 0], M[2, 0], M[2, 1] = M[0, 1], M[0, 2], M[1, 2]
-    t = likeliest_translation(N, S_y, S_f, R)
+        if common[k]:
+            for a in range(3):
+                y[k, a] = R[a, 0] * g[k, 0] + R[a, 1] * g[k, 1] + R[a, 2] * g[k, 2]
+    t = _translation(f, y, R, weight, common)
 
     # Two directions across t.
     u, v = np.zeros(3), np.zeros(3)
@@ -151,9 +146,7 @@ def linearise_pair(
         if not common[k]:
             continue
         g0, g1, g2 = g[k, 0], g[k, 1], g[k, 2]
-        y0 = R[0, 0] * g0 + R[0, 1] * g1 + R[0, 2] * g2
-        y1 = R[1, 0] * g0 + R[1, 1] * g1 + R[1, 2] * g2
-        y2 = R[2, 0] * g0 + R[2, 1] * g1 + R[2, 2] * g2
+        y0, y1, y2 = y[k, 0], y[k, 1], y[k, 2]
         f0, f1, f2 = f[k, 0], f[k, 1], f[k, 2]
         n0, n1, n2 = f1 * y2 - f2 * y1, f2 * y0 - f0 * y2, f0 * y1 - f1 * y0
         # d (n . t) by f: y x t; by g: R' (t x f).
@@ -201,7 +194,45 @@ def _add_outer(M: Float, v0: float, v1: float, v2: float, w: float) -> None:
 
 
 @kernel
-def likeliest_translation(N: Float, S_y: Float, S_f: Float, R: Float) -> Float:
+def likeliest_translations(f: Float, y: Float, R_C1C2: Float, weight: Float, common: Bool) -> Float:
+    """(P, 3) of P pairs, see :func:`_translation`: f, y (P, N, 3), R_C1C2 (P, 3, 3), weight and common (P, N).
+
+    Where no track counts it is along the optical axis.
+    """
+    t = np.zeros((len(f), 3))
+    for p in range(len(f)):
+        if (common[p] & (weight[p] > 0.0)).any():
+            t[p] = _translation(f[p], y[p], R_C1C2[p], weight[p], common[p])
+        else:
+            t[p, 2] = 1.0
+    return t
+
+
+@kernel
+def _translation(f: Float, y: Float, R: Float, weight: Float, common: Bool) -> Float:
+    """The direction that the normals of the bearings f and ``y`` = R g are most perpendicular to, as they are weighed.
+
+    Of the tracks (N,) those count that are ``common``.
+    """
+    N = np.zeros((3, 3))
+    S_y, S_f = np.zeros((3, 3)), np.zeros((3, 3))
+    for k in range(len(f)):
+        if not common[k]:
+            continue
+        w = weight[k]
+        y0, y1, y2 = y[k, 0], y[k, 1], y[k, 2]
+        f0, f1, f2 = f[k, 0], f[k, 1], f[k, 2]
+        n0, n1, n2 = f1 * y2 - f2 * y1, f2 * y0 - f0 * y2, f0 * y1 - f1 * y0
+        _add_outer(N, n0, n1, n2, w)
+        _add_outer(S_y, y0, y1, y2, w)
+        _add_outer(S_f, f0, f1, f2, w)
+    for M in (N, S_y, S_f):
+        M[1, 0], M[2, 0], M[2, 1] = M[0, 1], M[0, 2], M[1, 2]
+    return _likeliest(N, S_y, S_f, R)
+
+
+@kernel
+def _likeliest(N: Float, S_y: Float, S_f: Float, R: Float) -> Float:
     """The unit t that minimises t' N t over t' noise t (Kanatani 2005), N the moments of the normals n = f x y.
 
     Noise e across the optical axis z moves a normal by e x y, and the average of (e x y)(e x y)' over the plane is

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from vioframe.estimation.hand_eye import HandEye, Part, Turns
+from vioframe.estimation.hand_eye import HandEye, Part, Turns, top_beside
 from vioframe.estimation.inertial.readings import Readings
 from vioframe.estimation.initialization.window import PIXEL_SIGMA, refuse_unless
 from vioframe.estimation.turns import Turn, turn_between
@@ -139,9 +139,10 @@ class SensorCheck:
             return None
         given = HandEye(np.zeros(3), camera.R_BC)
         noise = float(np.median([turn.misfit for *_, turn in self._pairs])) / _MEDIAN
-        if camera.rotation_known and _fits(turns, given, noise):
+        as_given = turns.fit(given, ()) if camera.rotation_known else None
+        if as_given is not None and _fits(turns, *as_given, noise):
             return None
-        best, parts, _, variance = _best(turns, given, camera.rotation_known)
+        best, parts, variance = _best(turns, given, as_given)
         if variance > (_BADLY * noise) ** 2 and (found := self._other_focal(readings, calibration, best)) is not None:
             return found
         if not parts:
@@ -191,9 +192,7 @@ class SensorCheck:
         between = best + int(np.sign(as_given - best))
         if squares[best] > _FOCAL_BETTER * squares[as_given] or squares[between] > _FOCAL_VALLEY * squares[as_given]:
             return None
-        a, b, c = np.log(squares[best - 1 : best + 2])
-        step = _FOCALS[1] - _FOCALS[0]
-        factor = 1.0 + _FOCALS[best] + 0.5 * step * (a - c) / (a - 2.0 * b + c)
+        factor = 1.0 + _FOCALS[best] + (_FOCALS[1] - _FOCALS[0]) * top_beside(-np.log(squares), best)
         return Found(calibration.with_camera(0, model=camera.model.zoomed(factor)), focal_sigma=_FOCAL_SIGMA)
 
 
@@ -205,34 +204,37 @@ def _anew(pairs: Iterable[tuple[FrameTracks, FrameTracks]], camera: Camera, sigm
             yield before, now, turn
 
 
-def _fits(turns: Turns, given: HandEye, noise: float) -> bool:
-    """Whether turns scatter about ``given`` as their tracks' ``noise`` has them, and nothing near fits much better."""
-    x, variance = turns.fit(given, ())
+def _fits(turns: Turns, x: HandEye, variance: float, noise: float) -> bool:
+    """Whether turns scatter about ``x`` as their tracks' ``noise`` has them, and nothing near fits much better."""
     if variance > (_WELL * noise) ** 2:
         return False
     near, variance = turns.fit(x, ("rotation", "offset"))
     return turns.cost(x, variance) < turns.cost(near, variance) + _BETTER_BY
 
 
-def _best(turns: Turns, given: HandEye, rotation_known: bool) -> tuple[HandEye, tuple[Part, ...], float, float]:
-    """The fewest parts that have to be other than ``given``, how, the sum of squares then, and their variance."""
-    starts: dict[tuple[Part, ...], HandEye] = {}
-    if rotation_known:
-        starts[()] = given
-        starts["offset",] = turns.nearest(given, turned=False)
+def _best(
+    turns: Turns, given: HandEye, as_given: tuple[HandEye, float] | None
+) -> tuple[HandEye, tuple[Part, ...], float]:
+    """The fewest parts that have to be other than ``given``, how, and the variance of the turns then.
+
+    ``as_given`` is the fit with none other; None where nobody knows how the camera is turned.
+    """
+    fits: dict[tuple[Part, ...], tuple[HandEye, float]] = {}
+    if as_given is not None:
+        fits[()] = as_given
+        fits["offset",] = turns.fit(turns.nearest(given, turned=False), ("offset",))
     turned = turns.nearest(given, turned=True)
-    starts["rotation",] = replace(turned, offset_s=0.0)
-    starts["rotation", "offset"] = turned
-    fits = {parts: turns.fit(start, parts) for parts, start in starts.items()}
+    fits["rotation",] = turns.fit(replace(turned, offset_s=0.0), ("rotation",))
+    fits["rotation", "offset"] = turns.fit(turned, ("rotation", "offset"))
     variance = min(variance for _, variance in fits.values())
     costs = {parts: turns.cost(x, variance) for parts, (x, _) in fits.items()}
     limit = _BETTER * min(costs.values()) + _BETTER_BY
     # In the order of how much they change.
     parts = next(parts for parts, cost in costs.items() if cost <= limit)
-    (x, _), cost = fits[parts], costs[parts]
-    if rotation_known and _is_near(x, given, parts):
+    x, _ = fits[parts]
+    if as_given is not None and _is_near(x, given, parts):
         parts = ()
-    return x, parts, cost, variance
+    return x, parts, variance
 
 
 def _is_near(x: HandEye, given: HandEye, parts: Sequence[Part]) -> bool:

@@ -11,6 +11,7 @@ import numpy as np
 
 from vioframe.arrays import Bool
 from vioframe.estimation.factors.tracks import TrackTable
+from vioframe.estimation.hand_eye import BIAS_SIGMA
 from vioframe.estimation.inertial.preintegration import join_segments
 from vioframe.geometry import so3
 from vioframe.types import CameraOnBody, Float, FrameTracks, ImuSegment, Int, NavState
@@ -19,7 +20,7 @@ Packet = tuple[ImuSegment, FrameTracks]
 
 PIXEL_SIGMA = 1.0
 """Standard deviation of an observation, px."""
-BIAS_GYRO_SIGMA, BIAS_ACCEL_SIGMA = 0.2, 0.15
+BIAS_GYRO_SIGMA, BIAS_ACCEL_SIGMA = BIAS_SIGMA, 0.15
 """Priors of the biases about zero, rad/s and m/s^2; those of EuRoC's IMU are 0.08 and 0.13."""
 LARGEST_IMU_GAP_S = 0.1
 """A longer stretch without readings begins everything anew."""
