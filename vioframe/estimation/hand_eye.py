@@ -98,8 +98,9 @@ class Turns:
             squared = (r * r).sum(axis=1)
             variance = max(float(np.median(squared)) / _MEDIAN_CHI2, 1e-4)
             weight = 1.0 / (1.0 + squared / (_CAUCHY**2 * variance)) / variance
-            H = np.einsum("p,pki,pkj->ij", weight, J, J)[np.ix_(active, active)]
-            g = np.einsum("p,pki,pk->i", weight, J, r)[active]
+            columns = J[:, :, active].reshape(-1, len(active))
+            weighted = columns.T * np.repeat(weight, 3)
+            H, g = weighted @ columns, weighted @ r.ravel()
             H[:3, :3] += np.eye(3) / BIAS_SIGMA**2
             g[:3] += x.bias_gyro_B / BIAS_SIGMA**2
             # Half a turn that nothing tells of is as likely as none.
