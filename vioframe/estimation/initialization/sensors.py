@@ -26,8 +26,10 @@ _LOOK_BACK_NS = 4 * NS_PER_S
 _FEWEST_TURNS = 8
 # What is given fits where nothing else fits better by so much: as a part of the sum of squares, and in all.
 _BETTER, _BETTER_BY = 1.3, 15.0
-# ... and where what would is farther from it than this, s and rad: less than that an estimator finds by itself.
+# ... and where what would is farther from it than this, s and rad: less than that an estimator finds by itself; and by
+# more than so many standard deviations.
 _NEAR: dict[Part, float] = {"offset": 0.008, "rotation": np.deg2rad(3.0)}
+_INSIGNIFICANT = 2.0
 # Standard deviations with which a part can be taken over, s, rad and relative.
 _NAMES: dict[Part, str] = {"offset": "the time offset", "rotation": "the camera's rotation on the body"}
 _SURE: dict[Part, float] = {"offset": 0.012, "rotation": np.deg2rad(1.5)}
@@ -147,7 +149,7 @@ class SensorCheck:
             return found
         if not parts:
             return None
-        sigma = {part: best.sigma(part) * np.sqrt(_OVERLAP) for part in parts}
+        sigma = {part: _sigma(best, part) for part in parts}
         unsure = [part for part in parts if not sigma[part] <= _SURE[part]]
         what = " and ".join(_NAMES[part] for part in parts)
         wrong = f"{what} given {'do' if len(parts) > 1 else 'does'} not fit, and what does"
@@ -239,4 +241,8 @@ def _best(
 
 def _is_near(x: HandEye, given: HandEye, parts: Sequence[Part]) -> bool:
     off = {"offset": abs(x.offset_s), "rotation": float(np.linalg.norm(so3.log(given.R_BC.T @ x.R_BC)))}
-    return all(off[part] <= _NEAR[part] for part in parts)
+    return all(off[part] <= max(_NEAR[part], _INSIGNIFICANT * _sigma(x, part)) for part in parts)
+
+
+def _sigma(x: HandEye, part: Part) -> float:
+    return float(x.sigma(part) * np.sqrt(_OVERLAP))
