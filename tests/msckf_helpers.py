@@ -22,7 +22,7 @@ START_COV = np.diag(np.repeat([0.005, 0.001, 0.02, 0.005, 0.05], 3) ** 2)
 def prior_of(calibration: Calibration) -> CalibrationEstimate:
     """``calibration`` as well known as the life cycle takes any to be."""
     intrinsics = np.repeat([1.0, 0.005], 4)
-    sigma = CameraSigma(np.full(3, 0.005), np.full(3, 0.015), 0.01, intrinsics, 0.02)
+    sigma = CameraSigma(np.full(3, 0.005), np.full(3, 0.015), 0.01, intrinsics)
     return CalibrationEstimate(calibration, (sigma,))
 
 

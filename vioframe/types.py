@@ -217,9 +217,13 @@ class Calibration:
         return replace(self, cameras=tuple(cameras))
 
 
+UNKNOWN_READOUT_S = 0.02
+"""Standard deviation of a readout of which nobody knows more than that it is shorter than a frame."""
+
+
 @dataclass(frozen=True, slots=True)
 class CameraSigma:
-    """Standard deviations of a camera's calibration; zero is what is taken as given and not estimated.
+    """Standard deviations of a camera's calibration; zero is what is taken as given.
 
     ``rotation`` (3,) rad and ``position`` (3,) m of the camera on the body, right perturbation; ``time_offset_s``;
     ``intrinsics`` (8,) of fx fy cx cy px and of the four distortion coefficients; ``readout_s``.

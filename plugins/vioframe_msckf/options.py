@@ -29,6 +29,6 @@ class MsckfOptions:
     calibrate_time_offset: bool = True
     """Estimate what is left of the time offset between camera and IMU."""
     calibrate_readout: bool = False
-    """Estimate the readout time of a rolling shutter."""
+    """Estimate the readout time of a rolling shutter, as is done anyway where another than given was found."""
     calibrate_intrinsics: bool = True
     """Estimate focal lengths, principal point and distortion."""

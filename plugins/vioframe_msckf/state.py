@@ -25,6 +25,7 @@ from vioframe.types import (
     DTHETA,
     DV,
     NS_PER_S,
+    UNKNOWN_READOUT_S,
     CalibrationEstimate,
     CameraSigma,
     Float,
@@ -99,6 +100,7 @@ class FilterState:
         intrinsics: bool,
         readout: bool = False,
     ):
+        """With covariance, on what of the calibration is to be estimated, too; ``readout`` though it is given."""
         assert initial.cov is not None
         self.R_WB, self.p_WB, self.v_WB = initial.R_WB.copy(), initial.p_WB.copy(), initial.v_WB.copy()
         self.bias_gyro_B, self.bias_accel_B = initial.bias_gyro_B.copy(), initial.bias_accel_B.copy()
@@ -116,7 +118,8 @@ class FilterState:
         self.p_WF: Float = np.empty((0, 3))
         self.p_WF_first: Float = np.empty((0, 3))
 
-        self.calibrated = slice(IMU, READOUT.stop if readout else INTRINSICS.stop)
+        readout_sigma_s = known.readout_s or readout * UNKNOWN_READOUT_S
+        self.calibrated = slice(IMU, READOUT.stop if readout_sigma_s else INTRINSICS.stop)
         """Columns of the calibration; the clones begin where it ends."""
         sigma = np.zeros(self.calibrated.stop)
         if extrinsics:
@@ -125,8 +128,7 @@ class FilterState:
             sigma[OFFSET] = known.time_offset_s
         if intrinsics:
             sigma[INTRINSICS] = known.intrinsics
-        if readout:
-            sigma[READOUT] = known.readout_s
+        sigma[READOUT] = readout_sigma_s
         self.cov: Float = np.diag(sigma**2)
         self.cov[:IMU, :IMU] = initial.cov
 

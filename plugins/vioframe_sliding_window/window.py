@@ -32,6 +32,7 @@ from vioframe.estimation.standstill import Standstill
 from vioframe.geometry.kernels import intrinsics_of
 from vioframe.types import (
     NS_PER_S,
+    UNKNOWN_READOUT_S,
     CalibrationEstimate,
     CameraSigma,
     Float,
@@ -67,6 +68,7 @@ class Window:
         self._camera_model, intrinsics = intrinsics_of(camera.model)
         self._camera = Calibrated(camera.R_BC, camera.p_BC, 0.0, camera.readout_s, intrinsics)
         known = sigma.stacked()
+        known[READOUT] = known[READOUT] or options.calibrate_readout * UNKNOWN_READOUT_S
         self._calibrated = _calibrated(options) & (known > 0.0)
         self._camera_sigma = np.where(self._calibrated, known, 0.0)
         self._prior = Prior.of(state, self._camera, self._camera_sigma)
@@ -295,7 +297,7 @@ class Window:
         )
 
     def _shutter(self, rows: Int) -> Shutter:
-        if not (self._camera.readout_s or self._options.calibrate_readout):
+        if not (self._camera.readout_s or self._calibrated[READOUT]):
             return GLOBAL_SHUTTER
         states = self._states
         velocity_B = np.einsum("kji,kj->ki", states.R_WB, states.v_WB)
@@ -330,10 +332,10 @@ class Window:
 
 
 def _calibrated(options: SlidingWindowOptions) -> Bool:
-    """(16,) what of the calibration is to be estimated."""
+    """(16,) what of the calibration is to be estimated unless it is known for sure."""
     out = np.empty(CALIBRATION_SIZE, bool)
     out[:OFFSET], out[OFFSET] = options.calibrate_extrinsics, options.calibrate_time_offset
-    out[READOUT], out[INTRINSICS] = options.calibrate_readout, options.calibrate_intrinsics
+    out[READOUT], out[INTRINSICS] = True, options.calibrate_intrinsics
     return out
 
 

@@ -34,6 +34,11 @@ class Readings:
     def cover(self, begin_ns: int, end_ns: int) -> bool:
         return bool(len(self.t_ns)) and bool(self.t_ns[0] <= begin_ns) and bool(end_ns <= self.t_ns[-1])
 
+    def gyro_at(self, t_ns: int) -> Float:
+        """(3,) rad/s; beyond the readings that of the nearest."""
+        rate_B: Float = self._at(self.gyro_B, min(max(t_ns, int(self.t_ns[0])), int(self.t_ns[-1])))[0]
+        return rate_B
+
     def between(self, begin_ns: int, end_ns: int) -> ImuSegment:
         """The readings from ``begin_ns`` to ``end_ns``, which they must :meth:`cover`: a single one for an instant."""
         if begin_ns == end_ns:

@@ -61,8 +61,9 @@ _LEAST_PARALLAX_PX, _LARGEST_ERROR_PX = 5.0, 2.0
 # The readings' residuals, per degree of freedom: vibration makes them larger than the data sheet's noise.
 _MAX_INERTIAL = 9.0
 _MAX_BIAS_ACCEL = 4.0 * BIAS_ACCEL_SIGMA
-# Largest standard deviations that are accepted: of scale (relative), velocity on any axis, and gravity's direction.
-_SCALE_SIGMA, _VELOCITY_SIGMA, _TILT_SIGMA_DEG = 0.06, 0.05, 1.0
+# Largest standard deviations that are accepted: of scale (relative), velocity on any axis (m/s, or as a part of the
+# speed where that is more), and gravity's direction.
+_SCALE_SIGMA, _VELOCITY_SIGMA, _SPEED_SIGMA, _TILT_SIGMA_DEG = 0.06, 0.05, 0.03, 1.0
 # Beyond so many times these the first adjustment is not gone on with.
 _HOPELESS = 1.5
 
@@ -89,7 +90,7 @@ def initialise(packets: Sequence[Packet], calibration: Calibration, sigma: Float
     refuse_unless(alignment.scale > 0.0, "the readings contradict the direction of the motion in the images")
     x = _start_of_adjustment(window.without_last(), structure, alignment, calibration)
     problem, solution = _adjusted(window.without_last(), x, calibration, sigma)
-    _check_uncertainty(solution.variables.states.p_WB, covariance(problem, solution.variables, sigma), _HOPELESS)
+    _check_uncertainty(solution.variables.states, covariance(problem, solution.variables, sigma), _HOPELESS)
     keep = _explained(problem, solution.variables)
     window = window.only(keep)
     _require(window, "tracks fit the bundle adjustment")
@@ -107,7 +108,7 @@ def initialise(packets: Sequence[Packet], calibration: Calibration, sigma: Float
     _check_fit(problem, solution)
     x = solution.variables
     cov = covariance(problem, x, sigma)
-    _check_uncertainty(x.states.p_WB, cov)
+    _check_uncertainty(x.states, cov)
     keep = _explained(problem, x)
     return _estimate(window.only(keep), x.states, cov, _positions(problem, x)[keep])
 
@@ -254,17 +255,18 @@ def _newest(cov: Float) -> Float:
     return cov[-15 - CALIBRATION_SIZE : -CALIBRATION_SIZE, -15 - CALIBRATION_SIZE : -CALIBRATION_SIZE]
 
 
-def _check_uncertainty(p_WB: Float, cov: Float, factor: float = 1.0) -> None:
+def _check_uncertainty(states: StateArrays, cov: Float, factor: float = 1.0) -> None:
     """Velocity, gravity's direction and scale must be determined well; ``cov`` is of all states and the calibration.
 
-    ``p_WB`` (K, 3) is the path; the limits are ``factor`` times as wide.
+    The limits are ``factor`` times as wide.
     """
     newest = _newest(cov)
     velocity = float(np.sqrt(np.linalg.eigvalsh(newest[DV, DV])[-1]))
     tilt = float(np.rad2deg(np.sqrt(np.linalg.eigvalsh(newest[DTHETA, DTHETA])[-1])))
-    scale = scale_sigma(p_WB, cov)
+    scale = scale_sigma(states.p_WB, cov)
+    enough = max(_VELOCITY_SIGMA, _SPEED_SIGMA * float(np.linalg.norm(states.v_WB[-1])))
     for unsure, what in (
-        (velocity > factor * _VELOCITY_SIGMA, f"velocity known to {velocity:.3f} m/s only"),
+        (velocity > factor * enough, f"velocity known to {velocity:.3f} m/s only"),
         (tilt > factor * _TILT_SIGMA_DEG, f"gravity's direction known to {tilt:.2f} deg only"),
         (scale > factor * _SCALE_SIGMA, f"scale known to {100.0 * scale:.0f} % only"),
     ):

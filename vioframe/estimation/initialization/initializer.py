@@ -17,6 +17,7 @@ from vioframe.estimation.initialization.window import (
     Packet,
     RefusalError,
     UnsureError,
+    seen_anew,
     unrolled,
 )
 from vioframe.types import NS_PER_S, Calibration, CameraSigma, FrameTracks, ImuNoise, ImuSegment
@@ -33,16 +34,16 @@ _SOON_S, _LATER_S, _LATEST_S = 0.1, 0.05, 0.6
 # alignment errors do over its seconds: with 8 in all its squared errors on EuRoC's flights are as its covariance says.
 # Readings that are smoother than their calibration has it count as such: this many times what they jump by.
 _IN_MOTION, _JUMPS = 2.0, 2.5
-# How well a calibration is known (rad, m, s, px, distortion), as published for OpenVINS on EuRoC. Of a readout that is
-# to be estimated hardly more is known than that it is shorter than a frame, s.
-GIVEN = CameraSigma(np.full(3, 0.005), np.full(3, 0.015), 0.01, np.repeat([1.0, 0.005], 4), 0.02)
+# How well a calibration is known (rad, m, s, px, distortion), as published for OpenVINS on EuRoC.
+GIVEN = CameraSigma(np.full(3, 0.005), np.full(3, 0.015), 0.01, np.repeat([1.0, 0.005], 4))
 
 
 class Initializer:
     """Tries the static method at every frame, and the dynamic one every so often, until one is sure of itself.
 
-    Ahead of the dynamic method time offset, the camera's rotation on the body and its focal length are held against
-    what turns of camera and gyroscope say, and others found in their place where they do not fit, or are not known.
+    Ahead of the dynamic method time offset, the camera's rotation on the body, its focal length and readout are held
+    against what turns of camera and gyroscope say, and others found in their place where they do not fit, or are not
+    known.
     ``imu_noise_factor`` is that of :meth:`~vioframe.types.ImuNoise.in_flight`. Every attempt is logged to
     ``vioframe.estimation.initialization``.
     """
@@ -147,11 +148,9 @@ class Initializer:
             self._take_over(found)
             if self._packets[-1][1].t_ns != newest_ns:
                 return None
-        # Few frames tell little of a readout; it is taken as given.
-        sigma = replace(self.camera_sigma, readout_s=0.0).stacked()
         calibration = replace(self._calibration, imu=self._noise_in_motion())
         try:
-            return dynamic.initialise(self._last(self._window_s), calibration, sigma)
+            return dynamic.initialise(self._last(self._window_s), calibration, self.camera_sigma.stacked())
         except UnsureError:
             self._window_s = min(self._window_s * _LONGER, _LONGEST_WINDOW_S)
             raise
@@ -170,15 +169,14 @@ class Initializer:
         )
 
     def _take_over(self, found: Found) -> None:
-        """Cut frames and readings anew, and undistort the points, as ``found`` has it."""
+        """Cut frames and readings anew, and see the points, as ``found`` has it."""
         _log.info("%d %s", self._packets[-1][1].t_ns, found)
         (before,), (camera,) = self._calibration.cameras, found.calibration.cameras
         self._found, self._calibration = found.after(self._found), found.calibration
         self._readings.move(camera.time_offset_ns - before.time_offset_ns)
         frames = [*(tracks for _, tracks in self._packets), *self._waiting]
-        if camera.model != before.model:
-            frames = [tracks.undistorted(camera.model).finite() for tracks in frames]
-            self._sensors.undistort(camera.model)
+        frames = [seen_anew(tracks, camera, self._readings.gyro_at(tracks.t_ns)) for tracks in frames]
+        self._sensors.see_through(camera, self._readings)
         self._packets, self._waiting = [], [f for f in frames if f.t_ns >= self._readings.t_ns[0]]
         self._cut()
 

@@ -14,11 +14,11 @@ import numpy as np
 
 from vioframe.estimation.hand_eye import HandEye, Part, Turns, top_beside
 from vioframe.estimation.inertial.readings import Readings
-from vioframe.estimation.initialization.window import PIXEL_SIGMA, refuse_unless
+from vioframe.estimation.initialization.window import PIXEL_SIGMA, refuse_unless, seen_anew
 from vioframe.estimation.turns import Turn, turn_between
 from vioframe.geometry import so3
 from vioframe.geometry.cameras import Camera
-from vioframe.types import NS_PER_S, Calibration, CameraSigma, FrameTracks
+from vioframe.types import NS_PER_S, Calibration, CameraOnBody, CameraSigma, FrameTracks
 
 # From the first frame of a pair to the second, for fast and for slow turns, and from one pair to the next.
 _TURNS_NS, _STEP_NS = (190_000_000, 590_000_000), 90_000_000
@@ -38,10 +38,14 @@ _SYSTEMATIC: dict[Part, float] = {"offset": 0.003, "rotation": np.deg2rad(0.5)}
 # Turns are taken every so often and overlap.
 _OVERLAP = 4.0
 # The scatter of turns over that which the tracks' own noise gives them: up to here nothing else is tried, and beyond,
-# focal lengths are too. One must fit better by this part of the squares to be taken.
+# other focal lengths, relative, and readouts, s, are too, each by some of the turns.
 _WELL, _BADLY = 1.5, 1.7
-_FOCALS = np.linspace(-0.15, 0.15, 7)
-_FOCAL_BETTER, _FOCAL_VALLEY, _FOCAL_EVERY_NS, _FOCAL_TURNS, _FOCAL_SIGMA = 0.4, 0.75, NS_PER_S, 15, 0.02
+_ZOOMS, _READOUTS_S = np.linspace(-0.15, 0.15, 7), np.linspace(-0.045, 0.045, 7)
+_TRY_EVERY_NS, _TRIED_TURNS = NS_PER_S, 15
+# One must fit better by this part of the squares to be taken, and what lies between it and the given one by this.
+_FAR_BETTER, _VALLEY = 0.4, 0.75
+# How well it is found, relative and s.
+_FOCAL_SIGMA, _READOUT_SIGMA_S = 0.02, 0.004
 # The part of what the camera turned that may be left unexplained.
 _LARGEST_UNEXPLAINED = 0.5
 # The median of |x| for x ~ N(0, 1).
@@ -55,13 +59,15 @@ _Pair = tuple[FrameTracks, FrameTracks, Turn]
 class Found:
     """A calibration in place of the given one, and how well the parts that were found are known.
 
-    ``offset_sigma_s`` and ``rotation_sigma`` rad, ``focal_sigma`` relative; None is what was not looked for.
+    ``offset_sigma_s`` and ``rotation_sigma`` rad, ``focal_sigma`` relative, ``readout_sigma_s``; None is what was not
+    looked for.
     """
 
     calibration: Calibration
     offset_sigma_s: float | None = None
     rotation_sigma: float | None = None
     focal_sigma: float | None = None
+    readout_sigma_s: float | None = None
 
     def sigma(self, given: CameraSigma) -> CameraSigma:
         """``given``, where nothing else was found."""
@@ -72,6 +78,7 @@ class Found:
             rotation=np.maximum(self.rotation_sigma or 0.0, given.rotation),
             time_offset_s=max(self.offset_sigma_s or 0.0, given.time_offset_s),
             intrinsics=np.maximum(focal, given.intrinsics),
+            readout_s=self.readout_sigma_s or given.readout_s,
         )
 
     def after(self, before: Found | None) -> Found:
@@ -92,6 +99,8 @@ class Found:
             parts.append(f"camera's rotation on the body, R_BC as quat_xyzw {quat} (+- {sigma_deg:.1f} deg)")
         if self.focal_sigma is not None:
             parts.append(f"focal length {camera.model.focal_px:.0f} px (+- {100.0 * self.focal_sigma:.0f} %)")
+        if self.readout_sigma_s is not None:
+            parts.append(f"readout {1e3 * camera.readout_s:.0f} ms (+- {1e3 * self.readout_sigma_s:.0f} ms)")
         return "found while starting: " + ", ".join(parts)
 
 
@@ -101,7 +110,7 @@ class SensorCheck:
     def __init__(self) -> None:
         self._frames: deque[FrameTracks] = deque()
         self._pairs: deque[_Pair] = deque()
-        self._focal_tried_ns: int | None = None
+        self._tried_ns: int | None = None
 
     def reset(self) -> None:
         self._frames.clear()
@@ -124,10 +133,10 @@ class SensorCheck:
                 self._pairs.append((before, tracks, turn))
         self._frames.append(tracks)
 
-    def undistort(self, camera: Camera) -> None:
+    def see_through(self, camera: CameraOnBody, readings: Readings) -> None:
         """Count with ``camera`` from here on."""
-        self._frames = deque(tracks.undistorted(camera).finite() for tracks in self._frames)
-        self._pairs = deque(_anew(((a, b) for a, b, _ in self._pairs), camera, PIXEL_SIGMA / camera.focal_px))
+        self._frames = deque(seen_anew(tracks, camera, readings.gyro_at(tracks.t_ns)) for tracks in self._frames)
+        self._pairs = deque(_anew(((a, b) for a, b, _ in self._pairs), camera, readings))
 
     def judge(self, readings: Readings, calibration: Calibration) -> Found | None:
         """What to take in place of ``calibration``; None where that fits, or nothing can be said.
@@ -145,7 +154,7 @@ class SensorCheck:
         if as_given is not None and _fits(turns, *as_given, noise):
             return None
         best, parts, variance = _best(turns, given, as_given)
-        if variance > (_BADLY * noise) ** 2 and (found := self._other_focal(readings, calibration, best)) is not None:
+        if variance > (_BADLY * noise) ** 2 and (found := self._other_camera(readings, calibration, best)) is not None:
             return found
         if not parts:
             return None
@@ -166,43 +175,55 @@ class SensorCheck:
             sigma.get("rotation"),
         )
 
-    def _other_focal(self, readings: Readings, calibration: Calibration, start: HandEye) -> Found | None:
-        """A focal length with which the turns fit well, and far better, if there is one; tried now and then.
-
-        With each the turns are fitted anew from ``start``.
-        """
+    def _other_camera(self, readings: Readings, calibration: Calibration, start: HandEye) -> Found | None:
+        """With a focal length or a readout by which turns fit far better, if there is one; tried now and then."""
         now_ns = self._frames[-1].t_ns
-        if self._focal_tried_ns is not None and now_ns - self._focal_tried_ns < _FOCAL_EVERY_NS:
+        if self._tried_ns is not None and now_ns - self._tried_ns < _TRY_EVERY_NS:
             return None
-        self._focal_tried_ns = now_ns
-        camera = calibration.cameras[0]
-        sigma = PIXEL_SIGMA / camera.model.focal_px
-        some = [self._pairs[k] for k in np.unique(np.linspace(0, len(self._pairs) - 1, _FOCAL_TURNS).astype(int))]
+        self._tried_ns = now_ns
+        camera = replace(calibration.cameras[0], R_BC=start.R_BC, rotation_known=True)
+        zoomed = [replace(camera, model=camera.model.zoomed(1.0 + zoom)) for zoom in _ZOOMS]
+        if (place := self._valley(zoomed, readings, start)) is not None:
+            factor = 1.0 + np.interp(place, np.arange(len(_ZOOMS)), _ZOOMS)
+            return Found(calibration.with_camera(0, model=camera.model.zoomed(factor)), focal_sigma=_FOCAL_SIGMA)
+        rolling = [replace(camera, readout_s=camera.readout_s + longer_s) for longer_s in _READOUTS_S]
+        if (place := self._valley(rolling, readings, start)) is not None:
+            readout_s = camera.readout_s + float(np.interp(place, np.arange(len(_READOUTS_S)), _READOUTS_S))
+            return Found(calibration.with_camera(0, readout_s=readout_s), readout_sigma_s=_READOUT_SIGMA_S)
+        return None
+
+    def _valley(self, cameras: Sequence[CameraOnBody], readings: Readings, start: HandEye) -> float | None:
+        """Where between ``cameras``, the given one in the middle, turns fit well, and far better than there.
+
+        None where they do nowhere. With each camera they are fitted anew from ``start``.
+        """
+        some = [self._pairs[k] for k in np.unique(np.linspace(0, len(self._pairs) - 1, _TRIED_TURNS).astype(int))]
         squares, fits_well = [], []
-        for change in _FOCALS:
-            found = [turn for *_, turn in _anew(((a, b) for a, b, _ in some), camera.model.zoomed(1.0 + change), sigma)]
+        for camera in cameras:
+            found = [turn for *_, turn in _anew(((a, b) for a, b, _ in some), camera, readings)]
             turns = Turns(found, readings.t_ns, readings.gyro_B)
             if len(turns) < _FEWEST_TURNS:
                 return None
             x, variance = turns.fit(start, ("rotation", "offset"))
             squares.append(turns.cost(x, variance) * variance)
             fits_well.append(variance < (_BADLY * np.median([turn.misfit for turn in found]) / _MEDIAN) ** 2)
-        best, as_given = int(np.argmin(squares)), len(_FOCALS) // 2
+        best, as_given = int(np.argmin(squares)), len(cameras) // 2
         if best in (0, len(squares) - 1) or not fits_well[best]:
             return None
         # A valley, not a hole: what lies between the given one and the best is better than the given one, too.
         between = best + int(np.sign(as_given - best))
-        if squares[best] > _FOCAL_BETTER * squares[as_given] or squares[between] > _FOCAL_VALLEY * squares[as_given]:
+        if squares[best] > _FAR_BETTER * squares[as_given] or squares[between] > _VALLEY * squares[as_given]:
             return None
-        factor = 1.0 + _FOCALS[best] + (_FOCALS[1] - _FOCALS[0]) * top_beside(-np.log(squares), best)
-        return Found(calibration.with_camera(0, model=camera.model.zoomed(factor)), focal_sigma=_FOCAL_SIGMA)
+        return best + top_beside(-np.log(squares), best)
 
 
-def _anew(pairs: Iterable[tuple[FrameTracks, FrameTracks]], camera: Camera, sigma: float) -> Iterator[_Pair]:
-    """The pairs with their points undistorted by ``camera``, and the turns they make then, where they make any."""
+def _anew(
+    pairs: Iterable[tuple[FrameTracks, FrameTracks]], camera: CameraOnBody, readings: Readings
+) -> Iterator[_Pair]:
+    """The pairs as ``camera`` saw them, and the turns they make then, where they make any."""
     for pair in pairs:
-        before, now = (tracks.undistorted(camera).finite() for tracks in pair)
-        if (turn := turn_between(before, now, sigma)) is not None:
+        before, now = (seen_anew(tracks, camera, readings.gyro_at(tracks.t_ns)) for tracks in pair)
+        if (turn := turn_between(before, now, PIXEL_SIGMA / camera.model.focal_px)) is not None:
             yield before, now, turn
 
 

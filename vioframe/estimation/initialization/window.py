@@ -94,6 +94,11 @@ def unrolled(tracks: FrameTracks, camera: CameraOnBody, rate_B: Float) -> FrameT
     return replace(tracks, xy_normalised=turned[:, :2] / turned[:, 2:])
 
 
+def seen_anew(tracks: FrameTracks, camera: CameraOnBody, rate_B: Float) -> FrameTracks:
+    """``tracks`` as ``camera`` saw them, which is another than the one they were undistorted and unrolled for."""
+    return unrolled(tracks.undistorted(camera.model).finite(), camera, rate_B)
+
+
 def build_window(packets: Sequence[Packet], chosen: Sequence[int], min_views: int, max_landmarks: int) -> Window:
     """The frames ``chosen``, ascending indices of ``packets``, and the tracks that ``min_views`` or more see."""
     tracks = [packets[k][1] for k in chosen]
