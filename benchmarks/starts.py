@@ -4,7 +4,7 @@
 
 Real tracks of MH_01_easy_15s and of an AprilGrid, and landmarks seen along three simulated flights. Started within
 2.5 s of sufficient motion (5 s with a wrong rotation) in 95 % of them; no bad start: scale off by more than 5 % two
-seconds later, or a reset within ten.
+seconds later (from the time of sufficient motion, where it began at rest), or a reset within ten.
 """
 
 from collections.abc import Iterator
@@ -169,14 +169,16 @@ def attempt(starts: Starts, begin_ns: int, motion_s: float) -> Row:
         since_s = (measured.t_ns - begin_ns) * 1e-9
         if frame and (
             (not states and since_s > motion_s + _LOOKED_AT_S)
-            or (states and (measured.t_ns - states[0].t_ns) * 1e-9 > _RESET_S)
+            or (states and since_s > motion_s and (measured.t_ns - states[0].t_ns) * 1e-9 > _RESET_S)
             or reset
         ):
             break
     if not states:
         return {"after_s": np.inf, "scale": None, "reset": False}
     after_s = max((states[0].t_ns - begin_ns) * 1e-9 - motion_s, 0.0)
-    return {"after_s": after_s, "scale": scale_of(states, sequence.ground_truth), "reset": reset}
+    moving_ns = begin_ns + round(motion_s * 1e9)
+    moving = [state for state in states if state.t_ns >= moving_ns]
+    return {"after_s": after_s, "scale": scale_of(moving, sequence.ground_truth), "reset": reset}
 
 
 def sufficient_after_s(truth: Trajectory, begin_ns: int) -> float | None:
@@ -198,9 +200,9 @@ def sufficient_after_s(truth: Trajectory, begin_ns: int) -> float | None:
 
 
 def scale_of(states: list[NavState], truth: Trajectory) -> float | None:
-    """Of the path in the two seconds after the start, 1 being right; None where they are not there."""
+    """Of the path in the first two seconds of ``states``, 1 being right; None where they are not there."""
     part = [state for state in states if (state.t_ns - states[0].t_ns) * 1e-9 <= _SCALE_S]
-    if (part[-1].t_ns - part[0].t_ns) * 1e-9 < 0.8 * _SCALE_S:
+    if not part or (part[-1].t_ns - part[0].t_ns) * 1e-9 < 0.8 * _SCALE_S:
         return None
     stamps, R, p = (np.array([getattr(s, name) for s in part]) for name in ("t_ns", "R_WB", "p_WB"))
     try:

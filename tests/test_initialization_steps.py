@@ -45,7 +45,7 @@ NOISE = ImuNoise(1.0e-3, 2.0e-2, 1.0e-4, 1.0e-2, 200.0)
 
 
 # Of the calibration, which is right here: rad, m, s.
-CALIBRATION_SIGMA = np.repeat([1e-5, 1e-5, 1e-6, 0.0], [3, 3, 1, 9])
+CALIBRATION_COV = np.diag(np.repeat([1e-5, 1e-5, 1e-6, 0.0], [3, 3, 1, 9]) ** 2)
 
 
 @dataclass(frozen=True)
@@ -110,7 +110,7 @@ def problem_of(s: Scene) -> tuple[Problem, Variables]:
     host = s.window.seen.argmax(axis=0)
     p_C = np.einsum("lji,lj->li", R_WC[host], s.p_WF - p_WC[host])
     truth = Variables(s.truth, camera, np.column_stack([p_C[:, :2] / p_C[:, 2:], 1.0 / p_C[:, 2]]))
-    return adjustment(s.window, s.imu(), truth, CAMERA, CALIBRATION_SIGMA), truth
+    return adjustment(s.window, s.imu(), truth, CAMERA, CALIBRATION_COV), truth
 
 
 class TestGyroBias:
@@ -236,8 +236,8 @@ class TestBundleAdjustment:
         start = s.truth.retract(rng.normal(0.0, sigma, (11, 15)))
         points = truth.landmarks + rng.normal(0.0, [0.01, 0.01, 0.05], truth.landmarks.shape)
         start = replace(truth, states=start, landmarks=points)
-        problem = adjustment(s.window, s.imu(), start, CAMERA, CALIBRATION_SIGMA)
-        solution = adjusted(problem, start, CALIBRATION_SIGMA)
+        problem = adjustment(s.window, s.imu(), start, CAMERA, CALIBRATION_COV)
+        solution = adjusted(problem, start, CALIBRATION_COV)
         states = solution.variables.states
         assert solution.converged
         # The first state has not moved, nor turned about gravity.
@@ -257,8 +257,8 @@ class TestBundleAdjustment:
             bias_accel = np.random.default_rng(100 + seed).normal(0.0, 0.15, 3)
             s = scene(1.0, seed, noise=NOISE, bias_accel=bias_accel)
             problem, truth = problem_of(s)
-            x = adjusted(problem, truth, CALIBRATION_SIGMA).variables
-            cov = covariance(problem, x, CALIBRATION_SIGMA)
+            x = adjusted(problem, truth, CALIBRATION_COV).variables
+            cov = covariance(problem, x, CALIBRATION_COV)
             newest, true = x.states[-1:], s.truth[-1:]
             yaw = so3.log(newest.R_WB[0] @ true.R_WB[0].T)[2]
             turn = so3.exp([0.0, 0.0, yaw])

@@ -264,7 +264,7 @@ def test_prior_on_one_state_is_its_covariance():
     rng = np.random.default_rng(0)
     A = rng.normal(size=(15, 15))
     state = replace(x.states[:1].unstack(np.zeros(1, np.int64))[0], cov=A @ A.T)
-    prior = Prior.of(state, x.camera, np.sqrt(np.arange(1.0, 17.0)))
+    prior = Prior.of(state, x.camera, np.diag(np.arange(1.0, 17.0)))
     np.testing.assert_allclose(prior.H[:15, :15] @ state.cov, np.eye(15), atol=1e-8)
     np.testing.assert_allclose(np.diag(prior.H)[15:], 1.0 / np.arange(1.0, 17.0))
     assert not prior.H[:15, 15:].any()

@@ -71,7 +71,7 @@ class Window:
         known[READOUT] = known[READOUT] or options.calibrate_readout * UNKNOWN_READOUT_S
         self._calibrated = _calibrated(options) & (known > 0.0)
         self._camera_sigma = np.where(self._calibrated, known, 0.0)
-        self._prior = Prior.of(state, self._camera, self._camera_sigma)
+        self._prior = Prior.of(state, self._camera, np.diag(self._camera_sigma**2))
         self._readings: list[Preintegrated] = []
         self._still: dict[int, Standstill] = {}
         self._newest_is_keyframe = True

@@ -78,12 +78,12 @@ class Prior:
     frozen: Bool
 
     @staticmethod
-    def of(state: NavState, camera: Calibrated, sigma: Float) -> Prior:
-        """On a single state with covariance, and on the calibration, of ``sigma`` (16,), zero where it is fixed."""
+    def of(state: NavState, camera: Calibrated, camera_cov: Float) -> Prior:
+        """On a single state with covariance, and on the calibration with ``camera_cov`` (16, 16), zero where fixed."""
         assert state.cov is not None
         H = np.zeros((STATE_SIZE + CALIBRATION_SIZE, STATE_SIZE + CALIBRATION_SIZE))
         H[:STATE_SIZE, :STATE_SIZE] = np.linalg.inv(state.cov)
-        H[STATE_SIZE:, STATE_SIZE:] = calibration_information(sigma)
+        H[STATE_SIZE:, STATE_SIZE:] = calibration_information(camera_cov)
         return Prior(H, np.zeros(len(H)), StateArrays.stack([state]), camera, np.ones(1, dtype=bool))
 
     def with_state(self, states: StateArrays) -> Prior:
@@ -212,9 +212,9 @@ def _still_residual(still: Standstill, states: StateArrays, k: int) -> Float:
     return still.residual(states.R_WB[k], states.v_WB[k], states.bias_gyro_B[k], states.bias_accel_B[k])
 
 
-def calibration_information(sigma: Float) -> Float:
-    """(16, 16) of standard deviations (16,); one for those that are zero and stay as they are."""
-    return np.diag(1.0 / np.where(sigma > 0.0, sigma, 1.0) ** 2)
+def calibration_information(cov: Float) -> Float:
+    """The inverse of a covariance (16, 16), with one for what is known for sure and stays as it is."""
+    return np.linalg.inv(cov + np.diag(np.where(np.diag(cov) > 0.0, 0.0, 1.0)))
 
 
 def pose_columns(K: int) -> NDArray[np.intp]:

@@ -39,14 +39,14 @@ _RELATIVE_DECREASE = 1e-5
 _HELD, _FIXED = 1e4, 1e8
 
 
-def adjustment(window: Window, imu: list[Preintegrated], x: Variables, camera: CameraOnBody, sigma: Float) -> Problem:
+def adjustment(window: Window, imu: list[Preintegrated], x: Variables, camera: CameraOnBody, known: Float) -> Problem:
     """All factors of ``window``, whose readings are ``imu``, about the values ``x``; the first state is held.
 
-    ``sigma`` (16,) is how well the calibration of ``camera`` is known.
+    ``known`` (16, 16) is the covariance of the calibration of ``camera``, zero in what is known for sure.
     """
     seen = np.ascontiguousarray(window.seen.T)
     gyro_B = np.stack([imu[0].imu.gyro_B[0], *(m.imu.gyro_B[-1] for m in imu)])
-    xy, rolling = window.xy, bool(camera.readout_s or sigma[READOUT])
+    xy, rolling = window.xy, bool(camera.readout_s or known[READOUT, READOUT])
     if rolling:
         xy = camera.model.undistort(window.xy_px.reshape(-1, 2)).reshape(xy.shape)
     xy = np.ascontiguousarray(np.where(seen[..., None], np.swapaxes(xy, 0, 1), 0.0))
@@ -62,7 +62,7 @@ def adjustment(window: Window, imu: list[Preintegrated], x: Variables, camera: C
         shutter = Shutter(True, row, gyro_B - x.states.bias_gyro_B, velocity_B)
     sightings = Sightings(seen, xy, velocity, to_px, PIXEL_SIGMA, _CAUCHY, shutter=shutter, lens=lens)
     return Problem(
-        _prior(x, 0, _HELD, calibrated(camera), sigma), ImuFactors.stack(imu), {}, sightings, first_estimates=False
+        _prior(x, 0, _HELD, calibrated(camera), known), ImuFactors.stack(imu), {}, sightings, first_estimates=False
     )
 
 
@@ -73,31 +73,36 @@ def calibrated(camera: CameraOnBody) -> Calibrated:
     return Calibrated(R_BC, p_BC, 0.0, camera.readout_s, intrinsics_of(camera.model)[1])
 
 
-def adjusted(problem: Problem, x: Variables, sigma: Float) -> Solution:
+def adjusted(problem: Problem, x: Variables, known: Float) -> Solution:
     """Minimise from ``x``."""
-    return solve(problem, x, _active(x, sigma), _MAX_ITERATIONS, _RELATIVE_DECREASE)
+    return solve(problem, x, _active(x, known), _MAX_ITERATIONS, _RELATIVE_DECREASE)
 
 
-def covariance(problem: Problem, x: Variables, sigma: Float) -> Float:
-    """Of all states and the calibration (15 K + 16, 15 K + 16) at the minimum ``x``; zero where ``sigma`` (16,) is.
+def with_calibration(problem: Problem, x: Variables, camera: CameraOnBody, known: Float) -> Problem:
+    """``problem`` with another prior on the calibration."""
+    return replace(problem, prior=_prior(x, 0, _HELD, calibrated(camera), known))
+
+
+def covariance(problem: Problem, x: Variables, known: Float) -> Float:
+    """Of all states and the calibration (15 K + 16, 15 K + 16) at the minimum ``x``; zero where ``known`` is.
 
     Position and yaw are pinned at the *newest* state.
     """
-    prior = _prior(x, len(x.states) - 1, _FIXED, problem.prior.camera, sigma)
+    prior = _prior(x, len(x.states) - 1, _FIXED, problem.prior.camera, known)
     S, _, _ = replace(problem, prior=prior).linearise(x).reduced(0.0)
-    active = _active(x, sigma)
+    active = _active(x, known)
     at, cov = np.ix_(active, active), np.zeros(S.shape)
     cov[at] = solve_positive(S[at], np.eye(len(active)))
     return 0.5 * (cov + cov.T)
 
 
-def _active(x: Variables, sigma: Float) -> Int:
+def _active(x: Variables, known: Float) -> Int:
     """The entries of the error vector that are estimated: those of the calibration that are not known for sure."""
-    return np.flatnonzero(np.append(np.ones(STATE_SIZE * len(x.states), bool), sigma > 0.0))
+    return np.flatnonzero(np.append(np.ones(STATE_SIZE * len(x.states), bool), np.diag(known) > 0.0))
 
 
-def _prior(x: Variables, held: int, information: float, given: Calibrated, sigma: Float) -> Prior:
-    """The first state's biases about zero, the calibration about ``given`` with ``sigma`` (16,).
+def _prior(x: Variables, held: int, information: float, given: Calibrated, known: Float) -> Prior:
+    """The first state's biases about zero, the calibration about ``given`` with the covariance ``known`` (16, 16).
 
     And that state ``held`` neither moves nor turns about gravity.
     """
@@ -111,5 +116,5 @@ def _prior(x: Variables, held: int, information: float, given: Calibrated, sigma
     own[DP, DP] = information * np.eye(3)
     zero = np.zeros((K, 3))
     about = StateArrays(states.R_WB, states.p_WB, states.v_WB, zero, zero)
-    H[-CALIBRATION_SIZE:, -CALIBRATION_SIZE:] = calibration_information(sigma)
+    H[-CALIBRATION_SIZE:, -CALIBRATION_SIZE:] = calibration_information(known)
     return Prior(H, np.zeros(len(H)), about, given, np.isin(np.arange(K), (0, held)))

@@ -21,7 +21,13 @@ from vioframe.estimation.factors.reprojection import CALIBRATION_SIZE, Calibrate
 from vioframe.estimation.factors.solver import Solution
 from vioframe.estimation.hand_eye import HandEye, Turns
 from vioframe.estimation.inertial.preintegration import Preintegrated, preintegrate
-from vioframe.estimation.initialization.bundle_adjustment import adjusted, adjustment, calibrated, covariance
+from vioframe.estimation.initialization.bundle_adjustment import (
+    adjusted,
+    adjustment,
+    calibrated,
+    covariance,
+    with_calibration,
+)
 from vioframe.estimation.initialization.closed_form import (
     Alignment,
     Structure,
@@ -34,6 +40,7 @@ from vioframe.estimation.initialization.window import (
     BIAS_ACCEL_SIGMA,
     BIAS_GYRO_SIGMA,
     PIXEL_SIGMA,
+    ContradictedError,
     InitialEstimate,
     Packet,
     UnsureError,
@@ -64,14 +71,16 @@ _MAX_BIAS_ACCEL = 4.0 * BIAS_ACCEL_SIGMA
 # Largest standard deviations that are accepted: of scale (relative), velocity on any axis (m/s, or as a part of the
 # speed where that is more), and gravity's direction.
 _SCALE_SIGMA, _VELOCITY_SIGMA, _SPEED_SIGMA, _TILT_SIGMA_DEG = 0.06, 0.05, 0.03, 1.0
+# A calibration is wrong where the most likely one makes the rest so much likelier, as a difference of logarithms.
+_CONTRADICTED = 6.0
 # Beyond so many times these the first adjustment is not gone on with.
 _HOPELESS = 1.5
 
 
-def initialise(packets: Sequence[Packet], calibration: Calibration, sigma: Float) -> InitialEstimate:
+def initialise(packets: Sequence[Packet], calibration: Calibration, known: Float, doubted: Float) -> InitialEstimate:
     """Estimate from consecutive ``packets``, the newest last; raises :class:`RefusalError`.
 
-    ``sigma`` (16,) is how well the camera of ``calibration`` is known.
+    ``known`` (16, 16) is the covariance of the camera's ``calibration`` if that is right, ``doubted`` if it may not be.
     """
     t_ns = np.array([tracks.t_ns for _, tracks in packets])
     held_out = int((t_ns > t_ns[-1] - _LOOKAHEAD_S * 1e9).sum())
@@ -89,13 +98,13 @@ def initialise(packets: Sequence[Packet], calibration: Calibration, sigma: Float
     alignment = align(structure.position, imu[:-1], calibration.cameras[0].p_BC, BIAS_ACCEL_SIGMA)
     refuse_unless(alignment.scale > 0.0, "the readings contradict the direction of the motion in the images")
     x = _start_of_adjustment(window.without_last(), structure, alignment, calibration)
-    problem, solution = _adjusted(window.without_last(), x, calibration, sigma)
-    _check_uncertainty(solution.variables.states, covariance(problem, solution.variables, sigma), _HOPELESS)
+    problem, solution = _adjusted(window.without_last(), x, calibration, doubted)
+    _check_uncertainty(solution.variables.states, covariance(problem, solution.variables, doubted), _HOPELESS)
     keep = _explained(problem, solution.variables)
     window = window.only(keep)
     _require(window, "tracks fit the bundle adjustment")
     x = replace(solution.variables, landmarks=solution.variables.landmarks[keep])
-    problem, solution = _adjusted(window.without_last(), x, calibration, sigma)
+    problem, solution = _adjusted(window.without_last(), x, calibration, doubted)
     _check_fit(problem, solution)
 
     x = solution.variables
@@ -104,13 +113,30 @@ def initialise(packets: Sequence[Packet], calibration: Calibration, sigma: Float
     _check_lookahead(predicted, packets[-held_out:], x.camera, window.ids, p_WF, calibration.cameras[0].model)
 
     x = replace(x, states=x.states.append(StateArrays.stack(predicted[-1:])))
-    problem, solution = _adjusted(window, x, calibration, sigma)
+    problem, solution = _adjusted(window, x, calibration, doubted)
     _check_fit(problem, solution)
     x = solution.variables
-    cov = covariance(problem, x, sigma)
+    cov = covariance(problem, x, doubted)
     _check_uncertainty(x.states, cov)
+    problem, x = _believed(problem, solution, calibration, known, cov)
+    cov = covariance(problem, x, known)
     keep = _explained(problem, x)
     return _estimate(window.only(keep), x.states, cov, _positions(problem, x)[keep])
+
+
+def _believed(
+    problem: Problem, solution: Solution, calibration: Calibration, known: Float, cov: Float
+) -> tuple[Problem, Variables]:
+    """The adjustment where ``calibration`` is right, known to ``known`` (16, 16), and its minimum.
+
+    Raises :class:`ContradictedError` where the ``solution`` that doubts it, of covariance ``cov``, is far likelier.
+    """
+    camera, x = calibration.cameras[0], solution.variables
+    problem = with_calibration(problem, x, camera, known)
+    believed = adjusted(problem, replace(x, camera=calibrated(camera)), known)
+    if not believed.cost < solution.cost + _CONTRADICTED:
+        raise ContradictedError(x.camera, cov[-CALIBRATION_SIZE:, -CALIBRATION_SIZE:])
+    return problem, believed.variables
 
 
 def _require(window: Window, what: str) -> None:
@@ -157,12 +183,12 @@ def _start_of_adjustment(
     return Variables(states, calibrated(calibration.cameras[0]), landmarks)
 
 
-def _adjusted(window: Window, x: Variables, calibration: Calibration, sigma: Float) -> tuple[Problem, Solution]:
+def _adjusted(window: Window, x: Variables, calibration: Calibration, known: Float) -> tuple[Problem, Solution]:
     """The adjustment of ``window`` from ``x``, its readings integrated at the biases there."""
     biases = zip(x.states.bias_gyro_B[:-1], x.states.bias_accel_B[:-1], strict=True)
     imu = [preintegrate(segment, *bias, calibration.imu) for segment, bias in zip(window.segments, biases, strict=True)]
-    problem = adjustment(window, imu, x, calibration.cameras[0], sigma)
-    return problem, adjusted(problem, x, sigma)
+    problem = adjustment(window, imu, x, calibration.cameras[0], known)
+    return problem, adjusted(problem, x, known)
 
 
 def _explained(problem: Problem, x: Variables) -> Bool:
@@ -299,5 +325,5 @@ def warm_up(calibration: Calibration) -> None:
     _with_gyro_bias(window, calibration, 1e-3)
     state, landmarks = NavState(0, np.eye(3), *np.zeros((4, 3))), np.column_stack([xy[0], np.full(20, 0.2)])
     x = Variables(StateArrays.stack([state] * 4), calibrated(calibration.cameras[0]), landmarks)
-    problem, solution = _adjusted(window, x, calibration, np.full(CALIBRATION_SIZE, 0.01))
+    problem, solution = _adjusted(window, x, calibration, 1e-4 * np.eye(CALIBRATION_SIZE))
     _explained(problem, solution.variables)

@@ -7,12 +7,15 @@ from dataclasses import replace
 
 import numpy as np
 
+from vioframe.arrays import Float
+from vioframe.estimation.factors.reprojection import CALIBRATION_SIZE, INTRINSICS, OFFSET
 from vioframe.estimation.inertial.noise import jumps
 from vioframe.estimation.inertial.readings import Readings
 from vioframe.estimation.initialization import dynamic, static
-from vioframe.estimation.initialization.sensors import Found, SensorCheck
+from vioframe.estimation.initialization.sensors import Found, SensorCheck, found_by
 from vioframe.estimation.initialization.window import (
     LARGEST_IMU_GAP_S,
+    ContradictedError,
     InitialEstimate,
     Packet,
     RefusalError,
@@ -34,6 +37,10 @@ _SOON_S, _LATER_S, _LATEST_S = 0.1, 0.05, 0.6
 # alignment errors do over its seconds: with 8 in all its squared errors on EuRoC's flights are as its covariance says.
 # Readings that are smoother than their calibration has it count as such: this many times what they jump by.
 _IN_MOTION, _JUMPS = 2.0, 2.5
+# What a calibration may be off by before a start has borne it out, beyond how well it is known: rad, s and relative.
+# What contradicts it is taken over so many times in one attempt.
+_DOUBT_ROTATION, _DOUBT_OFFSET_S, _DOUBT_FOCAL = 0.05, 0.02, 0.08
+_MOST_CONTRADICTIONS = 3
 # How well a calibration is known (rad, m, s, px, distortion), as published for OpenVINS on EuRoC.
 GIVEN = CameraSigma(np.full(3, 0.005), np.full(3, 0.015), 0.01, np.repeat([1.0, 0.005], 4))
 
@@ -148,15 +155,31 @@ class Initializer:
             self._take_over(found)
             if self._packets[-1][1].t_ns != newest_ns:
                 return None
-        calibration = replace(self._calibration, imu=self._noise_in_motion())
         try:
-            return dynamic.initialise(self._last(self._window_s), calibration, self.camera_sigma.stacked())
+            for _ in range(_MOST_CONTRADICTIONS):
+                known = np.diag(self.camera_sigma.stacked() ** 2)
+                calibration = replace(self._calibration, imu=self._noise_in_motion())
+                try:
+                    return dynamic.initialise(self._last(self._window_s), calibration, known, self._doubted(known))
+                except ContradictedError as other:
+                    self._take_over(found_by(self._calibration, other.camera, other.cov))
+            raise RefusalError("images and readings contradict every calibration")
         except UnsureError:
             self._window_s = min(self._window_s * _LONGER, _LONGEST_WINDOW_S)
             raise
         except RefusalError:
             self._window_s = max(self._window_s / _LONGER, _USUAL_WINDOW_S)
             raise
+
+    def _doubted(self, known: Float) -> Float:
+        """``known`` (16, 16), with what the calibration may be wrong by where nothing bears it out."""
+        out, camera = known.copy(), self._calibration.cameras[0]
+        focal = np.zeros(CALIBRATION_SIZE)
+        focal[INTRINSICS][:2] = camera.model.fx, camera.model.fy
+        out[:3, :3] += np.eye(3) * _DOUBT_ROTATION**2
+        out[OFFSET, OFFSET] += _DOUBT_OFFSET_S**2
+        out += np.outer(focal, focal) * _DOUBT_FOCAL**2
+        return out
 
     def _noise_in_motion(self) -> ImuNoise:
         """What the readings of the window are off by: white noise by how they jump, within what is given."""

@@ -9,12 +9,15 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
+from vioframe.arrays import Float
+from vioframe.estimation.factors.reprojection import INTRINSICS, OFFSET, Calibrated
 from vioframe.estimation.hand_eye import HandEye, Part, Turns, top_beside
 from vioframe.estimation.inertial.readings import Readings
-from vioframe.estimation.initialization.window import PIXEL_SIGMA, refuse_unless, seen_anew
+from vioframe.estimation.initialization.window import PIXEL_SIGMA, UnsureError, refuse_unless, seen_anew
 from vioframe.estimation.turns import Turn, turn_between
 from vioframe.geometry import so3
 from vioframe.geometry.cameras import Camera
@@ -46,6 +49,10 @@ _TRY_EVERY_NS, _TRIED_TURNS = NS_PER_S, 15
 _FAR_BETTER, _VALLEY = 0.4, 0.75
 # How well it is found, relative and s.
 _FOCAL_SIGMA, _READOUT_SIGMA_S = 0.02, 0.004
+# A part of a calibration that is off by so many standard deviations is clearly wrong.
+_CLEAR = 3.0
+# Standard deviations with which a start can take a part over, rad, s and relative.
+_FOUND_SURE = {"rotation": np.deg2rad(2.5), "offset": 0.012, "focal": 0.02}
 # The part of what the camera turned that may be left unexplained.
 _LARGEST_UNEXPLAINED = 0.5
 # The median of |x| for x ~ N(0, 1).
@@ -102,6 +109,42 @@ class Found:
         if self.readout_sigma_s is not None:
             parts.append(f"readout {1e3 * camera.readout_s:.0f} ms (+- {1e3 * self.readout_sigma_s:.0f} ms)")
         return "found while starting: " + ", ".join(parts)
+
+
+def found_by(given: Calibration, camera: Calibrated, cov: Float) -> Found:
+    """What of ``camera``, with covariance (16, 16), differs most from the calibration ``given``, or clearly.
+
+    Raises :class:`UnsureError` where that is not known well enough.
+    """
+    old = given.cameras[0]
+    turn, offset_s = so3.log(old.R_BC.T @ camera.R_BC), camera.offset_s
+    focal = np.array([old.model.fx, old.model.fy])
+    zoom = float(np.mean(camera.intrinsics[:2] / focal)) - 1.0
+    by_focal = np.zeros(len(cov))
+    by_focal[INTRINSICS][:2] = 0.5 / focal
+    sigma = {
+        "rotation": float(np.sqrt(np.linalg.eigvalsh(cov[:3, :3])[-1])),
+        "offset": float(np.sqrt(cov[OFFSET, OFFSET])),
+        "focal": float(np.sqrt(by_focal @ cov @ by_focal)),
+    }
+    off = {"rotation": float(np.linalg.norm(turn)), "offset": abs(offset_s), "focal": abs(zoom)}
+    clear = {part: off[part] / sigma[part] for part in off}
+    chosen = {part for part in clear if clear[part] >= min(_CLEAR, max(clear.values()))}
+    if unsure := [part for part in chosen if sigma[part] > _FOUND_SURE[part]]:
+        raise UnsureError(
+            f"the {' and '.join(unsure)} given contradict what is seen; what fits is not known well enough"
+        )
+    changes: dict[str, dict[str, Any]] = {
+        "rotation": {"R_BC": camera.R_BC},
+        "offset": {"time_offset_ns": old.time_offset_ns + round(offset_s * NS_PER_S)},
+        "focal": {"model": old.model.zoomed(1.0 + zoom)},
+    }
+    return Found(
+        given.with_camera(0, **{name: value for part in chosen for name, value in changes[part].items()}),
+        sigma["offset"] if "offset" in chosen else None,
+        sigma["rotation"] if "rotation" in chosen else None,
+        sigma["focal"] if "focal" in chosen else None,
+    )
 
 
 class SensorCheck:

@@ -10,6 +10,7 @@ from typing import Literal
 import numpy as np
 
 from vioframe.arrays import Bool
+from vioframe.estimation.factors.reprojection import Calibrated
 from vioframe.estimation.factors.tracks import TrackTable
 from vioframe.estimation.hand_eye import BIAS_SIGMA
 from vioframe.estimation.inertial.preintegration import join_segments
@@ -47,6 +48,14 @@ class RefusalError(Exception):
 
 class UnsureError(RefusalError):
     """An attempt that is not sure enough of itself: more of the same motion may make it so."""
+
+
+class ContradictedError(RefusalError):
+    """What was seen and felt speaks against the calibration, and for ``camera``, of covariance ``cov`` (16, 16)."""
+
+    def __init__(self, camera: Calibrated, cov: Float) -> None:
+        super().__init__("images and readings contradict the calibration")
+        self.camera, self.cov = camera, cov
 
 
 def refuse_unless(good: object, why: str) -> None:
