@@ -80,6 +80,11 @@ class LifeCycle:
         still = self._standstill.sees_standstill(tracks) and self._options.zero_velocity_update
         if not self._following:
             return self._begin(imu, tracks)
+        if self._initializer.in_doubt and self._initializer.follow(imu, tracks, still):
+            self._following = False
+            return Estimate(
+                Status.LOST, events=(f"lost: the camera is mounted differently; {self._initializer.found}",)
+            )
         try:
             estimate = self._backend.process(imu, tracks, still)
             if (defect := defect_of(estimate, tracks.t_ns)) is not None:
@@ -129,6 +134,8 @@ class LifeCycle:
     def _start(self, state: NavState, imu: ImuSegment, tracks: FrameTracks) -> Start:
         """From ``state``, with what was found of the calibration while starting."""
         calibration = self._initializer.calibration
+        # It may have been found at this very frame.
+        tracks = tracks.undistorted(calibration.cameras[0].model).finite()
         flying = replace(calibration, imu=calibration.imu.in_flight(self._options.imu_noise_factor))
         prior = CalibrationEstimate(flying, (self._initializer.camera_sigma,))
         return Start(state, prior, calibration.imu, imu, tracks)

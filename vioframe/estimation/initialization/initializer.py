@@ -23,6 +23,7 @@ from vioframe.estimation.initialization.window import (
     seen_anew,
     unrolled,
 )
+from vioframe.geometry import so3
 from vioframe.types import NS_PER_S, Calibration, CameraSigma, FrameTracks, ImuNoise, ImuSegment
 
 _log = logging.getLogger("vioframe.estimation.initialization")
@@ -41,6 +42,8 @@ _IN_MOTION, _JUMPS = 2.0, 2.5
 # What contradicts it is taken over so many times in one attempt.
 _DOUBT_ROTATION, _DOUBT_OFFSET_S, _DOUBT_FOCAL = 0.05, 0.02, 0.08
 _MOST_CONTRADICTIONS = 3
+# A camera that is turned by more than this on the body, rad, no back-end finds by itself.
+_MOUNTED_DIFFERENTLY = np.deg2rad(15.0)
 # How well a calibration is known (rad, m, s, px, distortion), as published for OpenVINS on EuRoC.
 GIVEN = CameraSigma(np.full(3, 0.005), np.full(3, 0.015), 0.01, np.repeat([1.0, 0.005], 4))
 
@@ -64,6 +67,8 @@ class Initializer:
         self._readings = Readings()
         self._packets: list[Packet] = []
         self._waiting: list[FrameTracks] = []
+        self.in_doubt = False
+        """Whether a start was made that bears out nothing of the calibration: at rest."""
         self._begin_waiting()
 
     def _begin_waiting(self) -> None:
@@ -96,6 +101,7 @@ class Initializer:
         self._packets.clear()
         self._waiting.clear()
         self._refusals.clear()
+        self.in_doubt = False
         self._begin_waiting()
 
     def add(self, imu: ImuSegment, tracks: FrameTracks) -> InitialEstimate | None:
@@ -104,16 +110,8 @@ class Initializer:
         Where :attr:`calibration` has another time offset after it, ``imu`` of the next call must count with it, and
         begin where that of this call ended on the IMU's own clock, or earlier.
         """
-        if imu.largest_gap_s > LARGEST_IMU_GAP_S:
-            self.reset()
-            _log.info("no readings for %.2f s: begun anew", imu.largest_gap_s)
-        tracks = unrolled(tracks.finite(), self._calibration.cameras[0], imu.gyro_B[-1])
-        self._readings.add(imu)
-        self._waiting.append(tracks)
-        self._sensors.add(tracks, self._calibration.cameras[0].model)
-        self._cut()
-        if not self._packets or self._packets[-1][1] is not tracks:
-            return None  # its readings are still to come
+        if not self._take(imu, tracks):
+            return None
         known = self._calibration.cameras[0].rotation_known
         methods = {"static": self._static, "dynamic": self._dynamic} if known else {"dynamic": self._dynamic}
         for method, attempt in methods.items():
@@ -126,8 +124,44 @@ class Initializer:
             if estimate is not None:
                 _log.info("%d %s initialisation accepted", tracks.t_ns, method)
                 self._refusals.clear()
+                self.in_doubt = estimate.method == "static"
                 return estimate
         return None
+
+    def follow(self, imu: ImuSegment, tracks: FrameTracks, still: bool) -> bool:
+        """Take one frame of a flight that began at rest; whether the camera turns out to be mounted quite differently.
+
+        That is :attr:`found` then, and the frames so far are those of the next start; what is off by less a back-end
+        finds by itself. To be called as long as it is :attr:`in_doubt`.
+        """
+        if not self._take(imu, tracks) or still or tracks.t_ns < self._next_attempt_ns:
+            return False
+        self._next_attempt_ns = tracks.t_ns + round(_LATEST_S * NS_PER_S)
+        try:
+            found = self._sensors.judge(self._readings, self._calibration)
+        except RefusalError:
+            return False
+        if found is None:
+            self.in_doubt = not self._sensors.bear_out(self._readings, self._calibration)
+            return False
+        (given,), (camera,) = self._calibration.cameras, found.calibration.cameras
+        if not np.linalg.norm(so3.log(given.R_BC.T @ camera.R_BC)) > _MOUNTED_DIFFERENTLY:
+            return False
+        self._take_over(found)
+        self._begin_waiting()
+        return True
+
+    def _take(self, imu: ImuSegment, tracks: FrameTracks) -> bool:
+        """Take one frame; whether its readings are there, or still to come."""
+        if imu.largest_gap_s > LARGEST_IMU_GAP_S:
+            self.reset()
+            _log.info("no readings for %.2f s: begun anew", imu.largest_gap_s)
+        tracks = unrolled(tracks.finite(), self._calibration.cameras[0], imu.gyro_B[-1])
+        self._readings.add(imu)
+        self._waiting.append(tracks)
+        self._sensors.add(tracks, self._calibration.cameras[0].model)
+        self._cut()
+        return bool(self._packets) and self._packets[-1][1] is tracks
 
     def _cut(self) -> None:
         """Give the frames that wait for readings theirs, as far as they reach; let go of what is too old."""

@@ -218,6 +218,14 @@ class SensorCheck:
             sigma.get("rotation"),
         )
 
+    def bear_out(self, readings: Readings, calibration: Calibration) -> bool:
+        """Whether the turns would tell another time offset or rotation from those of ``calibration``, which fits."""
+        turns = Turns([turn for *_, turn in self._pairs], readings.t_ns, readings.gyro_B)
+        if len(turns) < _FEWEST_TURNS:
+            return False
+        x, _ = turns.fit(HandEye(np.zeros(3), calibration.cameras[0].R_BC), ("rotation", "offset"))
+        return all(_sigma(x, part) <= sure for part, sure in _SURE.items())
+
     def _other_camera(self, readings: Readings, calibration: Calibration, start: HandEye) -> Found | None:
         """With a focal length or a readout by which turns fit far better, if there is one; tried now and then."""
         now_ns = self._frames[-1].t_ns
