@@ -1,0 +1,194 @@
+"""No start is believed because a calibration is: motion must bear it out, or another that fits is taken over."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from vioframe.errors import DivergedError
+from vioframe.estimation.factors.reprojection import INTRINSICS, OFFSET, Calibrated
+from vioframe.estimation.inertial.noise import jumps, noise_over
+from vioframe.estimation.initialization import InitialEstimate, Initializer
+from vioframe.estimation.initialization.sensors import found_by
+from vioframe.estimation.initialization.window import UnsureError
+from vioframe.estimation.lifecycle import LifeCycle
+from vioframe.geometry import so3
+from vioframe.geometry.kernels import intrinsics_of
+from vioframe.io.calibration import packaged_calibration
+from vioframe.simulation import TrackSequence, simulated_sequence
+from vioframe.types import Calibration, ImuSegment, Status
+from vioframe_msckf.backend import Msckf
+
+EUROC = packaged_calibration("euroc", cameras=["cam0"])
+BIASES = {"bias_gyro_B": np.array([-0.002, 0.02, 0.08]), "bias_accel_B": np.array([-0.02, 0.13, 0.07])}
+AXIS = np.array([0.6, 0.64, 0.48])
+
+
+def hovering(seed: int = 0) -> TrackSequence:
+    """Slow and hardly turning: what is wrong hides behind the noise of a second and a half."""
+    return simulated_sequence("hover", pixel_sigma=0.5, seed=seed, duration_s=6.0, **BIASES)
+
+
+def begun(sequence: TrackSequence, told: Calibration) -> tuple[InitialEstimate, Initializer]:
+    initializer = Initializer(told)
+    for imu, tracks in sequence.packets:
+        seen = tracks.undistorted(initializer.calibration.cameras[0].model)
+        if (estimate := initializer.add(imu, seen)) is not None:
+            return estimate, initializer
+    raise AssertionError(initializer.refusal)
+
+
+def scale_of(estimate: InitialEstimate, sequence: TrackSequence) -> float:
+    truth = sequence.ground_truth
+    true = np.array([truth.p_WB[np.searchsorted(truth.t_ns, state.t_ns)] for state in estimate.states])
+    path = np.array([state.p_WB for state in estimate.states])
+    return float(np.linalg.norm(path - path.mean(axis=0)) / np.linalg.norm(true - true.mean(axis=0)))
+
+
+@pytest.mark.parametrize("percent", [-10.0, 10.0])
+def test_a_focal_length_that_turns_do_not_tell(percent: float):
+    s = hovering()
+    true = s.calibration.cameras[0].model
+    estimate, initializer = begun(s, s.calibration.with_camera(0, model=true.zoomed(1.0 + percent / 100.0)))
+    found = initializer.found
+    assert found is not None
+    assert found.focal_sigma is not None
+    assert abs(found.calibration.cameras[0].model.fx / true.fx - 1.0) < 0.04
+    assert abs(scale_of(estimate, s) - 1.0) < 0.1
+
+
+def test_a_rotation_that_turns_do_not_tell():
+    s = hovering(3)
+    true = s.calibration.cameras[0].R_BC
+    _, initializer = begun(s, s.calibration.with_camera(0, R_BC=true @ so3.exp(np.deg2rad(8.0) * AXIS)))
+    assert initializer.found is not None
+    left = so3.log(initializer.calibration.cameras[0].R_BC.T @ true)
+    assert np.rad2deg(np.linalg.norm(left)) < 4.0
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_calibration_that_is_right_stays(seed: int):
+    s = hovering(seed)
+    estimate, initializer = begun(s, s.calibration)
+    assert initializer.found is None
+    assert abs(scale_of(estimate, s) - 1.0) < 0.1
+
+
+def test_a_readout_that_nobody_told():
+    rolling = EUROC.with_camera(0, readout_s=0.03)
+    s = simulated_sequence("aggressive", pixel_sigma=0.5, seed=1, duration_s=6.0, calibration=rolling, **BIASES)
+    _, initializer = begun(s, s.calibration.with_camera(0, readout_s=0.0))
+    found = initializer.found
+    assert found is not None
+    assert found.readout_sigma_s is not None
+    assert found.calibration.cameras[0].readout_s == pytest.approx(0.03, abs=0.006)
+    assert "readout" in str(found)
+    assert initializer.camera_sigma.readout_s == found.readout_sigma_s
+
+
+def test_a_flight_from_rest_with_a_camera_mounted_quite_differently_begins_again():
+    s = simulated_sequence("inspection", pixel_sigma=0.5, duration_s=9.0, **BIASES)
+    true = s.calibration.cameras[0].R_BC
+    wrong = s.calibration.with_camera(0, R_BC=true @ so3.exp(np.deg2rad(90.0) * AXIS))
+    life, events, statuses = LifeCycle(Msckf(), wrong), [], []
+    for imu, tracks in s.packets:
+        estimate = life.process(imu, tracks)
+        events += estimate.events
+        statuses.append(estimate.status)
+    assert "initialised (static)" in events
+    (lost,) = [event for event in events if event.startswith("lost")]
+    assert "mounted differently" in lost
+    left = so3.log(life.calibration.cameras[0].R_BC.T @ true)
+    assert np.rad2deg(np.linalg.norm(left)) < 3.0
+    assert "initialised (dynamic)" in events
+    assert statuses[-1] is Status.TRACKING
+
+
+def test_motion_ends_the_doubt_of_a_flight_from_rest():
+    s = simulated_sequence("inspection", pixel_sigma=0.5, duration_s=9.0, **BIASES)
+    life, doubted = LifeCycle(Msckf(), s.calibration), []
+    for imu, tracks in s.packets:
+        assert life.process(imu, tracks).status is not Status.LOST
+        doubted.append(life._initializer.in_doubt)
+    assert any(doubted)
+    assert not doubted[-1]
+
+
+class TestFoundBy:
+    COV = np.diag(np.repeat([0.01, 0.01, 0.004, 1e-9, 4.0, 0.01], [3, 3, 1, 1, 4, 4]) ** 2)
+
+    @staticmethod
+    def other(turn: float = 0.0, offset_s: float = 0.0, zoom: float = 1.0) -> Calibrated:
+        camera = EUROC.cameras[0]
+        intrinsics = intrinsics_of(camera.model)[1]
+        intrinsics[:2] *= zoom
+        return Calibrated(camera.R_BC @ so3.exp(turn * AXIS), camera.p_BC, offset_s, 0.0, intrinsics)
+
+    def test_only_what_is_clearly_off(self):
+        found = found_by(EUROC, self.other(turn=0.001, offset_s=0.002, zoom=1.05), self.COV)
+        (camera,), (given,) = found.calibration.cameras, EUROC.cameras
+        assert camera.model.fx == pytest.approx(1.05 * given.model.fx)
+        assert (found.offset_sigma_s, found.rotation_sigma) == (None, None)
+        assert camera.time_offset_ns == given.time_offset_ns
+        np.testing.assert_array_equal(camera.R_BC, given.R_BC)
+        # The mean of both focal lengths is known better than each.
+        assert found.focal_sigma == pytest.approx(4.0 / given.model.focal_px / np.sqrt(2.0), rel=0.01)
+
+    def test_all_that_is(self):
+        found = found_by(EUROC, self.other(turn=0.1, offset_s=-0.03, zoom=0.9), self.COV)
+        (camera,) = found.calibration.cameras
+        assert camera.time_offset_ns == -30_000_000
+        np.testing.assert_allclose(so3.log(EUROC.cameras[0].R_BC.T @ camera.R_BC), 0.1 * AXIS, atol=1e-9)
+        assert camera.model.fx == pytest.approx(0.9 * EUROC.cameras[0].model.fx)
+
+    def test_the_farthest_where_nothing_is_clear(self):
+        found = found_by(EUROC, self.other(turn=0.001, offset_s=0.009), self.COV)
+        assert found.calibration.cameras[0].time_offset_ns == 9_000_000
+        assert found.rotation_sigma is None
+
+    def test_not_what_is_hardly_known(self):
+        cov = self.COV.copy()
+        cov[OFFSET, OFFSET] = 0.03**2
+        with pytest.raises(UnsureError, match="offset"):
+            found_by(EUROC, self.other(offset_s=0.1), cov)
+        cov[INTRINSICS, INTRINSICS] *= 100.0
+        with pytest.raises(UnsureError, match="focal"):
+            found_by(EUROC, self.other(zoom=1.5), cov)
+
+
+class TestNoise:
+    @staticmethod
+    def readings(times: float, gap_s: float = 0.0) -> ImuSegment:
+        """A second at rest, with white noise so many times what the calibration has."""
+        rng, noise = np.random.default_rng(0), EUROC.imu
+        t_ns = np.arange(201) * 5_000_000
+        gyro, accel = (
+            times * density * np.sqrt(200.0) * rng.normal(size=(201, 3))
+            for density in (noise.gyro_density, noise.accel_density)
+        )
+        return ImuSegment(t_ns, gyro, accel, max(gap_s, 0.005))
+
+    def test_jumps_are_the_density_of_white_noise(self):
+        imu = self.readings(1.0)
+        assert jumps(imu.t_ns, imu.gyro_B) == pytest.approx(EUROC.imu.gyro_density, rel=0.1)
+        # A steady turn, or a steady change of it, is none.
+        steady = imu.gyro_B + 1e-3 * np.arange(201)[:, None] * EUROC.imu.gyro_density
+        assert jumps(imu.t_ns, steady) == pytest.approx(EUROC.imu.gyro_density, rel=0.1)
+
+    @pytest.mark.parametrize(("times", "expected"), [(0.1, 1.0), (1.0, 2.0), (1.5, 3.0), (10.0, 4.0)])
+    def test_between_rest_and_flight(self, times: float, expected: float):
+        rest, flight = EUROC.imu, EUROC.imu.in_flight(4.0)
+        noise = noise_over(self.readings(times), rest, flight)
+        assert noise.gyro_density == pytest.approx(expected * rest.gyro_density, rel=0.15)
+        assert noise.accel_density == pytest.approx(expected * rest.accel_density, rel=0.15)
+        assert noise.gyro_walk == rest.gyro_walk
+
+    def test_what_is_asked_for_is_the_most(self):
+        noise = noise_over(self.readings(10.0), EUROC.imu, EUROC.imu.in_flight(0.5))
+        assert noise.gyro_density == 0.5 * EUROC.imu.gyro_density
+
+    def test_gaps(self):
+        rest, flight = EUROC.imu, EUROC.imu.in_flight(4.0)
+        assert noise_over(self.readings(1.0, 0.1), rest, flight).gyro_density > 0.1
+        with pytest.raises(DivergedError, match="no inertial readings for"):
+            noise_over(self.readings(1.0, 0.6), rest, flight)
