@@ -9,7 +9,7 @@ from vioframe.errors import DivergedError
 from vioframe.estimation.factors.reprojection import INTRINSICS, OFFSET, Calibrated
 from vioframe.estimation.inertial.noise import jumps, noise_over
 from vioframe.estimation.initialization import InitialEstimate, Initializer
-from vioframe.estimation.initialization.sensors import found_by
+from vioframe.estimation.initialization.found import found_by
 from vioframe.estimation.initialization.window import UnsureError
 from vioframe.estimation.lifecycle import LifeCycle
 from vioframe.geometry import so3

@@ -15,7 +15,7 @@ from vioframe import pipeline
 from vioframe.errors import ConfigError
 from vioframe.estimation.hand_eye import HandEye, Turns
 from vioframe.estimation.initialization import Initializer
-from vioframe.estimation.initialization.sensors import Found
+from vioframe.estimation.initialization.found import Found
 from vioframe.estimation.lifecycle import LifeCycle
 from vioframe.estimation.turns import likeliest_translations, linearise_pairs, turn_between
 from vioframe.evaluation import evaluate

@@ -12,7 +12,8 @@ from vioframe.estimation.factors.reprojection import CALIBRATION_SIZE, INTRINSIC
 from vioframe.estimation.inertial.noise import jumps
 from vioframe.estimation.inertial.readings import Readings
 from vioframe.estimation.initialization import dynamic, static
-from vioframe.estimation.initialization.sensors import Found, SensorCheck, found_by
+from vioframe.estimation.initialization.found import Found, found_by
+from vioframe.estimation.initialization.sensors import SensorCheck
 from vioframe.estimation.initialization.window import (
     LARGEST_IMU_GAP_S,
     ContradictedError,

@@ -1,27 +1,25 @@
 """Whether camera and gyroscope belong together as their calibration says; where they do not, what would make them.
 
 Before anything is estimated from both, the camera's turns are held against the gyroscope's. Where the given time
-offset, rotation or focal length leaves them further apart than others do, those are taken in its place.
+offset, rotation, focal length or readout leaves them further apart than others do, those are taken in its place.
 """
 
 from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import replace
 
 import numpy as np
 
-from vioframe.arrays import Float
-from vioframe.estimation.factors.reprojection import INTRINSICS, OFFSET, Calibrated
 from vioframe.estimation.hand_eye import HandEye, Part, Turns, top_beside
 from vioframe.estimation.inertial.readings import Readings
-from vioframe.estimation.initialization.window import PIXEL_SIGMA, UnsureError, refuse_unless, seen_anew
+from vioframe.estimation.initialization.found import Found
+from vioframe.estimation.initialization.window import PIXEL_SIGMA, refuse_unless, seen_anew
 from vioframe.estimation.turns import Turn, turn_between
 from vioframe.geometry import so3
 from vioframe.geometry.cameras import Camera
-from vioframe.types import NS_PER_S, Calibration, CameraOnBody, CameraSigma, FrameTracks
+from vioframe.types import NS_PER_S, Calibration, CameraOnBody, FrameTracks
 
 # From the first frame of a pair to the second, for fast and for slow turns, and from one pair to the next.
 _TURNS_NS, _STEP_NS = (190_000_000, 590_000_000), 90_000_000
@@ -49,10 +47,6 @@ _TRY_EVERY_NS, _TRIED_TURNS = NS_PER_S, 15
 _FAR_BETTER, _VALLEY = 0.4, 0.75
 # How well it is found, relative and s.
 _FOCAL_SIGMA, _READOUT_SIGMA_S = 0.02, 0.004
-# A part of a calibration that is off by so many standard deviations is clearly wrong.
-_CLEAR = 3.0
-# Standard deviations with which a start can take a part over, rad, s and relative.
-_FOUND_SURE = {"rotation": np.deg2rad(2.5), "offset": 0.012, "focal": 0.02}
 # The part of what the camera turned that may be left unexplained.
 _LARGEST_UNEXPLAINED = 0.5
 # The median of |x| for x ~ N(0, 1).
@@ -60,91 +54,6 @@ _MEDIAN = 0.6745
 
 
 _Pair = tuple[FrameTracks, FrameTracks, Turn]
-
-
-@dataclass(frozen=True, slots=True)
-class Found:
-    """A calibration in place of the given one, and how well the parts that were found are known.
-
-    ``offset_sigma_s`` and ``rotation_sigma`` rad, ``focal_sigma`` relative, ``readout_sigma_s``; None is what was not
-    looked for.
-    """
-
-    calibration: Calibration
-    offset_sigma_s: float | None = None
-    rotation_sigma: float | None = None
-    focal_sigma: float | None = None
-    readout_sigma_s: float | None = None
-
-    def sigma(self, given: CameraSigma) -> CameraSigma:
-        """``given``, where nothing else was found."""
-        model = self.calibration.cameras[0].model
-        focal = (self.focal_sigma or 0.0) * np.array([model.fx, model.fy, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
-        return replace(
-            given,
-            rotation=np.maximum(self.rotation_sigma or 0.0, given.rotation),
-            time_offset_s=max(self.offset_sigma_s or 0.0, given.time_offset_s),
-            intrinsics=np.maximum(focal, given.intrinsics),
-            readout_s=self.readout_sigma_s or given.readout_s,
-        )
-
-    def after(self, before: Found | None) -> Found:
-        """With what was found ``before`` and not again."""
-        if before is None:
-            return self
-        kept = {name: getattr(before, name) for name in self.__slots__ if getattr(self, name) is None}
-        return replace(self, **kept)
-
-    def __str__(self) -> str:
-        (camera,), parts = self.calibration.cameras, []
-        if self.offset_sigma_s is not None:
-            offset_ms = 1e-6 * camera.time_offset_ns
-            parts.append(f"time offset {offset_ms:.0f} ms (+- {1e3 * self.offset_sigma_s:.0f} ms)")
-        if self.rotation_sigma is not None:
-            quat = " ".join(f"{q:.5f}" for q in so3.to_quat_xyzw(camera.R_BC))
-            sigma_deg = np.rad2deg(self.rotation_sigma)
-            parts.append(f"camera's rotation on the body, R_BC as quat_xyzw {quat} (+- {sigma_deg:.1f} deg)")
-        if self.focal_sigma is not None:
-            parts.append(f"focal length {camera.model.focal_px:.0f} px (+- {100.0 * self.focal_sigma:.0f} %)")
-        if self.readout_sigma_s is not None:
-            parts.append(f"readout {1e3 * camera.readout_s:.0f} ms (+- {1e3 * self.readout_sigma_s:.0f} ms)")
-        return "found while starting: " + ", ".join(parts)
-
-
-def found_by(given: Calibration, camera: Calibrated, cov: Float) -> Found:
-    """What of ``camera``, with covariance (16, 16), differs most from the calibration ``given``, or clearly.
-
-    Raises :class:`UnsureError` where that is not known well enough.
-    """
-    old = given.cameras[0]
-    turn, offset_s = so3.log(old.R_BC.T @ camera.R_BC), camera.offset_s
-    focal = np.array([old.model.fx, old.model.fy])
-    zoom = float(np.mean(camera.intrinsics[:2] / focal)) - 1.0
-    by_focal = np.zeros(len(cov))
-    by_focal[INTRINSICS][:2] = 0.5 / focal
-    sigma = {
-        "rotation": float(np.sqrt(np.linalg.eigvalsh(cov[:3, :3])[-1])),
-        "offset": float(np.sqrt(cov[OFFSET, OFFSET])),
-        "focal": float(np.sqrt(by_focal @ cov @ by_focal)),
-    }
-    off = {"rotation": float(np.linalg.norm(turn)), "offset": abs(offset_s), "focal": abs(zoom)}
-    clear = {part: off[part] / sigma[part] for part in off}
-    chosen = {part for part in clear if clear[part] >= min(_CLEAR, max(clear.values()))}
-    if unsure := [part for part in chosen if sigma[part] > _FOUND_SURE[part]]:
-        raise UnsureError(
-            f"the {' and '.join(unsure)} given contradict what is seen; what fits is not known well enough"
-        )
-    changes: dict[str, dict[str, Any]] = {
-        "rotation": {"R_BC": camera.R_BC},
-        "offset": {"time_offset_ns": old.time_offset_ns + round(offset_s * NS_PER_S)},
-        "focal": {"model": old.model.zoomed(1.0 + zoom)},
-    }
-    return Found(
-        given.with_camera(0, **{name: value for part in chosen for name, value in changes[part].items()}),
-        sigma["offset"] if "offset" in chosen else None,
-        sigma["rotation"] if "rotation" in chosen else None,
-        sigma["focal"] if "focal" in chosen else None,
-    )
 
 
 class SensorCheck:
