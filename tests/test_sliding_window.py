@@ -320,7 +320,8 @@ def test_min_observations_delays_landmarks():
 
 
 def test_noisier_readings_are_trusted_less():
-    sequence = simulated_sequence("figure_eight", seed=1, duration_s=4.0)
+    """Readings that jump six times as much as the calibration has it."""
+    sequence = simulated_sequence("figure_eight", CALIBRATION.imu.in_flight(6.0), seed=1, duration_s=4.0)
     once, often = (
         sigmas(fly(sequence, seed=1, estimation=EstimationOptions(imu_noise_factor=factor))) for factor in (1.0, 8.0)
     )
@@ -478,9 +479,9 @@ def test_stop_and_go_is_held_at_every_stop():
     assert velocity[told].max() < 0.02
     assert position_errors(held, sequence).max() < 0.03
     # Nothing is triangulated from a place that one does not leave: on readings alone the body wanders off.
-    assert (
-        position_errors(fly(sequence, estimation=EstimationOptions(zero_velocity_update=False)), sequence).max() > 0.5
-    )
+    loose = EstimationOptions(zero_velocity_update=False)
+    wandering = run_backend(since(sequence, 1), SlidingWindow(), loose, drawn_start(sequence, 1, 0))
+    assert position_errors(wandering, sequence).max() > 0.1
 
 
 def test_calibration_of_the_camera_is_in_its_own_hands():

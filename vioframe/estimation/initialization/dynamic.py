@@ -71,8 +71,9 @@ _MAX_BIAS_ACCEL = 4.0 * BIAS_ACCEL_SIGMA
 # Largest standard deviations that are accepted: of scale (relative), velocity on any axis (m/s, or as a part of the
 # speed where that is more), and gravity's direction.
 _SCALE_SIGMA, _VELOCITY_SIGMA, _SPEED_SIGMA, _TILT_SIGMA_DEG = 0.06, 0.05, 0.03, 1.0
-# A calibration is wrong where the most likely one makes the rest so much likelier, as a difference of logarithms.
-_CONTRADICTED = 6.0
+# A calibration is wrong where the likeliest makes the rest so much likelier, as a difference of logarithms: far more
+# than chance would, because the noise in many landmarks, each with few sightings, makes focal lengths seem longer.
+_CONTRADICTED = 20.0
 # Beyond so many times these the first adjustment is not gone on with.
 _HOPELESS = 1.5
 
@@ -134,9 +135,15 @@ def _believed(
     camera, x = calibration.cameras[0], solution.variables
     problem = with_calibration(problem, x, camera, known)
     believed = adjusted(problem, replace(x, camera=calibrated(camera)), known)
-    if not believed.cost < solution.cost + _CONTRADICTED:
+    if not believed.cost < solution.cost + _CONTRADICTED * _variance(problem, x):
         raise ContradictedError(x.camera, cov[-CALIBRATION_SIZE:, -CALIBRATION_SIZE:])
     return problem, believed.variables
+
+
+def _variance(problem: Problem, x: Variables) -> float:
+    """That of the sightings as the landmarks show it, over that which is assumed."""
+    errors, views = problem.sightings.errors(x.poses, x.camera, x.landmarks), problem.sightings.seen.sum(axis=1)
+    return float(np.median(2.0 * views * errors**2 / (2.0 * views - 3.0)))
 
 
 def _require(window: Window, what: str) -> None:
