@@ -111,7 +111,7 @@ class TestRealRecordings:
             assert errors.seconds < 1.1
             assert errors.tilt_deg < 1.0
             assert errors.velocity < 0.02
-            np.testing.assert_allclose(estimate.states[-1].bias_gyro_B, BIAS_GYRO, atol=0.004)
+            np.testing.assert_allclose(estimate.states[-1].bias_gyro_B, BIAS_GYRO, atol=0.01)
 
     def test_plane_under_strong_motion(self, shared_data: Path):
         """Every corner lies on one board, where an essential matrix is ambiguous."""
@@ -187,7 +187,7 @@ class TestSimulatedFlights:
         assert errors.tilt_deg < 1.5
         assert abs(errors.scale) < 0.1
         assert errors.nees < 3.0
-        np.testing.assert_allclose(estimate.states[-1].bias_gyro_B, BIAS_GYRO, atol=0.004)
+        np.testing.assert_allclose(estimate.states[-1].bias_gyro_B, BIAS_GYRO, atol=0.01)
 
     def test_landmarks_are_where_they_are(self):
         sequence = simulated_sequence("figure_eight", duration_s=5.0, pixel_sigma=0.2)

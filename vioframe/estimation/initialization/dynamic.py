@@ -62,7 +62,7 @@ _FARTHEST_M = 200.0
 # Frames of the window that are estimated, tracks that are used, the longest first, and how few refuse the attempt.
 _KEYFRAMES, _MOST_LANDMARKS, _FEWEST_LANDMARKS = 14, 100, 20
 # The newest part of the window is predicted from the rest to test the estimate.
-_LOOKAHEAD_S, _LARGEST_LOOKAHEAD_PX, _FEWEST_COMMON = 0.2, 3.0, 8
+_LOOKAHEAD_S, _LARGEST_LOOKAHEAD_PX, _FEWEST_COMMON = 0.2, 4.0, 8
 # Least median parallax, with the rotation taken out; most that the observations may disagree with the estimate (RMS).
 _LEAST_PARALLAX_PX, _LARGEST_ERROR_PX = 5.0, 2.0
 # The readings' residuals, per degree of freedom: vibration makes them larger than the data sheet's noise.

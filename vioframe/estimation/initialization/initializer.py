@@ -41,7 +41,7 @@ _SOON_S, _LATER_S, _LATEST_S = 0.1, 0.05, 0.6
 _IN_MOTION, _JUMPS = 2.0, 2.5
 # What a calibration may be off by before a start has borne it out, beyond how well it is known: rad, s and relative.
 # What contradicts it is taken over so many times in one attempt.
-_DOUBT_ROTATION, _DOUBT_OFFSET_S, _DOUBT_FOCAL = 0.05, 0.02, 0.08
+_DOUBT_ROTATION, _DOUBT_OFFSET_S, _DOUBT_FOCAL = 0.05, 0.02, 0.06
 _MOST_CONTRADICTIONS = 3
 # A camera that is turned by more than this on the body, rad, no back-end finds by itself.
 _MOUNTED_DIFFERENTLY = np.deg2rad(15.0)

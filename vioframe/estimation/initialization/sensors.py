@@ -43,7 +43,7 @@ _OVERLAP = 4.0
 _WELL, _BADLY = 1.5, 1.7
 _ZOOMS, _READOUTS_S = np.linspace(-0.15, 0.15, 7), np.linspace(-0.045, 0.045, 7)
 _TRY_EVERY_NS, _TRIED_TURNS = NS_PER_S, 15
-# One must fit better by this part of the squares to be taken, and what lies between it and the given one by this.
+# One must fit better by this part of the squares to be taken, and what lies next to the given one by this.
 _FAR_BETTER, _VALLEY = 0.4, 0.75
 # How well it is found, relative and s.
 _FOCAL_SIGMA, _READOUT_SIGMA_S = 0.02, 0.004
@@ -155,26 +155,39 @@ class SensorCheck:
     def _valley(self, cameras: Sequence[CameraOnBody], readings: Readings, start: HandEye) -> float | None:
         """Where between ``cameras``, the given one in the middle, turns fit well, and far better than there.
 
-        None where they do nowhere. With each camera they are fitted anew from ``start``.
+        None where no way leads down to it from the middle.
+        """
+        given = len(cameras) // 2
+        tried = {k: self._squares(cameras[k], readings, start) for k in (given - 1, given, given + 1)}
+        best = min(given - 1, given + 1, key=lambda k: tried[k][0])
+        if not tried[best][0] <= _VALLEY * tried[given][0]:
+            return None
+        onward = best - given
+        while 0 <= best + onward < len(cameras):
+            tried[best + onward] = self._squares(cameras[best + onward], readings, start)
+            if not tried[best + onward][0] < tried[best][0]:
+                break
+            best += onward
+        else:
+            return None
+        squares, fits_well = tried[best]
+        if not (fits_well and squares <= _FAR_BETTER * tried[given][0]):
+            return None
+        return best + top_beside(-np.log([tried[k][0] for k in (best - 1, best, best + 1)]), 1)
+
+    def _squares(self, camera: CameraOnBody, readings: Readings, start: HandEye) -> tuple[float, bool]:
+        """The squares by which some of the turns that ``camera`` saw are off, and whether that is no more than noise.
+
+        They are fitted anew from ``start``; infinite where there are too few.
         """
         some = [self._pairs[k] for k in np.unique(np.linspace(0, len(self._pairs) - 1, _TRIED_TURNS).astype(int))]
-        squares, fits_well = [], []
-        for camera in cameras:
-            found = [turn for *_, turn in _anew(((a, b) for a, b, _ in some), camera, readings)]
-            turns = Turns(found, readings.t_ns, readings.gyro_B)
-            if len(turns) < _FEWEST_TURNS:
-                return None
-            x, variance = turns.fit(start, ("rotation", "offset"))
-            squares.append(turns.cost(x, variance) * variance)
-            fits_well.append(variance < (_BADLY * np.median([turn.misfit for turn in found]) / _MEDIAN) ** 2)
-        best, as_given = int(np.argmin(squares)), len(cameras) // 2
-        if best in (0, len(squares) - 1) or not fits_well[best]:
-            return None
-        # A valley, not a hole: what lies between the given one and the best is better than the given one, too.
-        between = best + int(np.sign(as_given - best))
-        if squares[best] > _FAR_BETTER * squares[as_given] or squares[between] > _VALLEY * squares[as_given]:
-            return None
-        return best + top_beside(-np.log(squares), best)
+        found = [turn for *_, turn in _anew(((a, b) for a, b, _ in some), camera, readings)]
+        turns = Turns(found, readings.t_ns, readings.gyro_B)
+        if len(turns) < _FEWEST_TURNS:
+            return np.inf, False
+        x, variance = turns.fit(start, ("rotation", "offset"))
+        noise = float(np.median([turn.misfit for turn in found])) / _MEDIAN
+        return turns.cost(x, variance) * variance, variance < (_BADLY * noise) ** 2
 
 
 def _anew(
