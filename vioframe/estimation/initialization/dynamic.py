@@ -17,7 +17,7 @@ from vioframe.arrays import Bool, Float, Int
 from vioframe.estimation.factors.inertial import StateArrays
 from vioframe.estimation.factors.landmarks import positions
 from vioframe.estimation.factors.problem import Problem, Variables
-from vioframe.estimation.factors.reprojection import CALIBRATION_SIZE, Calibrated
+from vioframe.estimation.factors.reprojection import CALIBRATION_SIZE, READOUT, Calibrated
 from vioframe.estimation.factors.solver import Solution
 from vioframe.estimation.hand_eye import HandEye, Turns
 from vioframe.estimation.inertial.preintegration import Preintegrated, preintegrate
@@ -74,6 +74,8 @@ _SCALE_SIGMA, _VELOCITY_SIGMA, _SPEED_SIGMA, _TILT_SIGMA_DEG = 0.06, 0.05, 0.03,
 # A calibration is wrong where the likeliest makes the rest so much likelier, as a difference of logarithms: far more
 # than chance would, because the noise in many landmarks, each with few sightings, makes focal lengths seem longer.
 _CONTRADICTED = 20.0
+# A readout is doubted where it can be found to this.
+_READOUT_SIGMA_S, _READOUT = 0.0025, READOUT - CALIBRATION_SIZE
 # Beyond so many times these the first adjustment is not gone on with.
 _HOPELESS = 1.5
 
@@ -115,9 +117,15 @@ def initialise(packets: Sequence[Packet], calibration: Calibration, known: Float
 
     x = replace(x, states=x.states.append(StateArrays.stack(predicted[-1:])))
     problem, solution = _adjusted(window, x, calibration, doubted)
+    cov = covariance(problem, solution.variables, doubted)
+    if not cov[_READOUT, _READOUT] <= _READOUT_SIGMA_S**2:
+        # Only fast turns tell a readout; slow ones would have it make up for something else.
+        doubted = doubted.copy()
+        doubted[READOUT, READOUT] = known[READOUT, READOUT]
+        problem, solution = _adjusted(window, x, calibration, doubted)
+        cov = covariance(problem, solution.variables, doubted)
     _check_fit(problem, solution)
     x = solution.variables
-    cov = covariance(problem, x, doubted)
     _check_uncertainty(x.states, cov)
     problem, x = _believed(problem, solution, calibration, known, cov)
     cov = covariance(problem, x, known)

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from vioframe.arrays import Float
-from vioframe.estimation.factors.reprojection import INTRINSICS, OFFSET, Calibrated
+from vioframe.estimation.factors.reprojection import INTRINSICS, OFFSET, READOUT, Calibrated
 from vioframe.estimation.initialization.window import UnsureError
 from vioframe.geometry import so3
 from vioframe.types import NS_PER_S, Calibration, CameraSigma
@@ -16,7 +16,7 @@ from vioframe.types import NS_PER_S, Calibration, CameraSigma
 # A part of a calibration that is off by so many standard deviations is clearly wrong.
 _CLEAR = 3.0
 # Standard deviations with which a start can take a part over, rad, s and relative.
-_FOUND_SURE = {"rotation": np.deg2rad(2.5), "offset": 0.012, "focal": 0.02}
+_FOUND_SURE = {"rotation": np.deg2rad(2.5), "offset": 0.012, "focal": 0.02, "readout": 0.005}
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,9 +83,16 @@ def found_by(given: Calibration, camera: Calibrated, cov: Float) -> Found:
         "rotation": float(np.sqrt(np.linalg.eigvalsh(cov[:3, :3])[-1])),
         "offset": float(np.sqrt(cov[OFFSET, OFFSET])),
         "focal": float(np.sqrt(by_focal @ cov @ by_focal)),
+        "readout": float(np.sqrt(cov[READOUT, READOUT])),
     }
-    off = {"rotation": float(np.linalg.norm(turn)), "offset": abs(offset_s), "focal": abs(zoom)}
-    clear = {part: off[part] / sigma[part] for part in off}
+    longer_s = camera.readout_s - old.readout_s
+    off = {
+        "rotation": float(np.linalg.norm(turn)),
+        "offset": abs(offset_s),
+        "focal": abs(zoom),
+        "readout": abs(longer_s),
+    }
+    clear = {part: off[part] / max(sigma[part], 1e-12) for part in off}
     chosen = {part for part in clear if clear[part] >= min(_CLEAR, max(clear.values()))}
     if unsure := [part for part in chosen if sigma[part] > _FOUND_SURE[part]]:
         raise UnsureError(
@@ -95,10 +102,12 @@ def found_by(given: Calibration, camera: Calibrated, cov: Float) -> Found:
         "rotation": {"R_BC": camera.R_BC},
         "offset": {"time_offset_ns": old.time_offset_ns + round(offset_s * NS_PER_S)},
         "focal": {"model": old.model.zoomed(1.0 + zoom)},
+        "readout": {"readout_s": camera.readout_s},
     }
     return Found(
         given.with_camera(0, **{name: value for part in chosen for name, value in changes[part].items()}),
         sigma["offset"] if "offset" in chosen else None,
         sigma["rotation"] if "rotation" in chosen else None,
         sigma["focal"] if "focal" in chosen else None,
+        sigma["readout"] if "readout" in chosen else None,
     )

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from vioframe.arrays import Float
-from vioframe.estimation.factors.reprojection import CALIBRATION_SIZE, INTRINSICS, OFFSET
+from vioframe.estimation.factors.reprojection import CALIBRATION_SIZE, INTRINSICS, OFFSET, READOUT
 from vioframe.estimation.inertial.noise import jumps
 from vioframe.estimation.inertial.readings import Readings
 from vioframe.estimation.initialization import dynamic, static
@@ -41,7 +41,7 @@ _SOON_S, _LATER_S, _LATEST_S = 0.1, 0.05, 0.6
 _IN_MOTION, _JUMPS = 2.0, 2.5
 # What a calibration may be off by before a start has borne it out, beyond how well it is known: rad, s and relative.
 # What contradicts it is taken over so many times in one attempt.
-_DOUBT_ROTATION, _DOUBT_OFFSET_S, _DOUBT_FOCAL = 0.05, 0.02, 0.06
+_DOUBT_ROTATION, _DOUBT_OFFSET_S, _DOUBT_FOCAL, _DOUBT_READOUT_S = 0.05, 0.02, 0.06, 0.015
 _MOST_CONTRADICTIONS = 3
 # A camera that is turned by more than this on the body, rad, no back-end finds by itself.
 _MOUNTED_DIFFERENTLY = np.deg2rad(15.0)
@@ -213,6 +213,7 @@ class Initializer:
         focal[INTRINSICS][:2] = camera.model.fx, camera.model.fy
         out[:3, :3] += np.eye(3) * _DOUBT_ROTATION**2
         out[OFFSET, OFFSET] += _DOUBT_OFFSET_S**2
+        out[READOUT, READOUT] += _DOUBT_READOUT_S**2
         out += np.outer(focal, focal) * _DOUBT_FOCAL**2
         return out
 

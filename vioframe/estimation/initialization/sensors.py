@@ -148,8 +148,10 @@ class SensorCheck:
             return Found(calibration.with_camera(0, model=camera.model.zoomed(factor)), focal_sigma=_FOCAL_SIGMA)
         rolling = [replace(camera, readout_s=camera.readout_s + longer_s) for longer_s in _READOUTS_S]
         if (place := self._valley(rolling, readings, start)) is not None:
-            readout_s = camera.readout_s + float(np.interp(place, np.arange(len(_READOUTS_S)), _READOUTS_S))
-            return Found(calibration.with_camera(0, readout_s=readout_s), readout_sigma_s=_READOUT_SIGMA_S)
+            longer_s = float(np.interp(place, np.arange(len(_READOUTS_S)), _READOUTS_S))
+            if abs(longer_s) > _INSIGNIFICANT * _READOUT_SIGMA_S:
+                found = calibration.with_camera(0, readout_s=camera.readout_s + longer_s)
+                return Found(found, readout_sigma_s=_READOUT_SIGMA_S)
         return None
 
     def _valley(self, cameras: Sequence[CameraOnBody], readings: Readings, start: HandEye) -> float | None:
