@@ -8,9 +8,9 @@ import pytest
 from vioframe.errors import DivergedError
 from vioframe.estimation.factors.reprojection import INTRINSICS, OFFSET, Calibrated
 from vioframe.estimation.inertial.noise import jumps, noise_over
-from vioframe.estimation.initialization import InitialEstimate, Initializer
+from vioframe.estimation.initialization import InitialEstimate, Initializer, dynamic
 from vioframe.estimation.initialization.found import found_by
-from vioframe.estimation.initialization.window import UnsureError
+from vioframe.estimation.initialization.window import ContradictedError, RefusalError, UnsureError
 from vioframe.estimation.lifecycle import LifeCycle
 from vioframe.geometry import so3
 from vioframe.geometry.kernels import intrinsics_of
@@ -112,6 +112,29 @@ def test_motion_ends_the_doubt_of_a_flight_from_rest():
         doubted.append(life._initializer.in_doubt)
     assert any(doubted)
     assert not doubted[-1]
+
+
+@pytest.mark.parametrize("offset_s", [-0.05, 0.05])
+def test_with_another_time_offset_the_readings_of_the_newest_frame_may_be_still_to_come(offset_s: float, monkeypatch):
+    s, asked = hovering(), []
+
+    def contradicted_once(packets, calibration, known, doubted):
+        asked.append(packets[-1][1].t_ns)
+        if len(asked) > 1:
+            raise RefusalError("enough")
+        camera = Calibrated(*TestFoundBy.other(offset_s=offset_s))
+        raise ContradictedError(camera, TestFoundBy.COV)
+
+    monkeypatch.setattr(dynamic, "initialise", contradicted_once)
+    initializer = Initializer(s.calibration)
+    for imu, tracks in s.packets:
+        assert initializer.add(imu, tracks) is None
+        if asked:
+            break
+    assert initializer.calibration.cameras[0].time_offset_ns == round(offset_s * 1e9)
+    # Later readings are not there yet, earlier ones are.
+    assert len(asked) == (1 if offset_s > 0.0 else 2)
+    assert set(asked) == {tracks.t_ns}
 
 
 class TestFoundBy:

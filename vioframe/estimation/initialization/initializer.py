@@ -188,10 +188,10 @@ class Initializer:
         self._next_attempt_ns = newest_ns + round((self._wait_s - 1e-3) * NS_PER_S)
         if (found := self._sensors.judge(self._readings, self._calibration)) is not None:
             self._take_over(found)
-            if self._packets[-1][1].t_ns != newest_ns:
-                return None
         try:
             for _ in range(_MOST_CONTRADICTIONS):
+                if self._packets[-1][1].t_ns != newest_ns:
+                    return None  # with another time offset, its readings are still to come
                 known = np.diag(self.camera_sigma.stacked() ** 2)
                 calibration = replace(self._calibration, imu=self._noise_in_motion())
                 try:
