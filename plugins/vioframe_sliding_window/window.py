@@ -8,7 +8,14 @@ import numpy as np
 
 from vioframe.arrays import Bool
 from vioframe.estimation.factors.inertial import ImuFactors, StateArrays
-from vioframe.estimation.factors.landmarks import image_velocities, in_hosts, in_images, positions, triangulate_tracks
+from vioframe.estimation.factors.landmarks import (
+    image_velocities,
+    in_hosts,
+    in_images,
+    motion_in_body,
+    positions,
+    triangulate_tracks,
+)
 from vioframe.estimation.factors.problem import STATE_SIZE, Prior, Problem, Variables, marginalise_oldest
 from vioframe.estimation.factors.reprojection import (
     CALIBRATION_SIZE,
@@ -299,10 +306,8 @@ class Window:
     def _shutter(self, rows: Int) -> Shutter:
         if not (self._camera.readout_s or self._calibrated[READOUT]):
             return GLOBAL_SHUTTER
-        states = self._states
-        velocity_B = np.einsum("kji,kj->ki", states.R_WB, states.v_WB)
         row = self._given.cameras[0].row(self.tracks.xy[rows, :, 1])
-        return Shutter(True, row, self._gyro_B - states.bias_gyro_B, velocity_B)
+        return Shutter(True, row, *motion_in_body(self._states, self._gyro_B))
 
     @property
     def _varies_lens(self) -> bool:

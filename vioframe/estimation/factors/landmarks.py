@@ -56,10 +56,15 @@ def image_velocities(states: StateArrays, camera: Calibrated, gyro_B: Float, xy:
     rolling shutter is read it hardly changes.
     """
     ray = np.concatenate([xy, np.ones((*depth.shape, 1))], axis=-1)
-    rate_B = gyro_B - states.bias_gyro_B
-    velocity_B = np.einsum("kji,kj->ki", states.R_WB, states.v_WB) + np.cross(rate_B, camera.p_BC)
+    rate_B, velocity_B = motion_in_body(states, gyro_B)
+    velocity_B = velocity_B + np.cross(rate_B, camera.p_BC)
     moved = -np.cross(rate_B @ camera.R_BC, ray) - velocity_B @ camera.R_BC / depth[..., None]
     return np.asarray(moved[..., :2] - ray[..., :2] * moved[..., 2:])
+
+
+def motion_in_body(states: StateArrays, gyro_B: Float) -> tuple[Float, Float]:
+    """(K, 3) rad/s and (K, 3) m/s: how the body turns and flies in every frame, where ``gyro_B`` (K, 3) was read."""
+    return gyro_B - states.bias_gyro_B, np.einsum("kji,kj->ki", states.R_WB, states.v_WB)
 
 
 def camera_poses(states: StateArrays, camera: Calibrated) -> tuple[Float, Float]:

@@ -12,7 +12,7 @@ import numpy as np
 
 from vioframe.arrays import Float, Int
 from vioframe.estimation.factors.inertial import ImuFactors, StateArrays
-from vioframe.estimation.factors.landmarks import image_velocities, in_images
+from vioframe.estimation.factors.landmarks import image_velocities, in_images, motion_in_body
 from vioframe.estimation.factors.problem import STATE_SIZE, Prior, Problem, Variables, calibration_information
 from vioframe.estimation.factors.reprojection import (
     CALIBRATION_SIZE,
@@ -58,8 +58,7 @@ def adjustment(window: Window, imu: list[Preintegrated], x: Variables, camera: C
     shutter = GLOBAL_SHUTTER
     if rolling:
         row = camera.row(np.ascontiguousarray(window.xy_px[..., 1].T))
-        velocity_B = np.einsum("kji,kj->ki", x.states.R_WB, x.states.v_WB)
-        shutter = Shutter(True, row, gyro_B - x.states.bias_gyro_B, velocity_B)
+        shutter = Shutter(True, row, *motion_in_body(x.states, gyro_B))
     sightings = Sightings(seen, xy, velocity, to_px, PIXEL_SIGMA, _CAUCHY, shutter=shutter, lens=lens)
     return Problem(
         _prior(x, 0, _HELD, calibrated(camera), known), ImuFactors.stack(imu), {}, sightings, first_estimates=False
