@@ -7,8 +7,9 @@ offset, rotation, focal length or readout leaves them further apart than others 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -88,7 +89,7 @@ class SensorCheck:
     def see_through(self, camera: CameraOnBody, readings: Readings) -> None:
         """Count with ``camera`` from here on."""
         self._frames = deque(seen_anew(tracks, camera, readings.gyro_at(tracks.t_ns)) for tracks in self._frames)
-        self._pairs = deque(_anew(((a, b) for a, b, _ in self._pairs), camera, readings))
+        self._pairs = deque(_anew(self._pairs, camera, readings))
 
     def judge(self, readings: Readings, calibration: Calibration) -> Found | None:
         """What to take in place of ``calibration``; None where that fits, or nothing can be said.
@@ -142,40 +143,19 @@ class SensorCheck:
             return None
         self._tried_ns = now_ns
         camera = replace(calibration.cameras[0], R_BC=start.R_BC, rotation_known=True)
+        squares = partial(self._squares, readings=readings, start=start)
+        as_given, _ = squares(camera)
         zoomed = [replace(camera, model=camera.model.zoomed(1.0 + zoom)) for zoom in _ZOOMS]
-        if (place := self._valley(zoomed, readings, start)) is not None:
+        if (place := _valley(zoomed, as_given, squares)) is not None:
             factor = 1.0 + np.interp(place, np.arange(len(_ZOOMS)), _ZOOMS)
             return Found(calibration.with_camera(0, model=camera.model.zoomed(factor)), focal_sigma=_FOCAL_SIGMA)
         rolling = [replace(camera, readout_s=camera.readout_s + longer_s) for longer_s in _READOUTS_S]
-        if (place := self._valley(rolling, readings, start)) is not None:
+        if (place := _valley(rolling, as_given, squares)) is not None:
             longer_s = float(np.interp(place, np.arange(len(_READOUTS_S)), _READOUTS_S))
             if abs(longer_s) > _INSIGNIFICANT * _READOUT_SIGMA_S:
                 found = calibration.with_camera(0, readout_s=camera.readout_s + longer_s)
                 return Found(found, readout_sigma_s=_READOUT_SIGMA_S)
         return None
-
-    def _valley(self, cameras: Sequence[CameraOnBody], readings: Readings, start: HandEye) -> float | None:
-        """Where between ``cameras``, the given one in the middle, turns fit well, and far better than there.
-
-        None where no way leads down to it from the middle.
-        """
-        given = len(cameras) // 2
-        tried = {k: self._squares(cameras[k], readings, start) for k in (given - 1, given, given + 1)}
-        best = min(given - 1, given + 1, key=lambda k: tried[k][0])
-        if not tried[best][0] <= _VALLEY * tried[given][0]:
-            return None
-        onward = best - given
-        while 0 <= best + onward < len(cameras):
-            tried[best + onward] = self._squares(cameras[best + onward], readings, start)
-            if not tried[best + onward][0] < tried[best][0]:
-                break
-            best += onward
-        else:
-            return None
-        squares, fits_well = tried[best]
-        if not (fits_well and squares <= _FAR_BETTER * tried[given][0]):
-            return None
-        return best + top_beside(-np.log([tried[k][0] for k in (best - 1, best, best + 1)]), 1)
 
     def _squares(self, camera: CameraOnBody, readings: Readings, start: HandEye) -> tuple[float, bool]:
         """The squares by which some of the turns that ``camera`` saw are off, and whether that is no more than noise.
@@ -183,7 +163,7 @@ class SensorCheck:
         They are fitted anew from ``start``; infinite where there are too few.
         """
         some = [self._pairs[k] for k in np.unique(np.linspace(0, len(self._pairs) - 1, _TRIED_TURNS).astype(int))]
-        found = [turn for *_, turn in _anew(((a, b) for a, b, _ in some), camera, readings)]
+        found = [turn for *_, turn in _anew(some, camera, readings)]
         turns = Turns(found, readings.t_ns, readings.gyro_B)
         if len(turns) < _FEWEST_TURNS:
             return np.inf, False
@@ -192,12 +172,39 @@ class SensorCheck:
         return turns.cost(x, variance) * variance, variance < (_BADLY * noise) ** 2
 
 
-def _anew(
-    pairs: Iterable[tuple[FrameTracks, FrameTracks]], camera: CameraOnBody, readings: Readings
-) -> Iterator[_Pair]:
+def _valley(
+    cameras: Sequence[CameraOnBody], as_given: float, squares: Callable[[CameraOnBody], tuple[float, bool]]
+) -> float | None:
+    """Where between ``cameras``, the given one in the middle, turns fit well, and far better than ``as_given`` there.
+
+    None where no way leads down to it from the middle. ``squares`` are those of a camera, and whether they are noise.
+    """
+    given = len(cameras) // 2
+    tried = {k: squares(cameras[k]) for k in (given - 1, given + 1)}
+    best = min(tried, key=lambda k: tried[k][0])
+    if not tried[best][0] <= _VALLEY * as_given:
+        return None
+    onward = best - given
+    while 0 <= best + onward < len(cameras):
+        tried[best + onward] = squares(cameras[best + onward])
+        if not tried[best + onward][0] < tried[best][0]:
+            break
+        best += onward
+    else:
+        return None
+    least, fits_well = tried[best]
+    if not (fits_well and least <= _FAR_BETTER * as_given):
+        return None
+    about = [as_given if k == given else tried[k][0] for k in (best - 1, best, best + 1)]
+    return best + top_beside(-np.log(about), 1)
+
+
+def _anew(pairs: Sequence[_Pair], camera: CameraOnBody, readings: Readings) -> Iterator[_Pair]:
     """The pairs as ``camera`` saw them, and the turns they make then, where they make any."""
-    for pair in pairs:
-        before, now = (seen_anew(tracks, camera, readings.gyro_at(tracks.t_ns)) for tracks in pair)
+    frames = {tracks.t_ns: tracks for *pair, _ in pairs for tracks in pair}
+    seen = {t_ns: seen_anew(tracks, camera, readings.gyro_at(t_ns)) for t_ns, tracks in frames.items()}
+    for a, b, _ in pairs:
+        before, now = seen[a.t_ns], seen[b.t_ns]
         if (turn := turn_between(before, now, PIXEL_SIGMA / camera.model.focal_px)) is not None:
             yield before, now, turn
 
