@@ -23,7 +23,9 @@ from vioframe_msckf.options import MsckfOptions
 
 EXACT = EstimationOptions(imu_noise_factor=1.0)
 """Readings are as noisy as stated, and no more."""
-CALIBRATED = MsckfOptions(calibrate_extrinsics=False, calibrate_time_offset=False, calibrate_intrinsics=False)
+WHITE = MsckfOptions(landmark_drift_px=0.0)
+"""Points that are simulated stay on their landmarks."""
+CALIBRATED = replace(WHITE, calibrate_extrinsics=False, calibrate_time_offset=False, calibrate_intrinsics=False)
 
 
 class GateCounts:
@@ -103,6 +105,28 @@ def test_outliers_are_rejected_and_do_no_harm(monkeypatch):
     assert max(errors) < 0.15
 
 
+def sliding(sequence: TrackSequence, drift_px: float, seed: int) -> TrackSequence:
+    """Points that walk off their landmarks by ``drift_px`` a frame on either axis."""
+    rng, off, packets = np.random.default_rng(seed), dict[int, Float](), []
+    for imu, tracks in sequence.packets:
+        for track in tracks.ids.tolist():
+            off[track] = off.get(track, np.zeros(2)) + drift_px * rng.normal(size=2)
+        xy = tracks.xy + np.array([off[track] for track in tracks.ids.tolist()])
+        packets.append((imu, replace(tracks, xy=xy, xy_normalised=sequence.calibration.cameras[0].model.undistort(xy))))
+    return replace(sequence, packets=tuple(packets))
+
+
+def test_landmarks_that_points_slide_off_are_not_believed_for_long():
+    ratios = []
+    for seed in range(3):
+        clean = simulated_sequence("figure_eight", pixel_sigma=0.3, seed=seed, duration_s=15.0)
+        truth = {s.t_ns: s for s in clean.true_states}
+        runs = [fly(sliding(clean, 0.3, seed), o, seed, EXACT) for o in (WHITE, MsckfOptions(landmark_drift_px=0.3))]
+        ratios.append([sum(pose_nees(run.states, truth)) for run in runs])
+    believed, doubted = np.mean(ratios, axis=0)
+    assert doubted < 0.7 * believed
+
+
 def mean_nees(flight: str, seeds: int, duration_s: float, options: MsckfOptions) -> tuple[float, float]:
     values = []
     for seed in range(seeds):
@@ -120,14 +144,14 @@ def test_errors_are_as_large_as_the_covariance_says(flight):
     """Three degrees of freedom over twelve flights; errors within a flight hang together, so each counts as one."""
     flights = 12
     low, high = chi2.ppf([0.025, 0.975], 3 * flights) / flights
-    orientation, position = mean_nees(flight, flights, 15.0, MsckfOptions())
+    orientation, position = mean_nees(flight, flights, 15.0, WHITE)
     assert low < orientation < high
     assert low < position < high
 
 
 def test_without_first_estimates_the_covariance_is_far_too_small():
-    sure, _ = mean_nees("figure_eight", 2, 20.0, MsckfOptions(first_estimate_jacobians=False))
-    honest, _ = mean_nees("figure_eight", 2, 20.0, MsckfOptions())
+    sure, _ = mean_nees("figure_eight", 2, 20.0, replace(WHITE, first_estimate_jacobians=False))
+    honest, _ = mean_nees("figure_eight", 2, 20.0, WHITE)
     assert honest < chi2.ppf(0.975, 6) / 2
     assert sure > 4.0 * honest
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from filterpy.kalman import KalmanFilter
-from msckf_helpers import random_covariance, random_state
+from msckf_helpers import CALIBRATION, random_covariance, random_state
 
 from vioframe.errors import DivergedError
 from vioframe.geometry import so3
@@ -185,6 +185,16 @@ def test_biases_walk_at_standstill():
     walk = np.zeros(len(P))
     walk[DBG], walk[DBA] = 0.05 * NOISE.gyro_walk**2, 0.05 * NOISE.accel_walk**2
     np.testing.assert_allclose(state.cov, P + np.diag(walk), rtol=1e-15)
+
+
+def test_landmarks_slide_in_proportion_to_their_distance():
+    state = random_state(9)
+    P, at = state.cov.copy(), state.landmarks_begin
+    state.slide_landmarks(0.5)
+    focal_px = float(CALIBRATION.cameras[0].model.fx)
+    far_m = np.repeat(np.linalg.norm(state.p_WF - state.p_WB, axis=1), 3)
+    np.testing.assert_allclose((state.cov - P)[:at], 0.0)
+    np.testing.assert_allclose((state.cov - P)[at:, at:], np.diag((0.5 * far_m / focal_px) ** 2), atol=1e-12)
 
 
 def test_covariance_stays_symmetric_and_positive_through_everything():

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Annotated
 
-from pydantic import Field, NonNegativeInt, PositiveFloat, PositiveInt
+from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -18,6 +18,8 @@ class MsckfOptions:
     """Observations that a finished track must have to be used."""
     max_slam_features: NonNegativeInt = 50
     """Long-lived landmarks kept in the state; 0 makes this a pure MSCKF."""
+    landmark_drift_px: NonNegativeFloat = 0.3
+    """How far a followed point slides off its landmark from one frame to the next, px; 0 where noise is white."""
     pixel_sigma: PositiveFloat = 1.0
     """Standard deviation of a tracked feature's position, px."""
     gate_quantile: Annotated[float, Field(gt=0.0, lt=1.0)] = 0.95

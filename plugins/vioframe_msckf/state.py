@@ -230,6 +230,12 @@ class FilterState:
         self._delete((self.landmarks_begin + 3 * gone[:, None] + np.arange(3)).ravel())
         self.landmark_ids, self.p_WF, self.p_WF_first = self.landmark_ids[keep], self.p_WF[keep], self.p_WF_first[keep]
 
+    def slide_landmarks(self, drift_px: float) -> None:
+        """Let each landmark be ``drift_px`` elsewhere: the patch that is followed slides over what it first showed."""
+        drift_m = drift_px / self.intrinsics[0] * np.linalg.norm(self.p_WF - self.p_WB, axis=1)
+        index = np.arange(self.landmarks_begin, len(self.cov))
+        self.cov[index, index] += np.repeat(drift_m**2, 3)
+
     def update(self, H: Float, residual: Float, columns: slice, R: float | Float) -> None:
         """Kalman update with ``residual`` (m,) = ``H`` (m, k) @ error[columns] + noise of variance ``R``.
 

@@ -96,6 +96,7 @@ def update_from_landmarks(state: FilterState, tracks: FrameTracks, options: Msck
     state.keep_landmarks(np.isin(state.landmark_ids, tracks.ids))
     if not len(state.landmark_ids):
         return 0
+    state.slide_landmarks(options.landmark_drift_px)
     order = np.argsort(tracks.ids)
     xy = tracks.xy[order[np.searchsorted(tracks.ids, state.landmark_ids, sorter=order)]]
     H, residual = landmark_rows(state, len(state.clones) - 1, xy, options.first_estimate_jacobians)

@@ -37,7 +37,7 @@ _FLOOR = 1e-3
 # Turns that are off by more than this many standard deviations begin to count less.
 _CAUCHY = 3.0
 _COLUMNS: dict[Part, slice] = {"rotation": slice(3, 6), "offset": slice(6, 7), "focal": slice(7, 8)}
-_ITERATIONS, _GRID_ITERATIONS, _SETTLED = 15, 4, 1e-5
+_ITERATIONS, _GRID_ITERATIONS, _SETTLED = 15, 4, 1e-4
 _LARGEST_STEP = np.array([np.inf] * 3 + [0.3] * 3 + [0.03, 0.05])
 # The median of chi2 with three degrees of freedom.
 _MEDIAN_CHI2 = 2.366
@@ -164,7 +164,7 @@ class Turns:
     def _linearise(self, x: HandEye) -> tuple[Float, Float]:
         """Whitened residuals (P, 3) and Jacobian (P, 3, 8) by [bias rotation offset log_focal]."""
         path = GyroPath(self._t_s, self._gyro_B - x.bias_gyro_B)
-        (R_1, rate_1), (R_2, rate_2) = (path.at(t + x.offset_s) for t in (self._first, self._second))
+        (R_1, R_2), (rate_1, rate_2) = path.at(np.stack([self._first, self._second]) + x.offset_s)
         R_B2B1 = np.swapaxes(R_2, -1, -2) @ R_1
         R_C1C2 = x.R_BC.T @ np.swapaxes(R_B2B1, -1, -2) @ x.R_BC
         off = so3.log(np.swapaxes(self.R_C1C2, -1, -2) @ R_C1C2) - self._by_focal * x.log_focal

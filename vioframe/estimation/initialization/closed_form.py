@@ -38,7 +38,7 @@ _FEWEST_COMMON = 10
 # Iterations, the longest pair used (s) and Cauchy's scale (standard deviations) of each stage. Short pairs lead near
 # the minimum; long ones, which a wrong bias turns by tens of pixels, then determine it.
 _STAGES = ((4, 0.5, 50.0), (4, 1.0, 20.0), (8, np.inf, 5.0), (8, np.inf, 2.0))
-_SETTLED = 1e-5  # rad/s
+_SETTLED = 1e-4  # rad/s
 # The error of an observation is weighed by the depth, which the solution before gives.
 _SOLVES = 4
 # A landmark's information along its ray over what noise alone would show: less is no parallax.

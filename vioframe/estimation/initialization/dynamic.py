@@ -101,8 +101,13 @@ def initialise(packets: Sequence[Packet], calibration: Calibration, known: Float
     alignment = align(structure.position, imu[:-1], calibration.cameras[0].p_BC, BIAS_ACCEL_SIGMA)
     refuse_unless(alignment.scale > 0.0, "the readings contradict the direction of the motion in the images")
     x = _start_of_adjustment(window.without_last(), structure, alignment, calibration)
-    problem, solution = _adjusted(window.without_last(), x, calibration, doubted)
-    _check_uncertainty(solution.variables.states, covariance(problem, solution.variables, doubted), _HOPELESS)
+    problem, solution = _adjusted(window.without_last(), x, calibration, doubted, roughly=True)
+    cov = covariance(problem, solution.variables, doubted)
+    _check_uncertainty(solution.variables.states, cov, _HOPELESS)
+    if not cov[_READOUT, _READOUT] <= _READOUT_SIGMA_S**2:
+        # Only fast turns tell a readout; slow ones would have it make up for something else.
+        doubted = doubted.copy()
+        doubted[READOUT, READOUT] = known[READOUT, READOUT]
     keep = _explained(problem, solution.variables)
     window = window.only(keep)
     _require(window, "tracks fit the bundle adjustment")
@@ -117,15 +122,9 @@ def initialise(packets: Sequence[Packet], calibration: Calibration, known: Float
 
     x = replace(x, states=x.states.append(StateArrays.stack(predicted[-1:])))
     problem, solution = _adjusted(window, x, calibration, doubted)
-    cov = covariance(problem, solution.variables, doubted)
-    if not cov[_READOUT, _READOUT] <= _READOUT_SIGMA_S**2:
-        # Only fast turns tell a readout; slow ones would have it make up for something else.
-        doubted = doubted.copy()
-        doubted[READOUT, READOUT] = known[READOUT, READOUT]
-        problem, solution = _adjusted(window, x, calibration, doubted)
-        cov = covariance(problem, solution.variables, doubted)
     _check_fit(problem, solution)
     x = solution.variables
+    cov = covariance(problem, x, doubted)
     _check_uncertainty(x.states, cov)
     problem, x = _believed(problem, solution, calibration, known, cov)
     cov = covariance(problem, x, known)
@@ -198,12 +197,14 @@ def _start_of_adjustment(
     return Variables(states, calibrated(calibration.cameras[0]), landmarks)
 
 
-def _adjusted(window: Window, x: Variables, calibration: Calibration, known: Float) -> tuple[Problem, Solution]:
+def _adjusted(
+    window: Window, x: Variables, calibration: Calibration, known: Float, roughly: bool = False
+) -> tuple[Problem, Solution]:
     """The adjustment of ``window`` from ``x``, its readings integrated at the biases there."""
     biases = zip(x.states.bias_gyro_B[:-1], x.states.bias_accel_B[:-1], strict=True)
     imu = [preintegrate(segment, *bias, calibration.imu) for segment, bias in zip(window.segments, biases, strict=True)]
     problem = adjustment(window, imu, x, calibration.cameras[0], known)
-    return problem, adjusted(problem, x, known)
+    return problem, adjusted(problem, x, known, roughly)
 
 
 def _explained(problem: Problem, x: Variables) -> Bool:
