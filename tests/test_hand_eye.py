@@ -17,7 +17,7 @@ from vioframe.estimation.hand_eye import HandEye, Turns
 from vioframe.estimation.initialization import Initializer
 from vioframe.estimation.initialization.found import Found
 from vioframe.estimation.lifecycle import LifeCycle
-from vioframe.estimation.turns import likeliest_translations, linearise_pairs, turn_between
+from vioframe.estimation.turns import likeliest_translations, linearise_pairs, turn_between, turns_before_plane
 from vioframe.evaluation import evaluate
 from vioframe.geometry import so3
 from vioframe.geometry.trajectory import Trajectory
@@ -34,6 +34,7 @@ from vioframe_shi_tomasi import ShiTomasi
 EUROC = packaged_calibration("euroc", cameras=["cam0"])
 BIAS_GYRO = np.array([-0.002, 0.021, 0.077])
 FLIGHTS = ["figure_eight", "aggressive", "stop_and_go", "pure_rotation"]
+EUROC_LEVEL = levelled(EUROC.cameras[0].R_BC)
 SIGMA = 1.0 / EUROC.cameras[0].model.focal_px
 
 
@@ -151,6 +152,22 @@ def turn_a_little(rng: np.random.Generator, R: Float) -> Float:
     return R @ so3.exp(0.02 * rng.normal(size=(len(R), 3)))
 
 
+def before_a_wall(s: TrackSequence, sigma_px: float = 0.3) -> list[Packet]:
+    """The packets of a camera that sees a wall 3 m before where it begins, and nothing else."""
+    rng, (camera,), out = np.random.default_rng(0), s.calibration.cameras, []
+    first = s.true_states[0]
+    p_CF = np.column_stack([rng.uniform([-4.0, -3.0], [4.0, 3.0], (300, 2)), np.full(300, 3.0)])
+    p_WF = (p_CF @ camera.R_BC.T + camera.p_BC) @ first.R_WB.T + first.p_WB
+    for true, (imu, tracks) in zip(s.true_states, s.packets, strict=True):
+        p_C = ((p_WF - true.p_WB) @ true.R_WB - camera.p_BC) @ camera.R_BC
+        ids = np.flatnonzero((p_C[:, 2] > 0.3) & (np.abs(p_C[:, :2]) < 0.7 * p_C[:, 2:]).all(axis=1))
+        xy = camera.model.project(p_C[ids]) + sigma_px * rng.normal(size=(len(ids), 2))
+        ids, xy = ids[camera.model.contains(xy)], xy[camera.model.contains(xy)]
+        seen = FrameTracks(tracks.t_ns, ids, np.zeros_like(ids), xy, camera.model.undistort(xy))
+        out.append((imu, seen))
+    return out
+
+
 def scaled(tracks: FrameTracks, factor: float) -> FrameTracks:
     return replace(tracks, xy_normalised=factor * tracks.xy_normalised)
 
@@ -169,6 +186,37 @@ def random_pairs(
     return f, g, p_2[..., 2] > 0.1, R_12
 
 
+class TestPlanes:
+    @pytest.mark.parametrize("seed", range(5))
+    def test_two_views_of_a_plane_allow_of_two_turns_and_one_of_them_it_was(self, seed: int):
+        rng = np.random.default_rng(seed)
+        normal = so3.exp(0.3 * rng.normal(size=3))[:, 2]
+        f = np.column_stack([rng.uniform(-0.6, 0.6, (60, 2)), np.ones(60)])
+        p_1 = f * (4.0 / (f @ normal))[:, None]
+        R_12, p_12 = so3.exp(0.15 * rng.normal(size=3)), rng.normal(size=3)
+        p_2 = (p_1 - p_12) @ R_12
+        g = p_2 / p_2[:, 2:]
+        both = turns_before_plane(f, g, SIGMA)
+        assert len(both) == 2
+        off = sorted(float(np.linalg.norm(so3.log(R.T @ R_12))) for R in both)
+        assert off[0] < 2e-3
+        assert off[1] > 0.01
+        # Points before and behind it leave one.
+        p_2 = (p_1 * rng.uniform(0.7, 1.3, (60, 1)) - p_12) @ R_12
+        assert not turns_before_plane(f, p_2 / p_2[:, 2:], SIGMA)
+
+    def test_the_gyroscope_tells_which(self):
+        flight = ShapedFlight(8.0, lambda t: 0.6 * swaying(t), lambda t: 0.3 * swaying(t + 2.0), EUROC_LEVEL)
+        s = simulated_sequence(flight, bias_gyro_B=BIAS_GYRO)
+        wall = before_a_wall(s)
+        found, initializer = find(shifted(wall, 100.0), s.calibration)
+        assert found is not None, initializer.refusal
+        assert abs(found.calibration.cameras[0].time_offset_ns + 100e6) < 12e6
+        found, initializer = find(wall, unknown(s.calibration))
+        assert found is not None, initializer.refusal
+        assert error_deg(found, s.calibration) < 3.0
+
+
 class TestHandEye:
     def turns(self, **options: float) -> tuple[Turns, TrackSequence]:
         s = simulated_sequence("figure_eight", noise=None, duration_s=4.0, bias_gyro_B=BIAS_GYRO, **options)
@@ -183,7 +231,7 @@ class TestHandEye:
         x = HandEye(
             np.array([0.02, -0.01, 0.03]), s.calibration.cameras[0].R_BC @ so3.exp([0.02, 0.01, -0.03]), 0.013, 0.02
         )
-        _, J = turns._linearise(x)
+        _, J, _ = turns._linearise(x)
         for k in range(8):
             step = np.zeros(8)
             step[k] = 1e-5

@@ -17,6 +17,7 @@ from functools import cached_property
 from typing import Literal
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from vioframe.arrays import Float, Int
 from vioframe.estimation.inertial.gyro_path import GyroPath
@@ -39,6 +40,9 @@ _CAUCHY = 3.0
 _COLUMNS: dict[Part, slice] = {"rotation": slice(3, 6), "offset": slice(6, 7), "focal": slice(7, 8)}
 _ITERATIONS, _GRID_ITERATIONS, _SETTLED = 15, 4, 1e-4
 _LARGEST_STEP = np.array([np.inf] * 3 + [0.3] * 3 + [0.03, 0.05])
+# The 24 rotations of a cube: none is farther than 62 deg from one of them. Tried with every so manieth offset.
+_ANY_ROTATION = Rotation.create_group("O").as_matrix()
+_COARSE = 5
 # The median of chi2 with three degrees of freedom.
 _MEDIAN_CHI2 = 2.366
 
@@ -67,7 +71,8 @@ class HandEye:
 class Turns:
     """P turns of a camera beside the readings of a gyroscope at ``t_ns`` (N,), ``gyro_B`` (N, 3) rad/s.
 
-    Only turns are used whose readings are there whatever the offset.
+    Only turns are used whose readings are there whatever the offset. Of two that explain the tracks of a plane as well,
+    the one counts that lies nearer to what the gyroscope has.
     """
 
     def __init__(self, turns: Sequence[Turn], t_ns: Int, gyro_B: Float) -> None:
@@ -76,11 +81,14 @@ class Turns:
         self._t_s, self._gyro_B = (t_ns - t_ns[0]) * 1e-9, gyro_B
         self._first, self._second = ((np.array([t.t_ns[k] for t in turns]) - t_ns[0]) * 1e-9 for k in (0, 1))
         self._dt = self._second - self._first
-        self.R_C1C2 = np.array([t.R_C1C2 for t in turns]).reshape(-1, 3, 3)
-        H = np.array([t.H for t in turns]).reshape(-1, 4, 4)
-        cov = np.linalg.inv(H[:, :3, :3])
+        either = [turns]
+        if any(t.other for t in turns):
+            either.append([t.other or t for t in turns])
+        self._R_C1C2 = np.array([[t.R_C1C2 for t in some] for some in either]).reshape(len(either), -1, 3, 3)
+        H = np.array([[t.H for t in some] for some in either]).reshape(len(either), -1, 4, 4)
+        cov = np.linalg.inv(H[..., :3, :3])
         # A longer focal length turns R_C1C2 by this much.
-        self._by_focal = -(cov @ H[:, :3, 3:])[..., 0]
+        self._by_focal = -(cov @ H[..., :3, 3:])[..., 0]
         self._whitener = np.swapaxes(np.linalg.cholesky(np.linalg.inv(cov + _FLOOR**2 * np.eye(3))), -1, -2)
 
     def __len__(self) -> int:
@@ -94,7 +102,7 @@ class Turns:
         active = np.r_[0:3, *(np.arange(8)[_COLUMNS[part]] for part in free)]
         x, variance = start, 1.0
         for _ in range(_ITERATIONS):
-            r, J = self._linearise(x)
+            r, J, _ = self._linearise(x)
             squared = (r * r).sum(axis=1)
             variance = max(float(np.median(squared)) / _MEDIAN_CHI2, 1e-4)
             weight = 1.0 / (1.0 + squared / (_CAUCHY**2 * variance)) / variance
@@ -119,13 +127,14 @@ class Turns:
 
     def cost(self, x: HandEye, variance: float) -> float:
         """The robust sum of squares of what the turns are off by, in terms of ``variance``."""
-        r, _ = self._linearise(x)
+        r, *_ = self._linearise(x)
         return float(_CAUCHY**2 * np.log1p((r * r).sum(axis=1) / (_CAUCHY**2 * variance)).sum())
 
     def unexplained(self, x: HandEye) -> float:
         """The typical turn that is left over with ``x``, over the typical turn beside a steady one."""
-        turns = so3.log(self.R_C1C2)
-        left = np.linalg.solve(self._whitener, self._linearise(x)[0][..., None])[..., 0]
+        r, _, which = self._linearise(x)
+        turns = so3.log(self._R_C1C2[which])
+        left = np.linalg.solve(self._whitener[which], r[..., None])[..., 0]
         size, beside = np.linalg.norm(left, axis=1), np.linalg.norm(turns - np.median(turns, axis=0), axis=1)
         return float(np.median(size) / max(np.median(beside), 1e-9))
 
@@ -135,23 +144,37 @@ class Turns:
         With each offset the bias is eliminated, which leaves an orthogonal Procrustes problem for the rotation.
         """
         offsets, beta = self._on_grid
-        gamma, dt = so3.log(self.R_C1C2), self._dt
-        known = np.linalg.norm(self._whitener, axis=(1, 2))
-        weight = np.tile(known**2, (len(offsets), 1))
+        R_BC = start.R_BC[None]
+        if turned and len(self._R_C1C2) > 1:
+            # Which of two turns it was, only a rotation not too far from the right one tells.
+            some = beta[::_COARSE]
+            tried = np.tile(_ANY_ROTATION, (len(some), 1, 1))
+            settled, _, typical = self._settled(np.repeat(some, len(_ANY_ROTATION), axis=0), tried, turned)
+            R_BC = settled[[np.argmin(typical)]]
+        R_BC, bias, typical = self._settled(beta, np.repeat(R_BC, len(offsets), axis=0), turned)
+        best = int(np.argmin(typical))
+        return HandEye(bias[best], R_BC[best], float(offsets[best]))
+
+    def _settled(self, beta: Float, R_BC: Float, turned: bool) -> tuple[Float, Float, Float]:
+        """From ``R_BC`` (G, 3, 3) and the gyroscope's turns (G, P, 3): R_BC, bias (G, 3) and typical distance (G,)."""
+        gammas, dt = so3.log(self._R_C1C2), self._dt
+        known = np.linalg.norm(self._whitener[0], axis=(1, 2))
+        weight, bias = np.tile(known**2, (len(beta), 1)), np.zeros((len(beta), 3))
         for _ in range(_GRID_ITERATIONS):
+            off = beta - dt[:, None] * bias[:, None] - np.einsum("gij,kpj->kgpi", R_BC, gammas)
+            which = np.linalg.norm(off, axis=3).argmin(axis=0)
+            gamma = gammas[which, np.arange(len(dt))]
             total = (weight * dt**2).sum(axis=1)[:, None]
-            beta_dt, gamma_dt = np.einsum("gp,p,gpi->gi", weight, dt, beta), (weight * dt) @ gamma
-            R_BC = np.broadcast_to(start.R_BC, (len(offsets), 3, 3))
+            beta_dt, gamma_dt = (np.einsum("gp,p,gpi->gi", weight, dt, turns) for turns in (beta, gamma))
             if turned:
-                moments = np.einsum("gp,gpi,pj->gij", weight, beta, gamma)
+                moments = np.einsum("gp,gpi,gpj->gij", weight, beta, gamma)
                 R_BC = so3.project(moments - beta_dt[:, :, None] * gamma_dt[:, None] / total[..., None])
             bias = (beta_dt - (R_BC @ gamma_dt[..., None])[..., 0]) / total
-            off = beta - np.einsum("gij,pj->gpi", R_BC, gamma) - dt[:, None] * bias[:, None]
+            off = beta - np.einsum("gij,gpj->gpi", R_BC, gamma) - dt[:, None] * bias[:, None]
             far = np.linalg.norm(off, axis=2) * known
             typical = np.median(far, axis=1)
             weight = known**2 / (1.0 + (far / np.maximum(1.5 * typical, 1e-3)[:, None]) ** 2)
-        best = int(np.argmin(typical))
-        return HandEye(bias[best], R_BC[best], float(offsets[best]))
+        return R_BC, bias, typical
 
     @cached_property
     def _on_grid(self) -> tuple[Float, Float]:
@@ -161,19 +184,21 @@ class Turns:
         R_1, R_2 = (path.at(t + offsets[:, None])[0] for t in (self._first, self._second))
         return offsets, so3.log(np.swapaxes(R_1, -1, -2) @ R_2)
 
-    def _linearise(self, x: HandEye) -> tuple[Float, Float]:
-        """Whitened residuals (P, 3) and Jacobian (P, 3, 8) by [bias rotation offset log_focal]."""
+    def _linearise(self, x: HandEye) -> tuple[Float, Float, tuple[Int, Int]]:
+        """Whitened residuals (P, 3) and Jacobian (P, 3, 8) by [bias rotation offset log_focal], and which turns."""
         path = GyroPath(self._t_s, self._gyro_B - x.bias_gyro_B)
         (R_1, R_2), (rate_1, rate_2) = path.at(np.stack([self._first, self._second]) + x.offset_s)
         R_B2B1 = np.swapaxes(R_2, -1, -2) @ R_1
         R_C1C2 = x.R_BC.T @ np.swapaxes(R_B2B1, -1, -2) @ x.R_BC
-        off = so3.log(np.swapaxes(self.R_C1C2, -1, -2) @ R_C1C2) - self._by_focal * x.log_focal
-        J = np.empty((len(off), 3, 8))
+        off = so3.log(np.swapaxes(self._R_C1C2, -1, -2) @ R_C1C2) - self._by_focal * x.log_focal
+        r = (self._whitener @ off[..., None])[..., 0]
+        which = (r * r).sum(axis=2).argmin(axis=0), np.arange(len(self))
+        J = np.empty((len(self), 3, 8))
         J[:, :, 0:3] = -0.5 * x.R_BC.T @ (np.eye(3) + R_B2B1) * self._dt[:, None, None]
         J[:, :, 3:6] = np.eye(3) - np.swapaxes(R_C1C2, -1, -2)
         J[:, :, 6] = (rate_2 - (R_B2B1 @ rate_1[..., None])[..., 0]) @ x.R_BC
-        J[:, :, 7] = -self._by_focal
-        return (self._whitener @ off[..., None])[..., 0], self._whitener @ J
+        J[:, :, 7] = -self._by_focal[which]
+        return r[which], self._whitener[which] @ J, which
 
 
 def top_beside(values: Float, best: int) -> float:

@@ -2,15 +2,17 @@
 
 For bearings f, g of one landmark in two cameras with rotation R, the normals n = f x R g of all epipolar planes are
 perpendicular to the translation, whichever it is (Kneip, Lynen, "Direct Optimization of Frame-to-Frame Rotation", ICCV
-2013). Works on planes and without parallax, where an essential matrix does not. Derivation:
-``docs/derivations/initialization.md``.
+2013). Works without parallax, where an essential matrix does not. Two views of a plane allow of two turns (Faugeras,
+Lustman, "Motion and structure from motion in a piecewise planar environment", IJPRAI 1988); both are told then.
+Derivation: ``docs/derivations/initialization.md``.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 
 from vioframe.arrays import Bool, Float, Int
@@ -22,7 +24,12 @@ FEWEST_TRACKS = 15
 _MOST_TRACKS = 80
 # Iterations and Cauchy's scale (standard deviations) of each stage.
 _STAGES = np.array([[6, 20.0], [6, 5.0], [6, 2.0]])
+_AS_IT_IS = np.array([[0, 2.0]])
 _PRIOR, _LARGEST_STEP, _SETTLED = 0.5, 0.2, 1e-6  # rad
+# Tracks are on a plane where its homography explains them to this, in standard deviations; outliers are beyond.
+_ON_PLANE, _OFF_PLANE = 0.6, 3.0
+# Less than this apart two turns are one, rad.
+_TWO = 0.01
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,7 +38,7 @@ class Turn:
 
     Half the sum of squares is d' H d / 2 + b' d, about d = [dtheta, dlog f] = 0: ``H`` (4, 4) and ``b`` (4,) in terms
     of pixels of noise, R <- R Exp(dtheta). ``misfit`` is the typical distance of a track from its epipolar line, in
-    standard deviations.
+    standard deviations. ``other`` is the second turn that explains the tracks as well, where they lie on a plane.
     """
 
     t_ns: tuple[int, int]
@@ -39,18 +46,41 @@ class Turn:
     H: Float
     b: Float
     misfit: float
+    other: Turn | None = None
 
 
-def turn_between(before: FrameTracks, now: FrameTracks, sigma: float) -> Turn | None:
+def turn_between(before: FrameTracks, now: FrameTracks, sigma: float, may_be_plane: bool = True) -> Turn | None:
     """From the tracks that both frames share, with noise ``sigma`` on the z = 1 plane; None where they are too few."""
     i, j = common_tracks(before, now, _MOST_TRACKS)
     if len(i) < FEWEST_TRACKS:
         return None
     f, g = _rays(before.xy_normalised[i]), _rays(now.xy_normalised[j])
+    t_ns = before.t_ns, now.t_ns
+    if may_be_plane and (on_plane := turns_before_plane(f, g, sigma)):
+        first, second = (Turn(t_ns, R, *_turn(f, g, R, sigma, _AS_IT_IS)[1:]) for R in on_plane)
+        return replace(first, other=second)
     # To begin with, the rotation that explains it best without moving.
     u, v = (rays / np.linalg.norm(rays, axis=1, keepdims=True) for rays in (f, g))
     R, H, b, misfit = _turn(f, g, so3.project(u.T @ v), sigma, _STAGES)
-    return Turn((before.t_ns, now.t_ns), R, H, b, misfit)
+    return Turn(t_ns, R, H, b, misfit)
+
+
+def turns_before_plane(f: Float, g: Float, sigma: float) -> list[Float]:
+    """The two R_C1C2 by which bearings f, g (N, 3) with z = 1 are those of points on a plane; none where they are not.
+
+    None either where both are the same, as without parallax.
+    """
+    H, _ = cv2.findHomography(g[:, :2], f[:, :2], cv2.RHO, _OFF_PLANE * sigma)
+    if H is None:
+        return []
+    seen = g @ H.T
+    off = np.linalg.norm(seen[:, :2] / seen[:, 2:] - f[:, :2], axis=1)
+    if not np.median(off) < _ON_PLANE * sigma:
+        return []
+    turns = [np.asarray(R, dtype=np.float64) for R in cv2.decomposeHomographyMat(H, np.eye(3))[1]]
+    first = turns[0]
+    second = max(turns, key=lambda R: np.linalg.norm(R - first))
+    return [first, second] if np.linalg.norm(so3.log(first.T @ second)) > _TWO else []
 
 
 def common_tracks(a: FrameTracks, b: FrameTracks, most: int) -> tuple[Int, Int]:

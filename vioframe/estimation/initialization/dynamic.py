@@ -80,10 +80,13 @@ _READOUT_SIGMA_S, _READOUT = 0.0025, READOUT - CALIBRATION_SIZE
 _HOPELESS = 1.5
 
 
-def initialise(packets: Sequence[Packet], calibration: Calibration, known: Float, doubted: Float) -> InitialEstimate:
+def initialise(
+    packets: Sequence[Packet], calibration: Calibration, known: Float, doubted: Float, bias_gyro_B: Float
+) -> InitialEstimate:
     """Estimate from consecutive ``packets``, the newest last; raises :class:`RefusalError`.
 
-    ``known`` (16, 16) is the covariance of the camera's ``calibration`` if that is right, ``doubted`` if it may not be.
+    ``known`` (16, 16) is the covariance of the camera's ``calibration`` if that is right, ``doubted`` if it may not be;
+    ``bias_gyro_B`` (3,) rad/s is about what the gyroscope's bias is.
     """
     t_ns = np.array([tracks.t_ns for _, tracks in packets])
     held_out = int((t_ns > t_ns[-1] - _LOOKAHEAD_S * 1e9).sum())
@@ -92,7 +95,7 @@ def initialise(packets: Sequence[Packet], calibration: Calibration, known: Float
 
     window = build_window(packets, [*chosen, len(packets) - 1], _MIN_VIEWS, _MOST_LANDMARKS)
     _require(window, "tracks are long enough")
-    window, bias_gyro = _with_gyro_bias(window, calibration, noise)
+    window, bias_gyro = _with_gyro_bias(window, bias_gyro_B, calibration, noise)
     imu = _preintegrate(window, bias_gyro, np.zeros(3), calibration)
     R_B0B = rotations(imu)
     _check_parallax(window, R_B0B, calibration)
@@ -163,9 +166,9 @@ def _preintegrate(
     return [preintegrate(segment, bias_gyro_B, bias_accel_B, calibration.imu) for segment in window.segments]
 
 
-def _with_gyro_bias(window: Window, calibration: Calibration, sigma: float) -> tuple[Window, Float]:
-    """The tracks that lie on their epipolar lines, and the gyroscope's bias (3,) that puts them there."""
-    imu = _preintegrate(window, np.zeros(3), np.zeros(3), calibration)
+def _with_gyro_bias(window: Window, about: Float, calibration: Calibration, sigma: float) -> tuple[Window, Float]:
+    """The tracks that lie on their epipolar lines, and the gyroscope's bias (3,), ``about`` this, that puts them so."""
+    imu = _preintegrate(window, about, np.zeros(3), calibration)
     bias, distance = estimate_gyro_bias(window, imu, calibration.cameras[0].R_BC, sigma, BIAS_GYRO_SIGMA)
     rate = float(np.linalg.norm(bias))
     refuse_unless(rate <= 3.0 * BIAS_GYRO_SIGMA, f"gyroscope bias of {rate:.2f} rad/s is not plausible")
@@ -338,7 +341,7 @@ def warm_up(calibration: Calibration) -> None:
     turns = [turn for a, b in pairwise(frames) if (turn := turn_between(a, b, 1e-3)) is not None]
     far_ns = np.arange(-10, 11) * 100_000_000
     Turns(turns, far_ns, np.zeros((21, 3))).fit(HandEye(np.zeros(3), np.eye(3)), ())
-    _with_gyro_bias(window, calibration, 1e-3)
+    _with_gyro_bias(window, np.zeros(3), calibration, 1e-3)
     state, landmarks = NavState(0, np.eye(3), *np.zeros((4, 3))), np.column_stack([xy[0], np.full(20, 0.2)])
     x = Variables(StateArrays.stack([state] * 4), calibrated(calibration.cameras[0]), landmarks)
     problem, solution = _adjusted(window, x, calibration, 1e-4 * np.eye(CALIBRATION_SIZE))

@@ -195,7 +195,8 @@ class Initializer:
                 known = np.diag(self.camera_sigma.stacked() ** 2)
                 calibration = replace(self._calibration, imu=self._noise_in_motion())
                 try:
-                    return dynamic.initialise(self._last(self._window_s), calibration, known, self._doubted(known))
+                    packets, doubted = self._last(self._window_s), self._doubted(known)
+                    return dynamic.initialise(packets, calibration, known, doubted, self._sensors.bias_gyro_B)
                 except ContradictedError as other:
                     self._take_over(found_by(self._calibration, other.camera, other.cov))
             raise RefusalError("images and readings contradict every calibration")

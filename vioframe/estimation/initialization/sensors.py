@@ -13,6 +13,7 @@ from functools import partial
 
 import numpy as np
 
+from vioframe.arrays import Float
 from vioframe.estimation.hand_eye import HandEye, Part, Turns, top_beside
 from vioframe.estimation.inertial.readings import Readings
 from vioframe.estimation.initialization.found import Found
@@ -64,6 +65,8 @@ class SensorCheck:
         self._frames: deque[FrameTracks] = deque()
         self._pairs: deque[_Pair] = deque()
         self._tried_ns: int | None = None
+        self.bias_gyro_B: Float = np.zeros(3)
+        """The gyroscope's bias (3,) rad/s as the camera's turns have it, once they have been judged."""
 
     def reset(self) -> None:
         self._frames.clear()
@@ -104,9 +107,11 @@ class SensorCheck:
         given = HandEye(np.zeros(3), camera.R_BC)
         noise = float(np.median([turn.misfit for *_, turn in self._pairs])) / _MEDIAN
         as_given = turns.fit(given, ()) if camera.rotation_known else None
+        self.bias_gyro_B = as_given[0].bias_gyro_B if as_given is not None else np.zeros(3)
         if as_given is not None and _fits(turns, *as_given, noise):
             return None
         best, parts, variance = _best(turns, given, as_given)
+        self.bias_gyro_B = best.bias_gyro_B
         if variance > (_BADLY * noise) ** 2 and (found := self._other_camera(readings, calibration, best)) is not None:
             return found
         if not parts:
@@ -203,10 +208,11 @@ def _anew(pairs: Sequence[_Pair], camera: CameraOnBody, readings: Readings) -> I
     """The pairs as ``camera`` saw them, and the turns they make then, where they make any."""
     frames = {tracks.t_ns: tracks for *pair, _ in pairs for tracks in pair}
     seen = {t_ns: seen_anew(tracks, camera, readings.gyro_at(t_ns)) for t_ns, tracks in frames.items()}
-    for a, b, _ in pairs:
+    for a, b, turn in pairs:
         before, now = seen[a.t_ns], seen[b.t_ns]
-        if (turn := turn_between(before, now, PIXEL_SIGMA / camera.model.focal_px)) is not None:
-            yield before, now, turn
+        anew = turn_between(before, now, PIXEL_SIGMA / camera.model.focal_px, turn.other is not None)
+        if anew is not None:
+            yield before, now, anew
 
 
 def _fits(turns: Turns, x: HandEye, variance: float, noise: float) -> bool:
