@@ -67,7 +67,7 @@ _LOOKAHEAD_S, _LARGEST_LOOKAHEAD_PX, _FEWEST_COMMON = 0.2, 4.0, 8
 _LEAST_PARALLAX_PX, _LARGEST_ERROR_PX = 5.0, 2.0
 # The readings' residuals, per degree of freedom: vibration makes them larger than the data sheet's noise.
 _MAX_INERTIAL = 9.0
-_MAX_BIAS_ACCEL = 4.0 * BIAS_ACCEL_SIGMA
+_MAX_BIAS_ACCEL = 5.0 * BIAS_ACCEL_SIGMA
 # Largest standard deviations that are accepted: of scale (relative), velocity on any axis (m/s, or as a part of the
 # speed where that is more), and gravity's direction.
 _SCALE_SIGMA, _VELOCITY_SIGMA, _SPEED_SIGMA, _TILT_SIGMA_DEG = 0.06, 0.05, 0.03, 1.0
