@@ -21,9 +21,10 @@ from vioframe.runs.evaluated import Evaluated
 from vioframe.runs.folder import RunFolder
 from vioframe.runs.recorder import Recorder
 from vioframe.testing import check_loop_closer
-from vioframe.types import Estimate, Status
+from vioframe.types import CalibrationEstimate, CameraSigma, Estimate, FrameSet, FrameTracks, NavState, Status, Step
 from vioframe_pose_graph import vioframe_loop_closers
 from vioframe_pose_graph.closer import PoseGraph
+from vioframe_pose_graph.keyframes import KeyframeSelector
 from vioframe_pose_graph.matching import DescriptorIndex, distance, match
 from vioframe_pose_graph.place import image_angle_deg
 from vioframe_pose_graph.verification import Correspondences, hypotheses, ransac, residuals
@@ -301,3 +302,23 @@ def test_the_summary_lists_the_segments(revisit, tmp_path):
         {"first_t_ns": t_ns[4], "last_t_ns": t_ns[4], "poses": 1},
     ]
     assert RunFolder.open(tmp_path).segment_starts_ns() == (t_ns[4],)
+
+
+def test_a_keyframe_is_placed_by_what_was_learned_of_the_offset_since_the_start():
+    """What the start found, the readings count with already."""
+    found_ns, learned_ns, period_ns = 50_000_000, 10_000_000, 50_000_000
+    selector, keyframes = KeyframeSelector(CALIBRATION, 30.0), []
+    image, v_WB, zero = np.zeros((10, 10), np.uint8), np.array([1.0, 0.0, 0.0]), np.zeros(3)
+    for k, offset_ns in enumerate((found_ns, found_ns + learned_ns)):
+        t_ns = k * period_ns
+        state = NavState(t_ns, np.eye(3), v_WB * t_ns * 1e-9, v_WB, zero, zero)
+        learned = CalibrationEstimate(
+            CALIBRATION.with_camera(0, time_offset_ns=offset_ns), (CameraSigma(zero, zero, 0.001, np.zeros(8)),)
+        )
+        ids, xy = np.array([k]), np.zeros((1, 2))
+        estimate = Estimate(Status.TRACKING, state, is_keyframe=True, calibration=learned)
+        step = Step(FrameSet(t_ns, (image,)), FrameTracks(t_ns, ids, ids, xy, xy), estimate, {})
+        keyframes += selector.add(step)
+    keyframes += selector.flush()
+    moved_m = [keyframe.p_WC[0] - keyframe.state.p_WB[0] - CAMERA.p_BC[0] for keyframe in keyframes]
+    np.testing.assert_allclose(moved_m, [0.0, 0.010], atol=1e-12)

@@ -60,13 +60,15 @@ class KeyframeSelector:
             self._tracking = False
             return self.flush()
         ready = []
+        if estimate.calibration is not None:
+            self._camera = estimate.calibration.calibration.cameras[0]
         if not self._tracking:
             ready = self.flush()
             self._tracking, self._last, self._previous = True, None, None
             self.segment += 1
+            # What a start has found, the readings count with.
+            self._offset_ns = self._camera.time_offset_ns
         self._p_WF.update(zip(estimate.landmark_ids.tolist(), estimate.p_WF, strict=True))
-        if estimate.calibration is not None:
-            self._camera = estimate.calibration.calibration.cameras[0]
         R_WC, p_WC = self._camera_pose(state)
         self._previous = state
         image = next(iter(step.frames.images), None)
