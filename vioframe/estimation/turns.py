@@ -74,7 +74,8 @@ def turns_before_plane(f: Float, g: Float, sigma: float) -> list[Float]:
     if H is None:
         return []
     seen = g @ H.T
-    off = np.linalg.norm(seen[:, :2] / seen[:, 2:] - f[:, :2], axis=1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        off = np.linalg.norm(seen[:, :2] / seen[:, 2:] - f[:, :2], axis=1)
     if not np.median(off) < _ON_PLANE * sigma:
         return []
     turns = [np.asarray(R, dtype=np.float64) for R in cv2.decomposeHomographyMat(H, np.eye(3))[1]]

@@ -167,7 +167,7 @@ def _preintegrate(
 
 
 def _with_gyro_bias(window: Window, about: Float, calibration: Calibration, sigma: float) -> tuple[Window, Float]:
-    """The tracks that lie on their epipolar lines, and the gyroscope's bias (3,), ``about`` this, that puts them so."""
+    """The tracks on their epipolar lines, and the gyroscope's bias (3,) near ``about`` that puts them there."""
     imu = _preintegrate(window, about, np.zeros(3), calibration)
     bias, distance = estimate_gyro_bias(window, imu, calibration.cameras[0].R_BC, sigma, BIAS_GYRO_SIGMA)
     rate = float(np.linalg.norm(bias))
