@@ -1,5 +1,6 @@
 """Synchronisation: whatever order, repetition or damage comes in, complete and increasing segments come out."""
 
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -55,6 +56,23 @@ def assert_same(packets: list[Packet], expected: list[Packet]) -> None:
         np.testing.assert_array_equal(imu.t_ns, imu_expected.t_ns)
         np.testing.assert_array_equal(imu.gyro_B, imu_expected.gyro_B)
         np.testing.assert_array_equal(imu.accel_B, imu_expected.accel_B)
+
+
+@pytest.mark.parametrize("wait_ms", [0.0, 50.0])
+def test_readings_with_stamps_from_the_future_are_waited_out(wait_ms: float) -> None:
+    hour_ns = 3_600_000_000_000
+    wild = {reading(k * IMU_PERIOD_NS).t_ns for k in (100, 101)}
+    measurements: list[Measurement] = [
+        replace(m, t_ns=m.t_ns + hour_ns) if isinstance(m, ImuSample) and m.t_ns in wild else m for m in recording()
+    ]
+    incidents, packets = Incidents(), []
+    synchroniser = Synchroniser(incidents, wait_ms=wait_ms)
+    for measurement in measurements:
+        packets += synchroniser.add(measurement)
+    packets += synchroniser.finish()
+    assert_clean(packets)
+    assert max(imu.largest_gap_s for imu, _ in packets) == pytest.approx(0.015)
+    assert set(incidents.counts) == {"imu_out_of_order"}
 
 
 def test_flawless_recording() -> None:
