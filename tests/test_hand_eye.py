@@ -201,6 +201,11 @@ class TestPlanes:
         off = sorted(float(np.linalg.norm(so3.log(R.T @ R_12))) for R in both)
         assert off[0] < 2e-3
         assert off[1] > 0.01
+        # Outliers do not hide it.
+        wrong = g.copy()
+        wrong[::4, :2] += 0.05 * rng.normal(size=(15, 2))
+        off = sorted(float(np.linalg.norm(so3.log(R.T @ R_12))) for R in turns_before_plane(f, wrong, SIGMA))
+        assert off[0] < 0.01
         # Points before and behind it leave one.
         p_2 = (p_1 * rng.uniform(0.7, 1.3, (60, 1)) - p_12) @ R_12
         assert not turns_before_plane(f, p_2 / p_2[:, 2:], SIGMA)

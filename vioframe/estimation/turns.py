@@ -26,8 +26,9 @@ _MOST_TRACKS = 80
 _STAGES = np.array([[6, 20.0], [6, 5.0], [6, 2.0]])
 _AS_IT_IS = np.array([[0, 2.0]])
 _PRIOR, _LARGEST_STEP, _SETTLED = 0.5, 0.2, 1e-6  # rad
-# Tracks are on a plane where its homography explains them to this, in standard deviations; outliers are beyond.
-_ON_PLANE, _OFF_PLANE = 0.6, 3.0
+# Tracks are on a plane where its homography explains them to this, in standard deviations; outliers are beyond, and
+# after so many samples of four tracks there is none.
+_ON_PLANE, _OFF_PLANE, _SAMPLES = 0.6, 3.0, 100
 # Less than this apart two turns are one, rad.
 _TWO = 0.01
 
@@ -70,7 +71,7 @@ def turns_before_plane(f: Float, g: Float, sigma: float) -> list[Float]:
 
     None either where both are the same, as without parallax.
     """
-    H, _ = cv2.findHomography(g[:, :2], f[:, :2], cv2.RHO, _OFF_PLANE * sigma)
+    H, _ = cv2.findHomography(g[:, :2], f[:, :2], cv2.USAC_FAST, _OFF_PLANE * sigma, None, _SAMPLES)
     if H is None:
         return []
     seen = g @ H.T
