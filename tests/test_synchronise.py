@@ -75,6 +75,19 @@ def test_readings_with_stamps_from_the_future_are_waited_out(wait_ms: float) -> 
     assert set(incidents.counts) == {"imu_out_of_order"}
 
 
+def test_frames_that_still_wait_at_the_end_come_out_behind_a_gap_too() -> None:
+    begin_ns, end_ns = 300_000_000, 1_500_000_000
+    measurements = [m for m in recording(400, 36) if not (isinstance(m, ImuSample) and begin_ns < m.t_ns < end_ns)]
+    incidents, packets = Incidents(), []
+    synchroniser = Synchroniser(incidents, wait_ms=5000.0)
+    for measurement in measurements:
+        packets += synchroniser.add(measurement)
+    assert not packets
+    packets += synchroniser.finish()
+    assert len(packets) == 36
+    assert dict(incidents.counts) == {"imu_gap": 1}
+
+
 def test_flawless_recording() -> None:
     packets, counts = play(recording())
     assert counts == {}

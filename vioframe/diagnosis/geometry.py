@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import permutations, product
 
 import numpy as np
 
@@ -118,7 +117,7 @@ def _is_certain_of_handedness(coarse: Alignment) -> bool:
 
 def _mirrored(coarse: Alignment, imu: ImuSamples, camera: CameraOnBody) -> Finding:
     """The camera's turns and the gyroscope's are those of frames of different handedness."""
-    D = min(_AXES[-1], key=lambda D: float(np.linalg.norm(D @ camera.R_BC - coarse.M)))
+    D = min(so3.signed_permutations(-1), key=lambda D: float(np.linalg.norm(D @ camera.R_BC - coarse.M)))
     alone, names = _gyroscope_alone(imu, D), _say(D)
     return Finding(
         "gyro_axes" if alone else "imu_mirrored",
@@ -142,7 +141,7 @@ def _rotation(found: SelfCalibration, camera: CameraOnBody, imu: ImuSamples) -> 
     line = f"to {sigma:.1f} deg it is `T_BS: data: [{rows}, 0, 0, 0, 1]`"
     figures = {"off_deg": off, "sigma_deg": sigma}
     inverse = _angle_deg(found.R_BC, camera.R_BC.T)
-    D = min(_AXES[1], key=lambda D: _angle_deg(found.R_BC, D @ camera.R_BC))
+    D = min(so3.signed_permutations(1), key=lambda D: _angle_deg(found.R_BC, D @ camera.R_BC))
     turned = _angle_deg(found.R_BC, D @ camera.R_BC)
     by_quarters = turned < min(_QUARTER_TURN_DEG, 0.5 * off) and not np.array_equal(D, np.eye(3))
     if inverse < min(_INVERSE_DEG, 0.5 * off) and not (by_quarters and turned < inverse - 1.0):
@@ -321,18 +320,6 @@ def _gyroscope_alone(imu: ImuSamples, D: Float) -> bool:
         return float(np.median((left * left).sum(axis=1)))
 
     return off(D.T) < _BETTER * off(np.eye(3) * np.linalg.det(D))
-
-
-def _signed_permutations() -> dict[int, list[Float]]:
-    """The 24 rotations (1) and 24 rotoreflections (-1) that map axes to axes."""
-    out: dict[int, list[Float]] = {1: [], -1: []}
-    for order, signs in product(permutations(range(3)), product((1.0, -1.0), repeat=3)):
-        D = np.eye(3)[list(order)] * np.array(signs)[:, None]
-        out[round(float(np.linalg.det(D)))].append(D)
-    return out
-
-
-_AXES = _signed_permutations()
 
 
 def _say(D: Float) -> str:

@@ -17,7 +17,6 @@ from functools import cached_property
 from typing import Literal
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from vioframe.arrays import Float, Int
 from vioframe.estimation.inertial.gyro_path import GyroPath
@@ -41,7 +40,7 @@ _COLUMNS: dict[Part, slice] = {"rotation": slice(3, 6), "offset": slice(6, 7), "
 _ITERATIONS, _GRID_ITERATIONS, _SETTLED = 15, 4, 1e-4
 _LARGEST_STEP = np.array([np.inf] * 3 + [0.3] * 3 + [0.03, 0.05])
 # The 24 rotations of a cube: none is farther than 62 deg from one of them. Tried with every so manieth offset.
-_ANY_ROTATION = Rotation.create_group("O").as_matrix()
+_ANY_ROTATION = so3.signed_permutations(1)
 _COARSE = 5
 # The median of chi2 with three degrees of freedom.
 _MEDIAN_CHI2 = 2.366

@@ -12,11 +12,11 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 
-import cv2
 import numpy as np
 
 from vioframe.arrays import Bool, Float, Int
 from vioframe.geometry import kernels, so3
+from vioframe.geometry.two_view import rays
 from vioframe.jit import kernel
 from vioframe.types import FrameTracks
 
@@ -55,13 +55,13 @@ def turn_between(before: FrameTracks, now: FrameTracks, sigma: float, may_be_pla
     i, j = common_tracks(before, now, _MOST_TRACKS)
     if len(i) < FEWEST_TRACKS:
         return None
-    f, g = _rays(before.xy_normalised[i]), _rays(now.xy_normalised[j])
+    f, g = rays(before.xy_normalised[i]), rays(now.xy_normalised[j])
     t_ns = before.t_ns, now.t_ns
     if may_be_plane and (on_plane := turns_before_plane(f, g, sigma)):
         first, second = (Turn(t_ns, R, *_turn(f, g, R, sigma, _AS_IT_IS)[1:]) for R in on_plane)
         return replace(first, other=second)
     # To begin with, the rotation that explains it best without moving.
-    u, v = (rays / np.linalg.norm(rays, axis=1, keepdims=True) for rays in (f, g))
+    u, v = (seen / np.linalg.norm(seen, axis=1, keepdims=True) for seen in (f, g))
     R, H, b, misfit = _turn(f, g, so3.project(u.T @ v), sigma, _STAGES)
     return Turn(t_ns, R, H, b, misfit)
 
@@ -71,6 +71,8 @@ def turns_before_plane(f: Float, g: Float, sigma: float) -> list[Float]:
 
     None either where both are the same, as without parallax.
     """
+    import cv2
+
     H, _ = cv2.findHomography(g[:, :2], f[:, :2], cv2.USAC_FAST, _OFF_PLANE * sigma, None, _SAMPLES)
     if H is None:
         return []
@@ -90,10 +92,6 @@ def common_tracks(a: FrameTracks, b: FrameTracks, most: int) -> tuple[Int, Int]:
     _, i, j = np.intersect1d(a.ids, b.ids, assume_unique=True, return_indices=True)
     some = np.linspace(0, len(i) - 1, min(len(i), most)).astype(np.int64)
     return i[some], j[some]
-
-
-def _rays(xy: Float) -> Float:
-    return np.column_stack([xy, np.ones(len(xy))])
 
 
 @kernel

@@ -4,6 +4,8 @@ Perturbations act on the right, ``R <- R Exp(dtheta)``. Formulas follow Solà, D
 state estimation in robotics" (2018), equation numbers in brackets.
 """
 
+from itertools import permutations, product
+
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -113,6 +115,16 @@ def interpolate(R_0: ArrayLike, R_1: ArrayLike, fraction: ArrayLike) -> Float:
     phi = log(np.swapaxes(R_0, -1, -2) @ np.asarray(R_1, dtype=np.float64))
     out: Float = R_0 @ exp(np.asarray(fraction, dtype=np.float64)[..., None] * phi)
     return out
+
+
+def signed_permutations(determinant: int) -> Float:
+    """(24, 3, 3): all rotations (1), or all rotoreflections (-1), that map axes to axes."""
+    out = []
+    for order, signs in product(permutations(range(3)), product((1.0, -1.0), repeat=3)):
+        D = np.eye(3)[list(order)] * np.array(signs)[:, None]
+        if round(float(np.linalg.det(D))) == determinant:
+            out.append(D)
+    return np.array(out)
 
 
 def project(M: ArrayLike) -> Float:

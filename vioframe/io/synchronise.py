@@ -98,7 +98,7 @@ class Synchroniser:
 
     def finish(self) -> Iterator[Packet]:
         """The packets of the frames that still wait, as far as readings reach: nothing more will come."""
-        while self._frames.t_ns and self._imu.goes_on_at(self._frames.t_ns[0]):
+        while self._frames.t_ns and self._imu.reaches(self._frames.t_ns[0], 1):
             yield from self._release()
         for t_ns in self._frames.t_ns:
             self._incidents.add("frame_after_imu", t_ns, "dropped: no IMU sample at or after it")
@@ -106,12 +106,9 @@ class Synchroniser:
 
     def _is_covered(self, t_ns: int) -> bool:
         """Whether the readings reach far enough behind the frame at ``t_ns``."""
-        fewest = 2
         if self._wait_ns == 0 or len(self._frames.t_ns) > _MAX_WAITING_FRAMES:
-            fewest = 1
-        else:
-            t_ns += self._wait_ns
-        return self._imu.count_from(t_ns) >= (fewest if self._imu.goes_on_at(t_ns) else _READINGS_BEHIND_THE_END)
+            return self._imu.reaches(t_ns, 1)
+        return self._imu.reaches(t_ns + self._wait_ns, 2)
 
     def _release(self) -> Iterator[Packet]:
         (t_ns,), (frame,) = self._frames.take(1)
@@ -303,14 +300,11 @@ class _ImuBuffer(_Ordered[ImuSample]):
         if len(self.t_ns) > 2 * _MOST_IDLE_READINGS:
             del self.t_ns[:_MOST_IDLE_READINGS], self.items[:_MOST_IDLE_READINGS]
 
-    def count_from(self, t_ns: int) -> int:
-        """Number of samples at or after ``t_ns``."""
-        return len(self.t_ns) - bisect_left(self.t_ns, t_ns)
-
-    def goes_on_at(self, t_ns: int) -> bool:
-        """Whether a sample follows soon, and not only some whose stamps are from the future."""
-        after = bisect_left(self.t_ns, t_ns)
-        return after < len(self.t_ns) and self.t_ns[after] - t_ns < NS_PER_S
+    def reaches(self, t_ns: int, fewest: int) -> bool:
+        """Whether so many samples are at or after ``t_ns``; more where all are far from it, as wild stamps are."""
+        first = bisect_left(self.t_ns, t_ns)
+        far = first < len(self.t_ns) and self.t_ns[first] - t_ns >= NS_PER_S
+        return len(self.t_ns) - first >= (_READINGS_BEHIND_THE_END if far else fewest)
 
     def covers(self, t_ns: int) -> bool:
         """Whether a reading at ``t_ns`` can be interpolated, given that there is a sample at or after it."""

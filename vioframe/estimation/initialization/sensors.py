@@ -107,8 +107,8 @@ class SensorCheck:
         given = HandEye(np.zeros(3), camera.R_BC)
         noise = float(np.median([turn.misfit for *_, turn in self._pairs])) / _MEDIAN
         as_given = turns.fit(given, ()) if camera.rotation_known else None
-        self.bias_gyro_B = as_given[0].bias_gyro_B if as_given is not None else np.zeros(3)
         if as_given is not None and _fits(turns, *as_given, noise):
+            self.bias_gyro_B = as_given[0].bias_gyro_B
             return None
         best, parts, variance = _best(turns, given, as_given)
         self.bias_gyro_B = best.bias_gyro_B

@@ -15,6 +15,7 @@ from vioframe.estimation.factors.tracks import TrackTable
 from vioframe.estimation.hand_eye import BIAS_SIGMA
 from vioframe.estimation.inertial.preintegration import join_segments
 from vioframe.geometry import so3
+from vioframe.geometry.two_view import rays
 from vioframe.types import CameraOnBody, Float, FrameTracks, ImuSegment, Int, NavState
 
 Packet = tuple[ImuSegment, FrameTracks]
@@ -98,8 +99,7 @@ def unrolled(tracks: FrameTracks, camera: CameraOnBody, rate_B: Float) -> FrameT
     if not camera.readout_s or not camera.rotation_known:
         return tracks
     late_s = camera.readout_s * camera.row(tracks.xy[:, 1])
-    rays = np.column_stack([tracks.xy_normalised, np.ones(len(tracks.ids))])
-    turned = (so3.exp(late_s[:, None] * (rate_B @ camera.R_BC)) @ rays[..., None])[..., 0]
+    turned = (so3.exp(late_s[:, None] * (rate_B @ camera.R_BC)) @ rays(tracks.xy_normalised)[..., None])[..., 0]
     return replace(tracks, xy_normalised=turned[:, :2] / turned[:, 2:])
 
 
