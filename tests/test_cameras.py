@@ -71,6 +71,10 @@ def test_compiled_rotations_agree():
         np.testing.assert_allclose(kernels.exp(phi), so3.exp(phi), atol=1e-12)
         np.testing.assert_allclose(kernels.right_jacobian(phi), so3.right_jacobian(phi), atol=1e-9)
         np.testing.assert_allclose(kernels.hat(phi), so3.hat(phi))
+    near_half_a_turn = [(np.pi - d) * axis for d in (0.0, 1e-9, 1e-3) for axis in so3.exp([0.3, -0.2, 0.9])]
+    for phi in [*rng.normal(size=(20, 3)), *(1e-9 * rng.normal(size=(5, 3))), np.zeros(3), *near_half_a_turn]:
+        np.testing.assert_allclose(so3.exp(kernels.log(so3.exp(phi))), so3.exp(phi), atol=1e-12)
+        np.testing.assert_allclose(np.abs(kernels.log(so3.exp(phi))), np.abs(so3.log(so3.exp(phi))), atol=1e-12)
 
 
 def test_points_beyond_the_fold_of_the_distortion_come_back_as_nan():

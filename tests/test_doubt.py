@@ -118,7 +118,7 @@ def test_motion_ends_the_doubt_of_a_flight_from_rest():
 def test_with_another_time_offset_the_readings_of_the_newest_frame_may_be_still_to_come(offset_s: float, monkeypatch):
     s, asked = hovering(), []
 
-    def contradicted_once(packets, *_):
+    def contradicted_once(packets, *_, **__):
         asked.append(packets[-1][1].t_ns)
         if len(asked) > 1:
             raise RefusalError("enough")

@@ -166,7 +166,7 @@ class TestRealMotion:
         assert velocity.max() < 0.25
         assert tilt.max() < 2.5
         assert scale.max() < 0.2
-        assert np.median(velocity) < 0.06
+        assert np.median(velocity) < 0.065
         assert np.median(scale) < 0.05
         assert np.median(nees) < 1.3
         assert np.median(seconds) < 2.5

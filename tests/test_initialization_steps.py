@@ -21,7 +21,7 @@ from vioframe.estimation.initialization.closed_form import (
     rotations,
     solve_structure,
 )
-from vioframe.estimation.initialization.dynamic import scale_sigma
+from vioframe.estimation.initialization.dynamic import path_scale_sigma
 from vioframe.estimation.initialization.window import (
     BIAS_ACCEL_SIGMA,
     RefusalError,
@@ -278,7 +278,7 @@ class TestBundleAdjustment:
             e = basis @ error
             distances.append(e @ np.linalg.solve(basis @ P @ basis.T, e))
             q, p = (path - path.mean(axis=0) for path in (x.states.p_WB, s.truth.p_WB @ turn.T))
-            scales.append(((q * p).sum() / (p * p).sum() - 1.0) / scale_sigma(x.states.p_WB, cov))
+            scales.append(((q * p).sum() / (p * p).sum() - 1.0) / path_scale_sigma(x.states.p_WB, cov))
         low, high = chi2.ppf([0.001, 0.999], 11 * len(distances)) / len(distances)
         assert low < np.mean(distances) < high
         low, high = chi2.ppf([0.001, 0.999], len(scales)) / len(scales)

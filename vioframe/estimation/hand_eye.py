@@ -21,7 +21,9 @@ import numpy as np
 from vioframe.arrays import Float, Int
 from vioframe.estimation.inertial.gyro_path import GyroPath
 from vioframe.estimation.turns import Turn
-from vioframe.geometry import so3
+from vioframe.geometry import kernels, so3
+from vioframe.geometry.kernels import product
+from vioframe.jit import kernel
 from vioframe.types import NS_PER_S
 
 Part = Literal["offset", "rotation", "focal"]
@@ -87,8 +89,9 @@ class Turns:
         H = np.array([[t.H for t in some] for some in either]).reshape(len(either), -1, 4, 4)
         cov = np.linalg.inv(H[..., :3, :3])
         # A longer focal length turns R_C1C2 by this much.
-        self._by_focal = -(cov @ H[..., :3, 3:])[..., 0]
-        self._whitener = np.swapaxes(np.linalg.cholesky(np.linalg.inv(cov + _FLOOR**2 * np.eye(3))), -1, -2)
+        self._by_focal = -np.ascontiguousarray((cov @ H[..., :3, 3:])[..., 0])
+        root = np.linalg.cholesky(np.linalg.inv(cov + _FLOOR**2 * np.eye(3)))
+        self._whitener = np.ascontiguousarray(np.swapaxes(root, -1, -2))
 
     def __len__(self) -> int:
         return len(self._dt)
@@ -186,18 +189,50 @@ class Turns:
     def _linearise(self, x: HandEye) -> tuple[Float, Float, tuple[Int, Int]]:
         """Whitened residuals (P, 3) and Jacobian (P, 3, 8) by [bias rotation offset log_focal], and which turns."""
         path = GyroPath(self._t_s, self._gyro_B - x.bias_gyro_B)
-        (R_1, R_2), (rate_1, rate_2) = path.at(np.stack([self._first, self._second]) + x.offset_s)
-        R_B2B1 = np.swapaxes(R_2, -1, -2) @ R_1
-        R_C1C2 = x.R_BC.T @ np.swapaxes(R_B2B1, -1, -2) @ x.R_BC
-        off = so3.log(np.swapaxes(self._R_C1C2, -1, -2) @ R_C1C2) - self._by_focal * x.log_focal
-        r = (self._whitener @ off[..., None])[..., 0]
-        which = (r * r).sum(axis=2).argmin(axis=0), np.arange(len(self))
-        J = np.empty((len(self), 3, 8))
-        J[:, :, 0:3] = -0.5 * x.R_BC.T @ (np.eye(3) + R_B2B1) * self._dt[:, None, None]
-        J[:, :, 3:6] = np.eye(3) - np.swapaxes(R_C1C2, -1, -2)
-        J[:, :, 6] = (rate_2 - (R_B2B1 @ rate_1[..., None])[..., 0]) @ x.R_BC
-        J[:, :, 7] = -self._by_focal[which]
-        return r[which], self._whitener[which] @ J, which
+        seen = self._R_C1C2, self._by_focal, self._whitener
+        r, J, which = _linearise(
+            *path.at(self._first + x.offset_s),
+            *path.at(self._second + x.offset_s),
+            *seen,
+            x.R_BC,
+            x.log_focal,
+            self._dt,
+        )
+        return r, J, (which, np.arange(len(self)))
+
+
+@kernel
+def _linearise(
+    R_1: Float,
+    rate_1: Float,
+    R_2: Float,
+    rate_2: Float,
+    R_C1C2: Float,
+    by_focal: Float,
+    whitener: Float,
+    R_BC: Float,
+    log_focal: float,
+    dt: Float,
+) -> tuple[Float, Float, Int]:
+    """:meth:`Turns._linearise` with the body turned to ``R_1``, ``R_2`` (P, 3, 3), at ``rate_1``, ``rate_2`` (P, 3)."""
+    n = len(dt)
+    r, J, which = np.empty((n, 3)), np.empty((n, 3, 8)), np.zeros(n, np.int64)
+    R_CB = np.ascontiguousarray(R_BC.T)
+    D = np.empty((3, 8))
+    for p in range(n):
+        R_B2B1 = product(R_2[p].T, R_1[p])
+        turned = product(product(R_CB, R_B2B1.T), R_BC)
+        least = np.inf
+        for k in range(len(R_C1C2)):
+            off = whitener[k, p] @ (kernels.log(product(R_C1C2[k, p].T, turned)) - by_focal[k, p] * log_focal)
+            if off @ off < least:
+                least, which[p], r[p] = off @ off, k, off
+        D[:, 0:3] = -0.5 * dt[p] * (R_CB + product(R_CB, R_B2B1))
+        D[:, 3:6] = np.eye(3) - turned.T
+        D[:, 6] = R_CB @ (rate_2[p] - kernels.turned(R_B2B1, rate_1[p]))
+        D[:, 7] = -by_focal[which[p], p]
+        J[p] = whitener[which[p], p] @ D
+    return r, J, which
 
 
 def top_beside(values: Float, best: int) -> float:

@@ -23,13 +23,37 @@ def intrinsics_of(camera: Camera) -> tuple[int, Float]:
 @kernel
 def hat(v: Float) -> Float:
     """(3,) -> (3, 3) skew matrix."""
-    return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
+    out = np.zeros((3, 3))
+    out[0, 1], out[0, 2], out[1, 2] = -v[2], v[1], -v[0]
+    out[1, 0], out[2, 0], out[2, 1] = v[2], -v[1], v[0]
+    return out
 
 
 @kernel
 def cross(a: Float, b: Float) -> Float:
     """(3,) x (3,) -> (3,)."""
-    return np.array([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
+    out = np.empty(3)
+    out[0], out[1], out[2] = a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+    return out
+
+
+@kernel
+def product(A: Float, B: Float) -> Float:
+    """(3, 3) x (3, 3) -> (3, 3), without the detour over BLAS that ``@`` makes."""
+    out = np.empty((3, 3))
+    for i in range(3):
+        for j in range(3):
+            out[i, j] = A[i, 0] * B[0, j] + A[i, 1] * B[1, j] + A[i, 2] * B[2, j]
+    return out
+
+
+@kernel
+def turned(R: Float, v: Float) -> Float:
+    """(3, 3) x (3,) -> (3,)."""
+    out = np.empty(3)
+    for i in range(3):
+        out[i] = R[i, 0] * v[0] + R[i, 1] * v[1] + R[i, 2] * v[2]
+    return out
 
 
 @kernel
@@ -41,9 +65,35 @@ def exp(phi: Float) -> Float:
     else:
         a = math.sqrt(a2)
         sinc, cosc = math.sin(a) / a, (1.0 - math.cos(a)) / a2
-    K = hat(phi)
-    R: Float = np.eye(3) + sinc * K + cosc * (K @ K)
+    x, y, z = phi[0], phi[1], phi[2]
+    R = np.empty((3, 3))
+    R[0, 0], R[0, 1], R[0, 2] = 1.0 - cosc * (y * y + z * z), cosc * x * y - sinc * z, cosc * x * z + sinc * y
+    R[1, 0], R[1, 1], R[1, 2] = cosc * x * y + sinc * z, 1.0 - cosc * (x * x + z * z), cosc * y * z - sinc * x
+    R[2, 0], R[2, 1], R[2, 2] = cosc * x * z - sinc * y, cosc * y * z + sinc * x, 1.0 - cosc * (x * x + y * y)
     return R
+
+
+@kernel
+def log(R: Float) -> Float:
+    """(3, 3) rotation -> (3,) rad with norm <= pi, exact near pi: of the quaternion the largest component divides."""
+    trace = R[0, 0] + R[1, 1] + R[2, 2]
+    v, best = np.empty(3), 3
+    for a in range(3):
+        if R[a, a] > (trace if best == 3 else R[best, best]):
+            best = a
+    if best == 3:
+        w = 1.0 + trace
+        v[0], v[1], v[2] = R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]
+    else:
+        b, c = (best + 1) % 3, (best + 2) % 3
+        w = R[c, b] - R[b, c]
+        v[best], v[b], v[c] = 1.0 - trace + 2.0 * R[best, best], R[b, best] + R[best, b], R[c, best] + R[best, c]
+        if w < 0.0:
+            w, v = -w, -v
+    n = math.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
+    q = n / math.sqrt(n * n + w * w)
+    # 2 atan2(n, w) / n of the unit quaternion, which tends to 2.
+    return v * (2.0 * math.atan2(n, w) / n if q > 1e-8 else 2.0 / w)
 
 
 @kernel
@@ -55,8 +105,11 @@ def right_jacobian(phi: Float) -> Float:
     else:
         a = math.sqrt(a2)
         cosc, sinc3 = (1.0 - math.cos(a)) / a2, (a - math.sin(a)) / (a2 * a)
-    K = hat(phi)
-    J: Float = np.eye(3) - cosc * K + sinc3 * (K @ K)
+    x, y, z = phi[0], phi[1], phi[2]
+    J = np.empty((3, 3))
+    J[0, 0], J[0, 1], J[0, 2] = 1.0 - sinc3 * (y * y + z * z), sinc3 * x * y + cosc * z, sinc3 * x * z - cosc * y
+    J[1, 0], J[1, 1], J[1, 2] = sinc3 * x * y - cosc * z, 1.0 - sinc3 * (x * x + z * z), sinc3 * y * z + cosc * x
+    J[2, 0], J[2, 1], J[2, 2] = sinc3 * x * z + cosc * y, sinc3 * y * z - cosc * x, 1.0 - sinc3 * (x * x + y * y)
     return J
 
 

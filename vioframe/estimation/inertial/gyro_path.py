@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from vioframe.arrays import Float
-from vioframe.geometry import so3
+from vioframe.geometry import kernels
 from vioframe.jit import kernel
 
 
@@ -23,11 +23,20 @@ class GyroPath:
 
     def at(self, t_s: Float) -> tuple[Float, Float]:
         """R_B0B (..., 3, 3), from B at the first reading, and the rate (..., 3) rad/s at times of any shape."""
-        k = np.clip(np.searchsorted(self._t_s, t_s, side="right") - 1, 0, len(self._t_s) - 2)
-        after = t_s - self._t_s[k]
-        slope = (self._rate_B[k + 1] - self._rate_B[k]) / (self._t_s[k + 1] - self._t_s[k])[..., None]
-        rate = self._rate_B[k] + slope * after[..., None]
-        return self._R_B0B[k] @ so3.exp(0.5 * (self._rate_B[k] + rate) * after[..., None]), rate
+        R_B0B, rate_B = _between(self._t_s, self._rate_B, self._R_B0B, np.ravel(t_s))
+        return R_B0B.reshape(*t_s.shape, 3, 3), rate_B.reshape(*t_s.shape, 3)
+
+
+@kernel
+def _between(at_s: Float, rate_B: Float, R_B0B: Float, t_s: Float) -> tuple[Float, Float]:
+    """The rotation (T, 3, 3) and the rate (T, 3) at ``t_s``, along readings ``rate_B`` at ``at_s``."""
+    R, rates = np.empty((len(t_s), 3, 3)), np.empty((len(t_s), 3))
+    for j in range(len(t_s)):
+        k = min(max(np.searchsorted(at_s, t_s[j], side="right") - 1, 0), len(at_s) - 2)
+        after = t_s[j] - at_s[k]
+        rates[j] = rate_B[k] + (rate_B[k + 1] - rate_B[k]) * (after / (at_s[k + 1] - at_s[k]))
+        R[j] = R_B0B[k] @ kernels.exp((rate_B[k] + rates[j]) * (0.5 * after))
+    return R, rates
 
 
 @kernel

@@ -12,8 +12,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from vioframe.estimation.inertial.error_transition import add_white, move, move_covariance
 from vioframe.geometry import so3
-from vioframe.geometry.kernels import exp, hat, right_jacobian
+from vioframe.geometry.kernels import exp, hat, product, right_jacobian, turned
 from vioframe.jit import kernel
 from vioframe.types import DP, DTHETA, DV, Float, ImuNoise, ImuSegment, NavState, g_W
 
@@ -79,9 +80,9 @@ class Preintegrated:
 def preintegrate(imu: ImuSegment, bias_gyro_B: Float, bias_accel_B: Float, noise: ImuNoise) -> Preintegrated:
     """Integrate ``imu`` at the biases (3,) rad/s and (3,) m/s^2; ``noise`` gives continuous-time densities."""
     variance = np.square([noise.gyro_density, noise.accel_density, noise.gyro_walk, noise.accel_walk])
-    dR, dp, dv, cov, transition = _integrate(imu.dt, imu.gyro_B - bias_gyro_B, imu.accel_B - bias_accel_B, variance)
+    dR, dp, dv, cov, bias_jacobian = _integrate(imu.dt, imu.gyro_B - bias_gyro_B, imu.accel_B - bias_accel_B, variance)
     return Preintegrated(
-        imu.duration_s, dR, dp, dv, cov, transition[:9, 9:], bias_gyro_B.copy(), bias_accel_B.copy(), imu, noise
+        imu.duration_s, dR, dp, dv, cov, bias_jacobian, bias_gyro_B.copy(), bias_accel_B.copy(), imu, noise
     )
 
 
@@ -104,35 +105,32 @@ def _integrate(dt: Float, gyro: Float, accel: Float, variance: Float) -> tuple[F
     interval as independent of those of the next would halve it, because neighbours share a reading.
     """
     R, p, v = np.eye(3), np.zeros(3), np.zeros(3)
-    cov, transition = np.zeros((15, 15)), np.eye(15)
-    F, by_gyro, by_accel = np.eye(15), np.zeros((9, 3)), np.zeros((9, 3))
+    cov, bias_jacobian = np.zeros((15, 15)), np.zeros((15, 6))
+    bias_jacobian[9:15] = np.eye(6)
+    by_theta, by_biases = np.zeros((6, 3)), np.zeros((9, 6))
     for i in range(len(dt)):
         h = dt[i]
         a_0, a_1 = accel[i], accel[i + 1]
         phi = 0.5 * h * (gyro[i] + gyro[i + 1])
         dR = exp(phi)
-        R_next = R @ dR
-        a = 0.5 * (R @ a_0 + R_next @ a_1)
+        R_next = product(R, dR)
+        a = 0.5 * (turned(R, a_0) + turned(R_next, a_1))
 
         # Errors at the end of the interval by those at its start [A.9], with the midpoint's two rotations.
         theta_by_gyro = -h * right_jacobian(phi)
-        a_by_theta_next = -0.5 * R_next @ hat(a_1)
-        a_by_theta = -0.5 * R @ hat(a_0) + a_by_theta_next @ dR.T
-        a_by_gyro = a_by_theta_next @ theta_by_gyro
+        a_by_theta_next = -0.5 * product(R_next, hat(a_1))
+        a_by_theta = -0.5 * product(R, hat(a_0)) + product(a_by_theta_next, dR.T)
+        a_by_gyro = product(a_by_theta_next, theta_by_gyro)
         a_by_accel = -0.5 * (R + R_next)
-        F[0:3, 0:3] = dR.T
-        F[3:6, 0:3] = 0.5 * h * h * a_by_theta
-        F[6:9, 0:3] = h * a_by_theta
-        for k in range(3):
-            F[3 + k, 6 + k] = h
-        by_gyro[0:3] = theta_by_gyro
-        by_gyro[3:6], by_accel[3:6] = 0.5 * h * h * a_by_gyro, 0.5 * h * h * a_by_accel
-        by_gyro[6:9], by_accel[6:9] = h * a_by_gyro, h * a_by_accel
-        F[0:9, 9:12], F[0:9, 12:15] = by_gyro, by_accel
+        by_theta[0:3], by_theta[3:6] = 0.5 * h * h * a_by_theta, h * a_by_theta
+        by_biases[0:3, 0:3] = theta_by_gyro
+        by_biases[3:6, 0:3], by_biases[3:6, 3:6] = 0.5 * h * h * a_by_gyro, 0.5 * h * h * a_by_accel
+        by_biases[6:9, 0:3], by_biases[6:9, 3:6] = h * a_by_gyro, h * a_by_accel
 
-        transition = F @ transition
-        cov = F @ cov @ F.T
-        cov[0:9, 0:9] += (variance[0] / h) * (by_gyro @ by_gyro.T) + (variance[1] / h) * (by_accel @ by_accel.T)
+        move(dR, by_theta, by_biases, h, bias_jacobian)
+        move_covariance(dR, by_theta, by_biases, h, cov)
+        add_white(by_biases[:, 0:3], variance[0] / h, cov)
+        add_white(by_biases[:, 3:6], variance[1] / h, cov)
         for k in range(3):
             cov[9 + k, 9 + k] += variance[2] * h
             cov[12 + k, 12 + k] += variance[3] * h
@@ -140,4 +138,4 @@ def _integrate(dt: Float, gyro: Float, accel: Float, variance: Float) -> tuple[F
         p = p + v * h + 0.5 * h * h * a
         v = v + h * a
         R = R_next
-    return R, p, v, 0.5 * (cov + cov.T), transition
+    return R, p, v, 0.5 * (cov + cov.T), bias_jacobian[:9]

@@ -11,7 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vioframe.geometry.kernels import cross, exp, hat, right_jacobian
+from vioframe.estimation.inertial.error_transition import move, move_covariance
+from vioframe.geometry.kernels import cross, exp, hat, product, right_jacobian, turned
 from vioframe.jit import kernel
 from vioframe.types import Float, ImuNoise, ImuSegment, g_W
 
@@ -69,7 +70,7 @@ def _integrate(
     R, p, v = R.copy(), p.copy(), v.copy()
     Phi = np.eye(15)
     Q = np.zeros((15, 15))
-    F = np.eye(15)
+    by_theta, by_biases = np.zeros((6, 3)), np.zeros((9, 6))
     for i in range(len(dt)):
         h = dt[i]
         w_0, w_1 = gyro[i], gyro[i + 1]
@@ -78,27 +79,24 @@ def _integrate(
         # Magnus expansion to fourth order for a rate linear in time: over the first half, and over the whole interval.
         phi_half = 0.25 * h * (w_0 + w_m) + (h * h / 48.0) * cross(w_0, w_m)
         phi = h * w_m + (h * h / 12.0) * cross(w_0, w_1)
-        R_half = R @ exp(phi_half)
+        R_half = product(R, exp(phi_half))
         dR = exp(phi)
-        R_next = R @ dR
-        f_0, f_m, f_1 = R @ a_0, R_half @ a_m, R_next @ a_1
+        R_next = product(R, dR)
+        f_0, f_m, f_1 = turned(R, a_0), turned(R_half, a_m), turned(R_next, a_1)
         dv = (h / 6.0) * (f_0 + 4.0 * f_m + f_1)
         dp = (h * h / 6.0) * (f_0 + 2.0 * f_m)
 
         # Error transition over the interval, with the errors of the biases constant in it.
-        F[0:3, 0:3] = dR.T
-        F[0:3, 9:12] = -h * right_jacobian(phi)
-        F[3:6, 0:3] = -hat(dp) @ R
-        F[6:9, 0:3] = -hat(dv) @ R
-        for k in range(3):
-            F[3 + k, 6 + k] = h
-        force = R_half @ hat(a_m)
-        F[3:6, 9:12] = (h**3 / 6.0) * force
-        F[6:9, 9:12] = (h**2 / 2.0) * force
-        F[3:6, 12:15] = -(h**2 / 2.0) * R_half
-        F[6:9, 12:15] = -h * R_half
-        Phi = F @ Phi
-        Q = F @ Q @ F.T
+        by_theta[0:3] = -product(hat(dp), R)
+        by_theta[3:6] = -product(hat(dv), R)
+        force = product(R_half, hat(a_m))
+        by_biases[0:3, 0:3] = -h * right_jacobian(phi)
+        by_biases[3:6, 0:3] = (h**3 / 6.0) * force
+        by_biases[6:9, 0:3] = (h**2 / 2.0) * force
+        by_biases[3:6, 3:6] = -(h**2 / 2.0) * R_half
+        by_biases[6:9, 3:6] = -h * R_half
+        move(dR, by_theta, by_biases, h, Phi)
+        move_covariance(dR, by_theta, by_biases, h, Q)
         for k in range(3):
             Q[k, k] += variance[0] * h
             Q[3 + k, 3 + k] += variance[1] * h**3 / 3.0

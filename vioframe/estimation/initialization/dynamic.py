@@ -71,6 +71,8 @@ _MAX_BIAS_ACCEL = 5.0 * BIAS_ACCEL_SIGMA
 # Largest standard deviations that are accepted: of scale (relative), velocity on any axis (m/s, or as a part of the
 # speed where that is more), and gravity's direction.
 _SCALE_SIGMA, _VELOCITY_SIGMA, _SPEED_SIGMA, _TILT_SIGMA_DEG = 0.06, 0.05, 0.03, 1.0
+# ... and of scale where the calibration had to be found, of which more may be wrong than was looked for.
+_SCALE_SIGMA_FOUND = 0.05
 # A calibration is wrong where the likeliest makes the rest so much likelier, as a difference of logarithms: far more
 # than chance would, because the noise in many landmarks, each with few sightings, makes focal lengths seem longer.
 _CONTRADICTED = 20.0
@@ -81,12 +83,18 @@ _HOPELESS = 1.5
 
 
 def initialise(
-    packets: Sequence[Packet], calibration: Calibration, known: Float, doubted: Float, bias_gyro_B: Float
+    packets: Sequence[Packet],
+    calibration: Calibration,
+    known: Float,
+    doubted: Float,
+    bias_gyro_B: Float,
+    *,
+    found: bool,
 ) -> InitialEstimate:
     """Estimate from consecutive ``packets``, the newest last; raises :class:`RefusalError`.
 
     ``known`` (16, 16) is the covariance of the camera's ``calibration`` if that is right, ``doubted`` if it may not be;
-    ``bias_gyro_B`` (3,) rad/s is about what the gyroscope's bias is.
+    ``bias_gyro_B`` (3,) rad/s is about what the gyroscope's bias is; ``found``, whether the calibration had to be.
     """
     t_ns = np.array([tracks.t_ns for _, tracks in packets])
     held_out = int((t_ns > t_ns[-1] - _LOOKAHEAD_S * 1e9).sum())
@@ -106,7 +114,8 @@ def initialise(
     x = _start_of_adjustment(window.without_last(), structure, alignment, calibration)
     problem, solution = _adjusted(window.without_last(), x, calibration, doubted, roughly=True)
     cov = covariance(problem, solution.variables, doubted)
-    _check_uncertainty(solution.variables.states, cov, _HOPELESS)
+    scale_sigma = _SCALE_SIGMA_FOUND if found else _SCALE_SIGMA
+    _check_uncertainty(solution.variables.states, cov, scale_sigma, _HOPELESS)
     if not cov[_READOUT, _READOUT] <= _READOUT_SIGMA_S**2:
         # Only fast turns tell a readout; slow ones would have it make up for something else.
         doubted = doubted.copy()
@@ -128,11 +137,11 @@ def initialise(
     _check_fit(problem, solution)
     x = solution.variables
     cov = covariance(problem, x, doubted)
-    _check_uncertainty(x.states, cov)
+    _check_uncertainty(x.states, cov, scale_sigma)
     problem, x = _believed(problem, solution, calibration, known, cov)
     cov = covariance(problem, x, known)
     keep = _explained(problem, x)
-    return _estimate(window.only(keep), x.states, cov, _positions(problem, x)[keep])
+    return _estimate(window.only(keep), x, cov, _positions(problem, x)[keep])
 
 
 def _believed(
@@ -146,7 +155,7 @@ def _believed(
     problem = with_calibration(problem, x, camera, known)
     believed = adjusted(problem, replace(x, camera=calibrated(camera)), known)
     if not believed.cost < solution.cost + _CONTRADICTED * _variance(problem, x):
-        raise ContradictedError(x.camera, cov[-CALIBRATION_SIZE:, -CALIBRATION_SIZE:])
+        raise ContradictedError(x.camera, _camera(cov))
     return problem, believed.variables
 
 
@@ -230,8 +239,9 @@ def _predict(packets: Sequence[Packet], last: NavState, calibration: Calibration
     return out
 
 
-def _estimate(window: Window, adjusted: StateArrays, cov: Float, p_WF: Float) -> InitialEstimate:
+def _estimate(window: Window, x: Variables, cov: Float, p_WF: Float) -> InitialEstimate:
     """The world turned and moved so that yaw and position are zero at the first state."""
+    adjusted = x.states
     R_0, p_0 = adjusted.R_WB[0], adjusted.p_WB[0]
     R_new = level_rotation(R_0[2]) @ R_0.T  # R_0[2] is the vertical in the body
     turn = np.eye(15)
@@ -239,7 +249,7 @@ def _estimate(window: Window, adjusted: StateArrays, cov: Float, p_WF: Float) ->
     states = replace(adjusted, p_WB=adjusted.p_WB - p_0).turned(R_new).unstack(window.t_ns)
     newest = turn @ _newest(cov) @ turn.T
     states[-1] = replace(states[-1], cov=0.5 * (newest + newest.T))
-    return InitialEstimate("dynamic", tuple(states), window.ids, (p_WF - p_0) @ R_new.T)
+    return InitialEstimate("dynamic", tuple(states), window.ids, (p_WF - p_0) @ R_new.T, x.camera, _camera(cov))
 
 
 def _check_parallax(window: Window, R_B0B: Float, calibration: Calibration) -> None:
@@ -300,26 +310,31 @@ def _newest(cov: Float) -> Float:
     return cov[-15 - CALIBRATION_SIZE : -CALIBRATION_SIZE, -15 - CALIBRATION_SIZE : -CALIBRATION_SIZE]
 
 
-def _check_uncertainty(states: StateArrays, cov: Float, factor: float = 1.0) -> None:
+def _camera(cov: Float) -> Float:
+    """(16, 16) of the calibration."""
+    return cov[-CALIBRATION_SIZE:, -CALIBRATION_SIZE:]
+
+
+def _check_uncertainty(states: StateArrays, cov: Float, scale_sigma: float, factor: float = 1.0) -> None:
     """Velocity, gravity's direction and scale must be determined well; ``cov`` is of all states and the calibration.
 
-    The limits are ``factor`` times as wide.
+    The limits, ``scale_sigma`` among them, are ``factor`` times as wide.
     """
     newest = _newest(cov)
     velocity = float(np.sqrt(np.linalg.eigvalsh(newest[DV, DV])[-1]))
     tilt = float(np.rad2deg(np.sqrt(np.linalg.eigvalsh(newest[DTHETA, DTHETA])[-1])))
-    scale = scale_sigma(states.p_WB, cov)
+    scale = path_scale_sigma(states.p_WB, cov)
     enough = max(_VELOCITY_SIGMA, _SPEED_SIGMA * float(np.linalg.norm(states.v_WB[-1])))
-    for unsure, what in (
-        (velocity > factor * enough, f"velocity known to {velocity:.3f} m/s only"),
-        (tilt > factor * _TILT_SIGMA_DEG, f"gravity's direction known to {tilt:.2f} deg only"),
-        (scale > factor * _SCALE_SIGMA, f"scale known to {100.0 * scale:.0f} % only"),
-    ):
-        if unsure:
-            raise UnsureError(f"{what} (standard deviation)")
+    by, what = max(
+        (velocity / enough, f"velocity known to {velocity:.3f} m/s only"),
+        (tilt / _TILT_SIGMA_DEG, f"gravity's direction known to {tilt:.2f} deg only"),
+        (scale / scale_sigma, f"scale known to {100.0 * scale:.0f} % only"),
+    )
+    if not by <= factor:
+        raise UnsureError(f"{what} (standard deviation)")
 
 
-def scale_sigma(p_WB: Float, cov: Float) -> float:
+def path_scale_sigma(p_WB: Float, cov: Float) -> float:
     """Relative standard deviation of the path's size, sum q_k . dp_k / sum |q_k|^2 with q from the path's centre.
 
     Translations and rotations of the whole path have no part in it.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Set
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -16,7 +17,7 @@ from vioframe.types import NS_PER_S, Calibration, CameraSigma
 # A part of a calibration that is off by so many standard deviations is clearly wrong.
 _CLEAR = 3.0
 # Standard deviations with which a start can take a part over, rad, s and relative.
-_FOUND_SURE = {"rotation": np.deg2rad(2.5), "offset": 0.012, "focal": 0.02, "readout": 0.005}
+_FOUND_SURE = {"rotation": np.deg2rad(1.5), "offset": 0.012, "focal": 0.02, "readout": 0.005}
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,16 +34,16 @@ class Found:
     focal_sigma: float | None = None
     readout_sigma_s: float | None = None
 
-    def sigma(self, given: CameraSigma) -> CameraSigma:
-        """``given``, where nothing else was found."""
+    def sigma(self, given: CameraSigma, factor: float = 1.0) -> CameraSigma:
+        """``given``, where nothing else was found; what was, ``factor`` times as unsure."""
         model = self.calibration.cameras[0].model
-        focal = (self.focal_sigma or 0.0) * np.array([model.fx, model.fy, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+        focal = factor * (self.focal_sigma or 0.0) * np.array([model.fx, model.fy, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
         return replace(
             given,
-            rotation=np.maximum(self.rotation_sigma or 0.0, given.rotation),
-            time_offset_s=max(self.offset_sigma_s or 0.0, given.time_offset_s),
+            rotation=np.maximum(factor * (self.rotation_sigma or 0.0), given.rotation),
+            time_offset_s=max(factor * (self.offset_sigma_s or 0.0), given.time_offset_s),
             intrinsics=np.maximum(focal, given.intrinsics),
-            readout_s=self.readout_sigma_s or given.readout_s,
+            readout_s=factor * (self.readout_sigma_s or 0.0) or given.readout_s,
         )
 
     def after(self, before: Found | None) -> Found:
@@ -51,6 +52,15 @@ class Found:
             return self
         kept = {name: getattr(before, name) for name in self.__slots__ if getattr(self, name) is None}
         return replace(self, **kept)
+
+    def settled(self, camera: Calibrated, cov: Float) -> Found:
+        """With the parts that were found as an adjustment has them in the end, with covariance (16, 16).
+
+        The time offset stays as the frames have been cut by it; an estimator finds the rest.
+        """
+        again = ("rotation", self.rotation_sigma), ("focal", self.focal_sigma), ("readout", self.readout_sigma_s)
+        parts = {part for part, sigma in again if sigma is not None}
+        return _found(self.calibration, camera, _sigmas(self.calibration, cov), parts).after(self)
 
     def __str__(self) -> str:
         (camera,), parts = self.calibration.cameras, []
@@ -74,23 +84,12 @@ def found_by(given: Calibration, camera: Calibrated, cov: Float) -> Found:
     Raises :class:`UnsureError` where that is not known well enough.
     """
     old = given.cameras[0]
-    turn, offset_s = so3.log(old.R_BC.T @ camera.R_BC), camera.offset_s
-    focal = np.array([old.model.fx, old.model.fy])
-    zoom = float(np.mean(camera.intrinsics[:2] / focal)) - 1.0
-    by_focal = np.zeros(len(cov))
-    by_focal[INTRINSICS][:2] = 0.5 / focal
-    sigma = {
-        "rotation": float(np.sqrt(np.linalg.eigvalsh(cov[:3, :3])[-1])),
-        "offset": float(np.sqrt(cov[OFFSET, OFFSET])),
-        "focal": float(np.sqrt(by_focal @ cov @ by_focal)),
-        "readout": float(np.sqrt(cov[READOUT, READOUT])),
-    }
-    longer_s = camera.readout_s - old.readout_s
+    sigma = _sigmas(given, cov)
     off = {
-        "rotation": float(np.linalg.norm(turn)),
-        "offset": abs(offset_s),
-        "focal": abs(zoom),
-        "readout": abs(longer_s),
+        "rotation": float(np.linalg.norm(so3.log(old.R_BC.T @ camera.R_BC))),
+        "offset": abs(camera.offset_s),
+        "focal": abs(_zoom(given, camera)),
+        "readout": abs(camera.readout_s - old.readout_s),
     }
     clear = {part: off[part] / max(sigma[part], 1e-12) for part in off}
     chosen = {part for part in clear if clear[part] >= min(_CLEAR, max(clear.values()))}
@@ -98,16 +97,37 @@ def found_by(given: Calibration, camera: Calibrated, cov: Float) -> Found:
         raise UnsureError(
             f"the {' and '.join(unsure)} given contradict what is seen; what fits is not known well enough"
         )
+    return _found(given, camera, sigma, chosen)
+
+
+def _sigmas(given: Calibration, cov: Float) -> dict[str, float]:
+    """How well each part is known by the covariance (16, 16) of its adjustment."""
+    model, by_focal = given.cameras[0].model, np.zeros(len(cov))
+    by_focal[INTRINSICS][:2] = 0.5 / model.fx, 0.5 / model.fy
+    return {
+        "rotation": float(np.sqrt(np.linalg.eigvalsh(cov[:3, :3])[-1])),
+        "offset": float(np.sqrt(cov[OFFSET, OFFSET])),
+        "focal": float(np.sqrt(by_focal @ cov @ by_focal)),
+        "readout": float(np.sqrt(cov[READOUT, READOUT])),
+    }
+
+
+def _zoom(given: Calibration, camera: Calibrated) -> float:
+    """By how much longer the focal length is, relative."""
+    model = given.cameras[0].model
+    return float(np.mean(camera.intrinsics[:2] / (model.fx, model.fy))) - 1.0
+
+
+def _found(given: Calibration, camera: Calibrated, sigma: dict[str, float], parts: Set[str]) -> Found:
+    """``given`` with the ``parts`` that are as ``camera`` has them."""
+    old = given.cameras[0]
     changes: dict[str, dict[str, Any]] = {
         "rotation": {"R_BC": camera.R_BC},
-        "offset": {"time_offset_ns": old.time_offset_ns + round(offset_s * NS_PER_S)},
-        "focal": {"model": old.model.zoomed(1.0 + zoom)},
+        "offset": {"time_offset_ns": old.time_offset_ns + round(camera.offset_s * NS_PER_S)},
+        "focal": {"model": old.model.zoomed(1.0 + _zoom(given, camera))},
         "readout": {"readout_s": camera.readout_s},
     }
     return Found(
-        given.with_camera(0, **{name: value for part in chosen for name, value in changes[part].items()}),
-        sigma["offset"] if "offset" in chosen else None,
-        sigma["rotation"] if "rotation" in chosen else None,
-        sigma["focal"] if "focal" in chosen else None,
-        sigma["readout"] if "readout" in chosen else None,
+        given.with_camera(0, **{name: value for part in parts for name, value in changes[part].items()}),
+        *(sigma[part] if part in parts else None for part in ("offset", "rotation", "focal", "readout")),
     )

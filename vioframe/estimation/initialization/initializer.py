@@ -43,6 +43,8 @@ _IN_MOTION, _JUMPS = 2.0, 2.5
 # What contradicts it is taken over so many times in one attempt.
 _DOUBT_ROTATION, _DOUBT_OFFSET_S, _DOUBT_FOCAL, _DOUBT_READOUT_S = 0.05, 0.02, 0.06, 0.015
 _MOST_CONTRADICTIONS = 3
+# What the frames of a start tell of the calibration would count twice as a prior for it: made so many times weaker.
+_WITHOUT_ITS_FRAMES = 2.0
 # A camera that is turned by more than this on the body, rad, no back-end finds by itself.
 _MOUNTED_DIFFERENTLY = np.deg2rad(15.0)
 # How well a calibration is known (rad, m, s, px, distortion), as published for OpenVINS on EuRoC.
@@ -192,11 +194,13 @@ class Initializer:
             for _ in range(_MOST_CONTRADICTIONS):
                 if self._packets[-1][1].t_ns != newest_ns:
                     return None  # with another time offset, its readings are still to come
-                known = np.diag(self.camera_sigma.stacked() ** 2)
+                known = np.diag(self._prior_sigma().stacked() ** 2)
                 calibration = replace(self._calibration, imu=self._noise_in_motion())
                 try:
                     packets, doubted = self._last(self._window_s), self._doubted(known)
-                    return dynamic.initialise(packets, calibration, known, doubted, self._sensors.bias_gyro_B)
+                    bias, was_found = self._sensors.bias_gyro_B, self._found is not None
+                    estimate = dynamic.initialise(packets, calibration, known, doubted, bias, found=was_found)
+                    return self._settled(estimate)
                 except ContradictedError as other:
                     self._take_over(found_by(self._calibration, other.camera, other.cov))
             raise RefusalError("images and readings contradict every calibration")
@@ -206,6 +210,18 @@ class Initializer:
         except RefusalError:
             self._window_s = max(self._window_s / _LONGER, _USUAL_WINDOW_S)
             raise
+
+    def _settled(self, estimate: InitialEstimate) -> InitialEstimate:
+        """The ``estimate``, with what was found of the calibration as it has that."""
+        if self._found is not None and estimate.camera is not None:
+            self._found = self._found.settled(estimate.camera, estimate.cov_camera)
+            self._calibration = self._found.calibration
+            _log.info("%d %s", estimate.states[-1].t_ns, self._found)
+        return estimate
+
+    def _prior_sigma(self) -> CameraSigma:
+        """How well the calibration is known without the frames of the start, which told what was found of it."""
+        return GIVEN if self._found is None else self._found.sigma(GIVEN, _WITHOUT_ITS_FRAMES)
 
     def _doubted(self, known: Float) -> Float:
         """``known`` (16, 16), with what the calibration may be wrong by where nothing bears it out."""

@@ -44,7 +44,7 @@ _OVERLAP = 4.0
 # other focal lengths, relative, and readouts, s, are too, each by some of the turns.
 _WELL, _BADLY = 1.5, 1.7
 _ZOOMS, _READOUTS_S = np.linspace(-0.15, 0.15, 7), np.linspace(-0.045, 0.045, 7)
-_TRY_EVERY_NS, _TRIED_TURNS = NS_PER_S, 15
+_TRY_EVERY_NS, _TRIED_TURNS = 3 * NS_PER_S // 2, 15
 # One must fit better by this part of the squares to be taken, and what lies next to the given one by this.
 _FAR_BETTER, _VALLEY = 0.4, 0.75
 # How well it is found, relative and s.
@@ -240,8 +240,10 @@ def _best(
     variance = min(variance for _, variance in fits.values())
     costs = {parts: turns.cost(x, variance) for parts, (x, _) in fits.items()}
     limit = _BETTER * min(costs.values()) + _BETTER_BY
-    # In the order of how much they change.
-    parts = next(parts for parts, cost in costs.items() if cost <= limit)
+    enough = [parts for parts, cost in costs.items() if cost <= limit]
+    # The first changes least. Where either alone would do, nothing tells which of them it is.
+    either = {("offset",), ("rotation",)} <= set(enough)
+    parts = enough[-1] if enough[0] and either else enough[0]
     x, _ = fits[parts]
     if as_given is not None and _is_near(x, given, parts):
         parts = ()

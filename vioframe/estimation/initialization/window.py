@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 
 from vioframe.arrays import Bool
-from vioframe.estimation.factors.reprojection import Calibrated
+from vioframe.estimation.factors.reprojection import CALIBRATION_SIZE, Calibrated
 from vioframe.estimation.factors.tracks import TrackTable
 from vioframe.estimation.hand_eye import BIAS_SIGMA
 from vioframe.estimation.inertial.preintegration import join_segments
@@ -34,13 +34,15 @@ class InitialEstimate:
 
     ``states`` are the window's frames, oldest first. The last is the newest frame and has ``cov`` (15, 15), with
     position and yaw, which nothing measures, pinned at that frame. ``landmark_ids`` (L,) and ``p_WF`` (L, 3) m are the
-    dynamic method's landmarks.
+    dynamic method's landmarks; ``camera``, of covariance ``cov_camera`` (16, 16), is what it saw them with.
     """
 
     method: Literal["static", "dynamic"]
     states: tuple[NavState, ...]
     landmark_ids: Int = field(default_factory=lambda: np.empty(0, np.int64))
     p_WF: Float = field(default_factory=lambda: np.empty((0, 3)))
+    camera: Calibrated | None = None
+    cov_camera: Float = field(default_factory=lambda: np.zeros((CALIBRATION_SIZE, CALIBRATION_SIZE)))
 
 
 class RefusalError(Exception):
