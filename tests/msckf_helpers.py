@@ -12,11 +12,23 @@ from vioframe.io.calibration import packaged_calibration
 from vioframe.simulation import TrackSequence, simulated_sequence
 from vioframe.simulation.tracks import EUROC_NOISE
 from vioframe.types import Calibration, CalibrationEstimate, CameraSigma, Float, NavState
-from vioframe_msckf.state import FilterState
+from vioframe_msckf.state import IMU, FilterState
 
 CALIBRATION = packaged_calibration("euroc", cameras=["cam0"])
 START_COV = np.diag(np.repeat([0.005, 0.001, 0.02, 0.005, 0.05], 3) ** 2)
 """How well a drawn start is known: rad, m, m/s, rad/s, m/s^2."""
+
+
+def landmark_rows(state: FilterState, clone: int, blocks: Float) -> Float:
+    """H (2 M, n) of landmarks seen from one clone, with all the zeros that its ``blocks`` (M, 2, 25) leave out."""
+    calibrated, m = state.calibrated.stop - IMU, len(blocks)
+    H = np.zeros((2 * m, len(state.cov)))
+    H[:, state.calibrated] = blocks[:, :, :calibrated].reshape(-1, calibrated)
+    at = state.calibrated.stop + 6 * clone
+    H[:, at : at + 6] = blocks[:, :, 16:22].reshape(-1, 6)
+    rows, columns = np.arange(2 * m).reshape(-1, 2, 1), np.arange(3 * m).reshape(-1, 1, 3)
+    H[rows, state.landmarks_begin + columns] = blocks[:, :, 22:]
+    return H
 
 
 def prior_of(calibration: Calibration) -> CalibrationEstimate:

@@ -4,12 +4,12 @@ import copy
 
 import numpy as np
 import pytest
-from msckf_helpers import random_covariance, seeing_state
+from msckf_helpers import landmark_rows, random_covariance, seeing_state
 from scipy.stats import chi2
 
 from vioframe.geometry import kernels, so3
 from vioframe.geometry.cameras import Camera
-from vioframe_msckf.measurement import Window, landmark_rows, mahalanobis, observations, reduce_landmark, track_rows
+from vioframe_msckf.measurement import Window, landmark_blocks, mahalanobis, observations, reduce_landmark, track_rows
 from vioframe_msckf.options import MsckfOptions
 from vioframe_msckf.state import IMU, OFFSET, READOUT
 from vioframe_msckf.updates import promote_tracks
@@ -75,9 +75,9 @@ def test_rows_of_landmarks_predict_how_residuals_change_with_the_state(readout_s
     def residual(dx):
         moved = copy.deepcopy(state)
         moved._correct(dx)
-        return landmark_rows(moved, clone, xy, False)[1]
+        return landmark_blocks(moved, clone, xy, False)[1]
 
-    H, _ = landmark_rows(state, clone, xy, False)
+    H = landmark_rows(state, clone, landmark_blocks(state, clone, xy, False)[0])
     eps, n = 1e-6, len(state.cov)
     numeric = np.stack([(residual(-eps * e) - residual(eps * e)) / (2 * eps) for e in np.eye(n)], axis=1)
     np.testing.assert_allclose(H, numeric, rtol=1e-6, atol=2e-4)
@@ -112,7 +112,8 @@ def test_first_estimates_hold_the_jacobian_and_not_the_residual():
     moved._correct(dx)
 
     def rows(of, first_estimates):
-        return landmark_rows(of, 2, table.xy[[row], 2], first_estimates)
+        blocks, residual = landmark_blocks(of, 2, table.xy[[row], 2], first_estimates)
+        return landmark_rows(of, 2, blocks), residual
 
     H, residual = rows(state, True)
     np.testing.assert_array_equal(rows(moved, True)[0], H)

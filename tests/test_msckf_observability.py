@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import pytest
-from msckf_helpers import CALIBRATION, drawn_start, since
+from msckf_helpers import CALIBRATION, drawn_start, landmark_rows, since
 
 import vioframe_msckf.updates as updates
 from vioframe.bench import run_backend
@@ -47,7 +47,7 @@ class Recorder:
     _reduced: tuple[Float, Float] = (np.empty(0), np.empty(0))
 
     def attach(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        for name in ("propagate", "augment_clone", "add_landmark", "update", "_delete"):
+        for name in ("propagate", "augment_clone", "add_landmark", "update", "innovation", "_delete"):
             monkeypatch.setattr(FilterState, name, self._wrapped(name, getattr(FilterState, name)))
         reduce_landmark = updates.reduce_landmark
 
@@ -95,7 +95,12 @@ class Recorder:
 
     def _update(self, state, original, H, residual, columns, R) -> None:
         assert len(self.N) == len(state.cov)
-        N = self.N[columns]
+        self._see(H, self.N[columns])
+
+    def _innovation(self, state, original, clone, blocks, variance) -> None:
+        self._see(landmark_rows(state, clone, blocks), self.N)
+
+    def _see(self, H: Float, N: Float) -> None:
         self.seen.append(np.linalg.norm(H @ N, axis=0) / np.linalg.norm(H) / np.linalg.norm(N, axis=0))
 
 

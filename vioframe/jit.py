@@ -13,9 +13,9 @@ import stat
 import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
-from typing import Any, TypeVar, cast
+from typing import Any, TypeVar, cast, overload
 
 import numba
 from numba.core import event
@@ -25,18 +25,34 @@ FunctionT = TypeVar("FunctionT", bound=Callable[..., object])
 _PACKAGE = Path(__file__).parent
 
 
-def kernel(function: FunctionT) -> FunctionT:
+@overload
+def kernel(function: FunctionT) -> FunctionT: ...
+@overload
+def kernel(*, reorder_sums: bool) -> Callable[[FunctionT], FunctionT]: ...
+def kernel(
+    function: FunctionT | None = None, *, reorder_sums: bool = False
+) -> FunctionT | Callable[[FunctionT], FunctionT]:
     """Compile ``function`` in nopython mode at its first call, or load it from the cache.
 
-    It divides as numpy does: by zero is no error. Loops with divisions can be vectorised then.
+    It divides as numpy does: by zero is no error. Loops with divisions can be vectorised then; those that sum, where
+    it may ``reorder_sums``, which lets their last digits depend on the processor. Threads run beside it.
     """
+    if function is None:
+        return partial(_compiled, reorder_sums=reorder_sums)
+    return _compiled(function, reorder_sums)
+
+
+def _compiled(function: FunctionT, reorder_sums: bool) -> FunctionT:
     source = Path(function.__code__.co_filename)
     in_package = (source.parent / "__init__.py").exists()
     settings: Any = numba.config
     before = settings.CACHE_DIR
     settings.CACHE_DIR = str(_folder(before) / _fingerprint(source.parent if in_package else source))
+    compiled = numba.njit(
+        cache=True, error_model="numpy", nogil=True, fastmath={"reassoc", "nsz"} if reorder_sums else False
+    )
     try:
-        return cast(FunctionT, numba.njit(cache=True, error_model="numpy")(function))
+        return cast(FunctionT, compiled(function))
     finally:
         settings.CACHE_DIR = before
 

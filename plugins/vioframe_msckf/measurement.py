@@ -48,18 +48,11 @@ class Window(NamedTuple):
         return Window(c.R_WB, c.p_WB, *first, c.rate_B, c.velocity_B, *camera, calibrated)
 
 
-def landmark_rows(state: FilterState, clone: int, xy: Float, first_estimates: bool) -> tuple[Float, Float]:
-    """Measurements (M, 2) px of the state's landmarks from one clone: H (2 M, n) and residuals (2 M,)."""
+def landmark_blocks(state: FilterState, clone: int, xy: Float, first_estimates: bool) -> tuple[Float, Float]:
+    """Measurements (M, 2) px of the state's landmarks from one clone: blocks (M, 2, 25) and residuals (2 M,)."""
     p_first = state.p_WF_first if first_estimates else state.p_WF
-    window = Window.of(state, first_estimates)
-    blocks, residual = observations(window, clone, state.p_WF, p_first, xy)
-    H = np.zeros((2 * len(xy), len(state.cov)))
-    H[:, state.calibrated] = blocks[:, :, : window.calibrated].reshape(-1, window.calibrated)
-    at = state.calibrated.stop + 6 * clone
-    H[:, at : at + 6] = blocks[:, :, 16:22].reshape(-1, 6)
-    rows, columns = np.arange(2 * len(xy)).reshape(-1, 2, 1), np.arange(3 * len(xy)).reshape(-1, 1, 3)
-    H[rows, state.landmarks_begin + columns] = blocks[:, :, 22:]
-    return H, residual.ravel()
+    blocks, residual = observations(Window.of(state, first_estimates), clone, state.p_WF, p_first, xy)
+    return blocks, residual.ravel()
 
 
 @kernel

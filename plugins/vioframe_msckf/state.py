@@ -1,4 +1,4 @@
-"""The filter's mean and covariance. This module alone edits the covariance.
+"""The filter's mean and covariance. This module alone edits the covariance, by the algebra of :mod:`covariance`.
 
 Error state: [imu 15 | calibration 15 or 16 | clones 6 each | landmarks 3 each] with
 imu [dtheta dp dv dbg dba], calibration [dtheta_BC dp_BC d_offset d_intrinsics(8)], and d_readout last where it is
@@ -8,16 +8,16 @@ and so are never corrected.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from filterpy.kalman import KalmanFilter
 from numpy.typing import NDArray
-from scipy.linalg.lapack import dgeqrf, dpotrf, dtrtrs
+from scipy.linalg.lapack import dgeqrf
 
 from vioframe.errors import DivergedError
 from vioframe.estimation.inertial.propagation import propagate, yaw_consistent_transition
-from vioframe.geometry import kernels, so3
+from vioframe.geometry import kernels
 from vioframe.types import (
     DBA,
     DBG,
@@ -33,6 +33,7 @@ from vioframe.types import (
     ImuSegment,
     NavState,
 )
+from vioframe_msckf.covariance import inserted, landmark_innovation, only, reduce
 
 IMU = 15
 EXTRINSICS, OFFSET, INTRINSICS, READOUT = slice(15, 21), slice(21, 22), slice(22, 30), slice(30, 31)
@@ -81,7 +82,8 @@ class Poses:
     def corrected(self, dx: Float) -> Poses:
         """Moved by the error ``dx`` (6 C,)."""
         d = dx.reshape(-1, 6)
-        return replace(self, R_WB=self.R_WB @ so3.exp(d[:, :3]), p_WB=self.p_WB + d[:, 3:])
+        R_WB, p_WB = kernels.turned_by(self.R_WB, d[:, :3]), self.p_WB + d[:, 3:]
+        return Poses(R_WB, p_WB, self.R_WB_first, self.p_WB_first, self.rate_B, self.velocity_B)
 
     def __len__(self) -> int:
         return len(self.p_WB)
@@ -194,17 +196,15 @@ class FilterState:
         ``gyro_B`` (3,) is the rate there, free of bias. The clone depends on the offset through the body's motion, as
         in Li and Mourikis (2014), so the offset is estimated with no term of its own in the measurement.
         """
-        turn = so3.exp(gyro_B * self.offset_s)
+        turn = kernels.exp(gyro_B * self.offset_s)
         R = self.R_WB @ turn
         p = self.p_WB + self.v_WB * self.offset_s
-        n = len(self.cov)
-        J = np.zeros((6, n))
+        J = np.zeros((6, OFFSET.stop))
         J[0:3, DTHETA], J[0:3, OFFSET] = turn.T, gyro_B[:, None]
-        J[0:3, DBG] = -self.offset_s * so3.right_jacobian(gyro_B * self.offset_s)
+        J[0:3, DBG] = -self.offset_s * kernels.right_jacobian(gyro_B * self.offset_s)
         J[3:6, DP], J[3:6, DV], J[3:6, OFFSET] = np.eye(3), self.offset_s * np.eye(3), self.v_WB[:, None]
-        JP = J @ self.cov
-        at = self.landmarks_begin
-        self.cov = _insert(self.cov, at, JP, JP @ J.T)
+        JP = J @ self.cov[: OFFSET.stop]
+        self.cov = inserted(self.cov, self.landmarks_begin, JP, JP[:, : OFFSET.stop] @ J.T)
         self.clones = self.clones.append(R, p, gyro_B, R.T @ self.v_WB)
 
     def drop_oldest_clone(self) -> None:
@@ -217,7 +217,7 @@ class FilterState:
 
         ``p_WF_first`` (3,) is where the measurements that initialised it were linearised.
         """
-        self.cov = _insert(self.cov, len(self.cov), cross, cov)
+        self.cov = inserted(self.cov, len(self.cov), cross, cov)
         self.landmark_ids = np.append(self.landmark_ids, landmark_id)
         self.p_WF = np.concatenate([self.p_WF, p_WF[None]])
         self.p_WF_first = np.concatenate([self.p_WF_first, p_WF_first[None]])
@@ -239,22 +239,29 @@ class FilterState:
     def update(self, H: Float, residual: Float, columns: slice, R: float | Float) -> None:
         """Kalman update with ``residual`` (m,) = ``H`` (m, k) @ error[columns] + noise of variance ``R``.
 
-        ``R`` is one variance for all rows or (m,) variances. In square-root form, P -= W^T W with W = L^-1 H P and
-        S = L L^T, which keeps the covariance symmetric; raises :class:`DivergedError` where S is not positive.
+        ``R`` is one variance for all rows or (m,) variances. Raises :class:`DivergedError` where the innovation's
+        covariance is not positive.
         """
         HP = H @ self.cov[columns]
         S = HP[:, columns] @ H.T
         S[np.diag_indices(len(S))] += R
-        L, bad = dpotrf(S, lower=1, clean=1)
-        if bad or not np.isfinite(residual).all():
-            raise DivergedError("the innovation covariance is not positive definite")
-        W, _ = dtrtrs(L, np.column_stack([HP, residual]), lower=1)
-        dx = W[:, :-1].T @ W[:, -1]
-        W = W[:, :-1]
-        self.cov -= W.T @ W
-        self.cov += self.cov.T
-        self.cov *= 0.5
-        self._correct(dx)
+        self.update_by(HP, S, residual)
+
+    def innovation(self, clone: int, blocks: Float, variance: float) -> tuple[Float, Float]:
+        """H P (2 M, n) and S (2 M, 2 M) of the landmarks, each seen from ``clone``.
+
+        ``blocks`` (M, 2, 25) are their Jacobians over [calibration 16, clone 6, landmark 3].
+        """
+        calibrated = self.calibrated.stop - IMU
+        at = self.calibrated.stop + 6 * clone
+        return landmark_innovation(self.cov, blocks, IMU, calibrated, at, self.landmarks_begin, variance)
+
+    def update_by(self, HP: Float, S: Float, residual: Float) -> None:
+        """The same by ``HP`` (m, n), the Jacobian times the covariance, and the innovation's covariance ``S`` (m, m).
+
+        Both are used up.
+        """
+        self._correct(reduce(self.cov, HP, S, residual))
 
     def update_joseph(self, H: Float, residual: Float, variances: Float) -> None:
         """The same for measurements of the body alone, ``H`` (m, 15): by filterpy, in Joseph's form.
@@ -269,12 +276,12 @@ class FilterState:
         self._correct(kalman.x[:, 0])
 
     def _correct(self, dx: Float) -> None:
-        self.R_WB = self.R_WB @ so3.exp(dx[DTHETA])
+        self.R_WB = self.R_WB @ kernels.exp(dx[DTHETA])
         self.p_WB = self.p_WB + dx[DP]
         self.v_WB = self.v_WB + dx[DV]
         self.bias_gyro_B = self.bias_gyro_B + dx[DBG]
         self.bias_accel_B = self.bias_accel_B + dx[DBA]
-        self.R_BC = self.R_BC @ so3.exp(dx[15:18])
+        self.R_BC = self.R_BC @ kernels.exp(dx[15:18])
         self.p_BC = self.p_BC + dx[18:21]
         self.offset_s += float(dx[21])
         self.intrinsics = self.intrinsics + dx[INTRINSICS]
@@ -288,7 +295,7 @@ class FilterState:
     def _delete(self, index: NDArray[np.intp]) -> None:
         keep = np.ones(len(self.cov), dtype=bool)
         keep[index] = False
-        self.cov = self.cov[np.ix_(keep, keep)]
+        self.cov = only(self.cov, np.flatnonzero(keep))
 
 
 def compress(H: Float, residual: Float) -> tuple[Float, Float]:
@@ -302,16 +309,3 @@ def compress(H: Float, residual: Float) -> tuple[Float, Float]:
     packed, *_ = dgeqrf(np.asfortranarray(np.column_stack([H, residual])), overwrite_a=1)
     R = np.triu(packed[:columns])
     return R[:, :columns], R[:, columns]
-
-
-def _insert(P: Float, at: int, cross: Float, block: Float) -> Float:
-    """``P`` (n, n) with rows and columns ``cross`` (k, n) and ``block`` (k, k) inserted before index ``at``."""
-    n, k = len(P), len(block)
-    old = np.r_[0:at, at + k : n + k]
-    new = np.arange(at, at + k)
-    out = np.empty((n + k, n + k))
-    out[np.ix_(old, old)] = P
-    out[np.ix_(new, old)] = cross
-    out[np.ix_(old, new)] = cross.T
-    out[np.ix_(new, new)] = 0.5 * (block + block.T)
-    return out

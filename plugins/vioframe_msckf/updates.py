@@ -10,10 +10,11 @@ from numpy.typing import NDArray
 from vioframe.estimation.factors.tracks import TrackTable
 from vioframe.estimation.standstill import Standstill
 from vioframe.types import Float, FrameTracks, ImuNoise, ImuSegment, Int
+from vioframe_msckf.covariance import distances
 from vioframe_msckf.measurement import (
     ACCEPTED,
     Window,
-    landmark_rows,
+    landmark_blocks,
     mahalanobis,
     msckf_rows,
     reduce_landmark,
@@ -99,17 +100,13 @@ def update_from_landmarks(state: FilterState, tracks: FrameTracks, options: Msck
     state.slide_landmarks(options.landmark_drift_px)
     order = np.argsort(tracks.ids)
     xy = tracks.xy[order[np.searchsorted(tracks.ids, state.landmark_ids, sorter=order)]]
-    H, residual = landmark_rows(state, len(state.clones) - 1, xy, options.first_estimate_jacobians)
-
-    variance = options.pixel_sigma**2
-    pairs = H.reshape(-1, 2, H.shape[1])
-    S = pairs @ state.cov @ pairs.transpose(0, 2, 1) + variance * np.eye(2)
-    r = residual.reshape(-1, 2)
-    distance = np.einsum("ni,ni->n", r, np.linalg.solve(S, r[..., None])[..., 0])
-    accepted = distance < gate[2]
+    newest = len(state.clones) - 1
+    blocks, residual = landmark_blocks(state, newest, xy, options.first_estimate_jacobians)
+    HP, S = state.innovation(newest, blocks, options.pixel_sigma**2)
+    accepted = distances(S, residual) < gate[2]
     if accepted.any():
         use = np.repeat(accepted, 2)
-        state.update(H[use], residual[use], slice(0, len(state.cov)), variance)
+        state.update_by(HP[use], S[np.ix_(use, use)], residual[use])
     state.keep_landmarks(accepted)
     return int(accepted.sum())
 

@@ -3,20 +3,15 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from vioframe.frontend.lucas_kanade import Pyramid, search
 from vioframe.frontend.options import Equalisation
 from vioframe.geometry import so3
 from vioframe.geometry.cameras import Camera
 from vioframe.geometry.two_view import Mask, rays
 from vioframe.types import Float, Image, ImuSegment
 
-Pixels = NDArray[np.float32]
-
-_ITERATIONS = 30
-_EPSILON_PX = 0.01
-# Smallest eigenvalue of a patch's gradient matrix, per pixel, below which it cannot be followed.
-_MIN_EIGENVALUE = 1e-4
+_LEVELS_BACK = 1
 
 
 def equalise(image: Image, method: Equalisation) -> Image:
@@ -53,34 +48,15 @@ def predict(camera: Camera, xy: Float, xy_normalised: Float, R_C2C1: Float) -> F
     return guess
 
 
-def follow(
-    before: Image, after: Image, xy: Float, guess: Float, *, window_px: int, levels: int, tolerance_px: float
-) -> tuple[Float, Mask]:
-    """Pyramidal Lucas-Kanade from ``before`` to ``after``, checked by the way back.
+def follow(before: Pyramid, after: Pyramid, xy: Float, guess: Float, tolerance_px: float) -> tuple[Float, Mask]:
+    """Lucas-Kanade from ``before`` to ``after``, checked by the way back.
 
     ``xy`` (N, 2) px in ``before``, ``guess`` (N, 2) px in ``after``. Returns (N, 2) px in ``after`` and (N,) whether
-    the point was found and returned to within ``tolerance_px``. The way back starts as far from its answer as the way
-    forth did, so that it is a test.
+    the point was found and returned to within ``tolerance_px``. The way back starts at its answer, in images half as
+    fine: a patch that is another one does not stay there.
     """
-    import cv2
-
-    def search(image_1: Image, image_2: Image, start: Pixels, first: Pixels) -> tuple[Pixels, Mask]:
-        # The Python binding takes images, not pyramids built before; building one costs 0.2 ms.
-        found, status, _ = cv2.calcOpticalFlowPyrLK(
-            image_1,
-            image_2,
-            start,
-            first.copy(),
-            winSize=(window_px, window_px),
-            maxLevel=levels,
-            criteria=(cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, _ITERATIONS, _EPSILON_PX),
-            flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
-            minEigThreshold=_MIN_EIGENVALUE,
-        )
-        return np.asarray(found, np.float32), np.ravel(status) == 1
-
     start, first = xy.astype(np.float32), guess.astype(np.float32)
     found, forth = search(before, after, start, first)
-    returned, back = search(after, before, found, np.asarray(found + (start - first), np.float32))
+    returned, back = search(after, before, found, start, levels=_LEVELS_BACK)
     ok: Mask = forth & back & (np.linalg.norm(returned - start, axis=1) < tolerance_px)
     return found.astype(np.float64), ok

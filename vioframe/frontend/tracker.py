@@ -7,6 +7,7 @@ import numpy as np
 from vioframe.errors import DatasetError
 from vioframe.frontend.candidates import CandidateSource
 from vioframe.frontend.flow import camera_rotation, equalise, follow, predict
+from vioframe.frontend.lucas_kanade import Pyramid
 from vioframe.frontend.options import FrontendOptions
 from vioframe.frontend.refill import spread, thin
 from vioframe.geometry import so3, two_view
@@ -47,6 +48,7 @@ class Frontend:
         self._options = options
         self._incidents = incidents
         self._image: Image | None = None
+        self._pyramid: Pyramid | None = None
         self._next_id = 0
         self._ids: Int = np.empty(0, np.int64)
         self._xy: Float = np.empty((0, 2))
@@ -75,7 +77,9 @@ class Frontend:
             (on_body,) = calibration.cameras
             R_C2C1 = camera_rotation(imu, on_body.R_BC) if on_body.rotation_known else None
             self._watch_for_frozen(image, R_C2C1, frames.t_ns)
-            xy_normalised_before = self._follow(image, R_C2C1)
+            pyramid = Pyramid.of(image, self._options.klt_levels, self._options.klt_window_px)
+            xy_normalised_before = self._follow(pyramid, R_C2C1)
+            self._pyramid = pyramid
             watch.lap("klt")
             self._reject(xy_normalised_before, R_C2C1)
             watch.lap("reject")
@@ -110,22 +114,13 @@ class Frontend:
         if turned_px > _FROZEN_PX and np.array_equal(image, self._image):
             self._incidents.add("frozen_image", t_ns)
 
-    def _follow(self, image: Image, R_C2C1: Float | None) -> Float:
-        """Move all tracks into ``image``, dropping the lost; returns (N, 2) where the others were, normalised."""
+    def _follow(self, pyramid: Pyramid, R_C2C1: Float | None) -> Float:
+        """Move all tracks to ``pyramid``, dropping the lost; returns (N, 2) where the others were, normalised."""
         before = self._xy_normalised
-        if self._image is None or not len(self._ids):
+        if self._pyramid is None or not len(self._ids):
             return before
-        options = self._options
         guess = self._xy if R_C2C1 is None else predict(self._camera, self._xy, before, R_C2C1)
-        xy, found = follow(
-            self._image,
-            image,
-            self._xy,
-            guess,
-            window_px=options.klt_window_px,
-            levels=options.klt_levels,
-            tolerance_px=_FORWARD_BACKWARD_PX,
-        )
+        xy, found = follow(self._pyramid, pyramid, self._xy, guess, _FORWARD_BACKWARD_PX)
         found &= self._camera.contains(xy, _BORDER_PX)
         self._xy = xy
         self._xy_normalised = self._camera.undistort(xy)

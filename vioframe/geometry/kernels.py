@@ -74,6 +74,15 @@ def exp(phi: Float) -> Float:
 
 
 @kernel
+def turned_by(R: Float, phi: Float) -> Float:
+    """R_k Exp(phi_k) of (N, 3, 3) and (N, 3) rad."""
+    out = np.empty((len(R), 3, 3))
+    for k in range(len(R)):
+        out[k] = product(R[k], exp(phi[k]))
+    return out
+
+
+@kernel
 def log(R: Float) -> Float:
     """(3, 3) rotation -> (3,) rad with norm <= pi, exact near pi: of the quaternion the largest component divides."""
     trace = R[0, 0] + R[1, 1] + R[2, 2]
