@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vioframe.geometry.kernels import cross, distort, exp, hat, intrinsics_jacobian, undistort
+from vioframe.geometry.kernels import cross, distort, exp, hat, intrinsics_jacobian, product, turned, undistort
 from vioframe.geometry.triangulation import triangulate
 from vioframe.jit import kernel
 from vioframe.types import Float
@@ -68,37 +68,39 @@ def _camera_at_row(w, c, y):
         return w.R_BC, w.p_BC
     late_s = w.readout_s * _row(w, y)
     turn = exp(late_s * w.rate_B[c])
-    return turn @ w.R_BC, turn @ w.p_BC + late_s * w.velocity_B[c]
+    return product(turn, w.R_BC), turned(turn, w.p_BC) + late_s * w.velocity_B[c]
 
 
 @kernel
 def _observe(w, c, p_WF, p_WF_first, xy, block, residual):
     """One observation: ``block`` (2, 25) over [calibration 16, clone 6, landmark 3] and ``residual`` (2,)."""
     R_rowC, p_rowC = _camera_at_row(w, c, xy[1])
-    p_C = R_rowC.T @ (w.R_WB[c].T @ (p_WF - w.p_WB[c]) - p_rowC)
+    p_C = turned(R_rowC.T, turned(w.R_WB[c].T, p_WF - w.p_WB[c]) - p_rowC)
     drawn, _ = distort(w.camera_model, w.intrinsics, p_C[0] / p_C[2], p_C[1] / p_C[2])
     residual[0], residual[1] = xy[0] - drawn[0], xy[1] - drawn[1]
 
     R_first = w.R_WB_first[c]
-    p_B = R_first.T @ (p_WF_first - w.p_WB_first[c])
-    p_C = R_rowC.T @ (p_B - p_rowC)
+    p_B = turned(R_first.T, p_WF_first - w.p_WB_first[c])
+    p_C = turned(R_rowC.T, p_B - p_rowC)
     x, y = p_C[0] / p_C[2], p_C[1] / p_C[2]
     _, D = distort(w.camera_model, w.intrinsics, x, y)
     J = np.empty((2, 3))
     for i in range(2):
         J[i, 0], J[i, 1] = D[i, 0] / p_C[2], D[i, 1] / p_C[2]
         J[i, 2] = -(D[i, 0] * x + D[i, 1] * y) / p_C[2]
-    J_B = J @ R_rowC.T
-    J_W = J_B @ R_first.T
-    J_row = J_B if w.readout_s == 0.0 else J @ w.R_BC.T  # by the point as seen from the body at the time of the row
-    block[:, 0:3] = J @ hat(p_C)
+    J_B = product(J, R_rowC.T)
+    J_W = product(J_B, R_first.T)
+    J_row = (
+        J_B if w.readout_s == 0.0 else product(J, w.R_BC.T)
+    )  # by the point as seen from the body at the time of the row
+    block[:, 0:3] = product(J, hat(p_C))
     block[:, 3:6] = -J_row
     block[:, 6] = 0.0  # the time offset acts through the clone
     block[:, 7:15] = intrinsics_jacobian(w.camera_model, w.intrinsics, x, y)
     if w.calibrated > 15:
-        p_row = w.R_BC @ p_C + w.p_BC
-        block[:, 15] = -_row(w, xy[1]) * (J_row @ cross(w.rate_B[c], p_row) + J_B @ w.velocity_B[c])
-    block[:, 16:19] = J_B @ hat(p_B)
+        p_row = turned(w.R_BC, p_C) + w.p_BC
+        block[:, 15] = -_row(w, xy[1]) * (turned(J_row, cross(w.rate_B[c], p_row)) + turned(J_B, w.velocity_B[c]))
+    block[:, 16:19] = product(J_B, hat(p_B))
     block[:, 19:22] = -J_W
     block[:, 22:25] = J_W
 
@@ -126,8 +128,8 @@ def track_rows(w, xy, xy_normalised, seen, pixel_sigma):
     for i in range(m):
         c = clones[i]
         R_rowC, p_rowC = _camera_at_row(w, c, xy[c, 1])
-        R_WC[i] = w.R_WB[c] @ R_rowC
-        p_WC[i] = w.R_WB[c] @ p_rowC + w.p_WB[c]
+        R_WC[i] = product(w.R_WB[c], R_rowC)
+        p_WC[i] = turned(w.R_WB[c], p_rowC) + w.p_WB[c]
         points[i, 0], points[i, 1] = undistort(
             w.camera_model, w.intrinsics, xy[c, 0], xy[c, 1], xy_normalised[c, 0], xy_normalised[c, 1]
         )

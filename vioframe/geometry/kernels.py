@@ -39,19 +39,19 @@ def cross(a: Float, b: Float) -> Float:
 
 @kernel
 def product(A: Float, B: Float) -> Float:
-    """(3, 3) x (3, 3) -> (3, 3), without the detour over BLAS that ``@`` makes."""
-    out = np.empty((3, 3))
-    for i in range(3):
-        for j in range(3):
+    """(m, 3) x (3, n) -> (m, n), without the detour over BLAS that ``@`` makes."""
+    out = np.empty((A.shape[0], B.shape[1]))
+    for i in range(A.shape[0]):
+        for j in range(B.shape[1]):
             out[i, j] = A[i, 0] * B[0, j] + A[i, 1] * B[1, j] + A[i, 2] * B[2, j]
     return out
 
 
 @kernel
 def turned(R: Float, v: Float) -> Float:
-    """(3, 3) x (3,) -> (3,)."""
-    out = np.empty(3)
-    for i in range(3):
+    """(m, 3) x (3,) -> (m,)."""
+    out = np.empty(R.shape[0])
+    for i in range(R.shape[0]):
         out[i] = R[i, 0] * v[0] + R[i, 1] * v[1] + R[i, 2] * v[2]
     return out
 

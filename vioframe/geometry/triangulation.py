@@ -5,6 +5,7 @@ import math
 import numpy as np
 
 from vioframe.arrays import Float
+from vioframe.geometry.kernels import product, turned
 from vioframe.jit import kernel
 
 MIN_DEPTH_M, MAX_DEPTH_M = 0.1, 60.0
@@ -24,7 +25,7 @@ def triangulate(R_WC: Float, p_WC: Float, xy: Float, sigma: float) -> tuple[bool
     b = np.zeros(3)
     rays = np.empty((m, 3))
     for i in range(m):
-        ray = R_WC[i] @ np.array([xy[i, 0], xy[i, 1], 1.0])
+        ray = xy[i, 0] * R_WC[i, :, 0] + xy[i, 1] * R_WC[i, :, 1] + R_WC[i, :, 2]
         ray /= math.sqrt(ray[0] * ray[0] + ray[1] * ray[1] + ray[2] * ray[2])
         rays[i] = ray
         along = ray[0] * p_WC[i, 0] + ray[1] * p_WC[i, 1] + ray[2] * p_WC[i, 2]
@@ -39,7 +40,7 @@ def triangulate(R_WC: Float, p_WC: Float, xy: Float, sigma: float) -> tuple[bool
         return False, p
     p = np.asarray(np.linalg.solve(A, b), np.float64)
 
-    first = R_WC[0].T @ (p - p_WC[0])
+    first = turned(R_WC[0].T, p - p_WC[0])
     if first[2] < MIN_DEPTH_M or first[2] > MAX_DEPTH_M:
         return False, p
     theta = np.array([first[0] / first[2], first[1] / first[2], 1.0 / first[2]])
@@ -48,8 +49,8 @@ def triangulate(R_WC: Float, p_WC: Float, xy: Float, sigma: float) -> tuple[bool
     R = np.empty((m, 3, 3))
     t = np.empty((m, 3))
     for i in range(m):
-        R[i] = R_WC[i].T @ R_WC[0]
-        t[i] = R_WC[i].T @ (p_WC[0] - p_WC[i])
+        R[i] = product(R_WC[i].T, R_WC[0])
+        t[i] = turned(R_WC[i].T, p_WC[0] - p_WC[i])
     damping = 1e-3
     cost, N, g = _normal_equations(R, t, xy, theta)
     if cost == np.inf:  # behind one of the cameras: nothing to start from
@@ -78,7 +79,7 @@ def triangulate(R_WC: Float, p_WC: Float, xy: Float, sigma: float) -> tuple[bool
             return False, p
     if theta[2] < sigma * math.sqrt(np.linalg.inv(N)[2, 2]):
         return False, p
-    return True, R_WC[0] @ first + p_WC[0]
+    return True, turned(R_WC[0], first) + p_WC[0]
 
 
 @kernel
@@ -90,7 +91,7 @@ def _normal_equations(R: Float, t: Float, xy: Float, theta: Float) -> tuple[floa
     J = np.empty((2, 3))
     for i in range(len(xy)):
         # rho * p_Ci, so that the projection needs no division by the inverse depth.
-        q = R[i] @ np.array([theta[0], theta[1], 1.0]) + theta[2] * t[i]
+        q = theta[0] * R[i, :, 0] + theta[1] * R[i, :, 1] + R[i, :, 2] + theta[2] * t[i]
         if q[2] < 1e-6:
             return np.inf, N, g
         x, y = q[0] / q[2], q[1] / q[2]
