@@ -6,11 +6,13 @@ from functools import partial
 import cv2
 import numpy as np
 import pytest
+from image_helpers import textured
 
 from vioframe.errors import ConfigError, PluginError
 from vioframe.parts import registry
 from vioframe_akaze import Akaze
 from vioframe_brisk import Brisk
+from vioframe_shi_tomasi import ShiTomasi
 from vioframe_surf import Surf
 from vioframe_surf.descriptors import describe
 
@@ -132,3 +134,18 @@ def test_surf_says_what_to_install(monkeypatch):
 def test_an_option_out_of_range_is_refused(name, key, value):
     with pytest.raises(ConfigError, match=rf"detector '{name}': {key}='{value}': Input should be greater than"):
         registry.load().create_detector(name, {key: value})
+
+
+def test_shi_tomasi_finds_the_corners_that_opencv_does():
+    image = textured(seed=5, size=(752, 480))
+    for count in (100, 10**6):
+        theirs, quality = cv2.goodFeaturesToTrackWithQuality(image, count, 0.01, 10.0, None, blockSize=3)
+        ours = ShiTomasi().detect(image, count)
+        theirs = {(x, y): q for (x, y), q in zip(theirs[:, 0], quality.ravel(), strict=True)}
+        score = dict(zip(map(tuple, ours.xy), ours.score, strict=True))
+        both = theirs.keys() & score.keys()
+        assert abs(len(score) - len(theirs)) <= 0.02 * len(theirs)
+        # What differs is near the edge, where gradients are those of reflections.
+        assert len(both) > 0.95 * len(theirs)
+        np.testing.assert_allclose([score[k] for k in both], [theirs[k] for k in both], rtol=1e-4)
+        assert (np.diff(ours.score) <= 0.0).all()

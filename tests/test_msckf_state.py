@@ -8,6 +8,7 @@ from msckf_helpers import CALIBRATION, random_covariance, random_state
 from vioframe.errors import DivergedError
 from vioframe.geometry import so3
 from vioframe.types import DBA, DBG, DP, DTHETA, DV, NS_PER_S, Float, ImuNoise, ImuSegment
+from vioframe_msckf import covariance
 from vioframe_msckf.state import IMU, OFFSET, FilterState, compress
 
 NOISE = ImuNoise(gyro_density=2e-3, accel_density=2e-2, gyro_walk=2e-3, accel_walk=3e-2, rate_hz=200.0)
@@ -252,3 +253,39 @@ def test_a_copy_of_the_body_is_its_own():
     nav.p_WB[:] = 0.0
     assert np.linalg.norm(state.cov[:IMU, :IMU]) > 0.0
     assert np.linalg.norm(state.p_WB) > 0.0
+
+
+class TestCovariance:
+    """The algebra by structure against the same written out."""
+
+    def test_inserting_and_leaving_out_are_inverse(self):
+        rng = np.random.default_rng(0)
+        P, cross, block = random_covariance(rng, 40), rng.normal(size=(6, 40)), random_covariance(rng, 6)
+        for at in (0, 21, 40):
+            out = covariance.inserted(P, at, cross, block)
+            new, old = np.arange(at, at + 6), np.delete(np.arange(46), np.s_[at : at + 6])
+            np.testing.assert_array_equal(out[np.ix_(old, old)], P)
+            np.testing.assert_array_equal(out[np.ix_(new, old)], cross)
+            np.testing.assert_array_equal(out, out.T)
+            np.testing.assert_allclose(out[np.ix_(new, new)], block)
+            np.testing.assert_array_equal(covariance.only(out, old), P)
+
+    @pytest.mark.parametrize("calibrated", [15, 16])
+    def test_landmarks_innovation_is_that_of_their_dense_rows(self, calibrated: int):
+        rng = np.random.default_rng(1)
+        n, clone, landmarks = 15 + calibrated + 18 + 15, 15 + calibrated + 6, 15 + calibrated + 18
+        P, blocks = random_covariance(rng, n), rng.normal(size=(5, 2, 25))
+        H = np.zeros((10, n))
+        for i, block in enumerate(blocks):
+            rows = slice(2 * i, 2 * i + 2)
+            H[rows, 15 : 15 + calibrated] = block[:, :calibrated]
+            H[rows, clone : clone + 6] = block[:, 16:22]
+            H[rows, landmarks + 3 * i : landmarks + 3 * i + 3] = block[:, 22:]
+        HP, S = covariance.landmark_innovation(P, blocks, 15, calibrated, clone, landmarks, 0.3)
+        np.testing.assert_allclose(HP, H @ P, atol=1e-12)
+        np.testing.assert_allclose(S, H @ P @ H.T + 0.3 * np.eye(10), atol=1e-11)
+        residual = rng.normal(size=10)
+        expected = [
+            residual[k : k + 2] @ np.linalg.solve(S[k : k + 2, k : k + 2], residual[k : k + 2]) for k in range(0, 10, 2)
+        ]
+        np.testing.assert_allclose(covariance.distances(S, residual), expected)

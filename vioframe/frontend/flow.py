@@ -11,7 +11,8 @@ from vioframe.geometry.cameras import Camera
 from vioframe.geometry.two_view import Mask, rays
 from vioframe.types import Float, Image, ImuSegment
 
-_LEVELS_BACK = 1
+# Above the full images, on the way back.
+_LEVELS_BACK = 2
 
 
 def equalise(image: Image, method: Equalisation) -> Image:
@@ -52,8 +53,8 @@ def follow(before: Pyramid, after: Pyramid, xy: Float, guess: Float, tolerance_p
     """Lucas-Kanade from ``before`` to ``after``, checked by the way back.
 
     ``xy`` (N, 2) px in ``before``, ``guess`` (N, 2) px in ``after``. Returns (N, 2) px in ``after`` and (N,) whether
-    the point was found and returned to within ``tolerance_px``. The way back starts at its answer, in images half as
-    fine: a patch that is another one does not stay there.
+    the point was found and returned to within ``tolerance_px``. The way back starts at its answer, in images a
+    quarter as fine: a patch that is another one does not stay there.
     """
     start, first = xy.astype(np.float32), guess.astype(np.float32)
     found, forth = search(before, after, start, first)
