@@ -21,7 +21,7 @@ from rendered_flight import CALIBRATION, RenderedFlight, rendered_flight
 
 from vioframe import pipeline
 from vioframe.cli import main
-from vioframe.errors import ConfigError, DatasetError
+from vioframe.errors import ConfigError, DatasetError, PluginError
 from vioframe.estimation.lifecycle import LifeCycle
 from vioframe.geometry import so3
 from vioframe.incidents import Incidents
@@ -35,11 +35,14 @@ from vioframe.runs.recorder import CALIBRATION_COLUMNS, Recorder
 from vioframe.simulation import TrackOptions, simulated_stream
 from vioframe.types import (
     NS_PER_S,
+    Calibration,
     Estimate,
     FrameSet,
     FrameTracks,
     Image,
     ImuSample,
+    ImuSegment,
+    Keypoints,
     Measurement,
     Status,
     Step,
@@ -131,6 +134,74 @@ def test_pieces_of_any_size_give_the_bytes_of_the_recording(backend):
     expected = all_bytes(played)
     for seed in range(2):
         assert all_bytes(pushed(odometry(), short_flight(), np.random.default_rng(seed))) == expected
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_two_threads_give_the_bytes_of_one(backend: str):
+    """At the start, in flight, and where it is lost and begins anew with another calibration."""
+    measurements = short_flight()
+    frames = [m.t_ns for m in measurements if isinstance(m, FrameSet)]
+
+    def flown(pipelined: bool) -> list[Step]:
+        odometry = Odometry(CALIBRATION, "shi_tomasi", backend, installed=INSTALLED)
+        steps = []
+        for step in odometry.follow(measurements, pipelined=pipelined):
+            steps.append(step)
+            if step.frames.t_ns == frames[len(frames) * 2 // 3]:
+                lose(odometry)
+        return steps
+
+    def lose(odometry: Odometry) -> None:
+        """The next frame finds the camera to be another one, and begins anew."""
+        life, process = odometry._life, odometry._life.process
+
+        def lost(imu: ImuSegment, tracks: FrameTracks) -> Estimate:
+            life.process = process
+            process(imu, tracks)
+            (camera,) = life.calibration.cameras
+            initializer = life._initializer
+            initializer._calibration = life.calibration.with_camera(
+                0, model=camera.model.zoomed(1.01), time_offset_ns=camera.time_offset_ns + 3_000_000
+            )
+            life._following = False
+            initializer.reset()
+            return Estimate(Status.LOST, events=("lost",))
+
+        life.process = lost
+
+    alone, two = flown(False), flown(True)
+    assert all_bytes(alone) == all_bytes(two)
+    assert tracked(alone) > 10
+    assert sum(step.estimate.status is Status.LOST for step in alone) == 1
+
+
+def test_with_two_threads_the_next_frame_is_seen_before_the_last_is_estimated():
+    odometry = Odometry(CALIBRATION, "shi_tomasi", "msckf", installed=INSTALLED)
+    seen, most = [], 0
+    track = odometry._frontend.track
+
+    def counted(imu: ImuSegment, frames: FrameSet, calibration: Calibration) -> FrameTracks:
+        seen.append(frames.t_ns)
+        return track(imu, frames, calibration)
+
+    odometry._frontend.track = counted
+    for k, step in enumerate(odometry.follow(short_flight(), pipelined=True)):
+        if step.estimate.status is Status.INITIALISING:
+            assert len(seen) == k + 1
+        most = max(most, len(seen) - k)
+    assert most >= 2
+    assert len(seen) == k + 1
+
+
+def test_a_detector_that_fails_in_its_thread_is_named():
+    class Never:
+        def detect(self, image: Image, max_points: int) -> Keypoints:
+            raise ValueError("no")
+
+    odometry = Odometry(CALIBRATION, Never(), "msckf", installed=INSTALLED)
+    odometry._tracking = True
+    with pytest.raises(PluginError, match="Never failed on each"):
+        list(odometry.follow(short_flight(), pipelined=True))
 
 
 def test_a_recording_from_files_is_the_same_pushed(shared_data):

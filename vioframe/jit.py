@@ -28,28 +28,33 @@ _PACKAGE = Path(__file__).parent
 @overload
 def kernel(function: FunctionT) -> FunctionT: ...
 @overload
-def kernel(*, reorder_sums: bool) -> Callable[[FunctionT], FunctionT]: ...
+def kernel(*, reorder_sums: bool = False, inlined: bool = False) -> Callable[[FunctionT], FunctionT]: ...
 def kernel(
-    function: FunctionT | None = None, *, reorder_sums: bool = False
+    function: FunctionT | None = None, *, reorder_sums: bool = False, inlined: bool = False
 ) -> FunctionT | Callable[[FunctionT], FunctionT]:
     """Compile ``function`` in nopython mode at its first call, or load it from the cache.
 
     It divides as numpy does: by zero is no error. Loops with divisions can be vectorised then; those that sum, where
-    it may ``reorder_sums``, which lets their last digits depend on the processor. Threads run beside it.
+    it may ``reorder_sums``, which lets their last digits depend on the processor. What it calls must be ``inlined``
+    then: others are compiled alone and again with their caller, and either may be run. Threads run beside it.
     """
     if function is None:
-        return partial(_compiled, reorder_sums=reorder_sums)
-    return _compiled(function, reorder_sums)
+        return partial(_compiled, reorder_sums=reorder_sums, inlined=inlined)
+    return _compiled(function, reorder_sums, inlined)
 
 
-def _compiled(function: FunctionT, reorder_sums: bool) -> FunctionT:
+def _compiled(function: FunctionT, reorder_sums: bool, inlined: bool) -> FunctionT:
     source = Path(function.__code__.co_filename)
     in_package = (source.parent / "__init__.py").exists()
     settings: Any = numba.config
     before = settings.CACHE_DIR
     settings.CACHE_DIR = str(_folder(before) / _fingerprint(source.parent if in_package else source))
     compiled = numba.njit(
-        cache=True, error_model="numpy", nogil=True, fastmath={"reassoc", "nsz"} if reorder_sums else False
+        cache=True,
+        error_model="numpy",
+        nogil=True,
+        fastmath={"reassoc", "nsz"} if reorder_sums else False,
+        inline="always" if inlined else "never",
     )
     try:
         return cast(FunctionT, compiled(function))

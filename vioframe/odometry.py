@@ -10,7 +10,9 @@ gives.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
+from dataclasses import dataclass
 from functools import cache
 from time import perf_counter
 from typing import Any
@@ -24,11 +26,12 @@ from vioframe.estimation.options import EstimationOptions
 from vioframe.frontend import Frontend, FrontendOptions
 from vioframe.incidents import Incidents
 from vioframe.interfaces import Backend, Detector
-from vioframe.io.synchronise import Synchroniser
+from vioframe.io.synchronise import Packet, Synchroniser
 from vioframe.parts import registry
 from vioframe.parts.registry import Registry
 from vioframe.types import (
     Calibration,
+    CameraOnBody,
     FrameSet,
     FrameTracks,
     Image,
@@ -36,11 +39,22 @@ from vioframe.types import (
     ImuSegment,
     Measurement,
     NavState,
+    Status,
     Step,
 )
 
 # More threads than this gain nothing on images of this size, and cost on machines that have many.
 _MAX_OPENCV_THREADS = 4
+
+
+@dataclass(frozen=True, slots=True)
+class _Seen:
+    """A frame's points, and the seconds that they took by stage."""
+
+    imu: ImuSegment
+    frames: FrameSet
+    tracks: FrameTracks
+    stage_seconds: Mapping[str, float]
 
 
 class Odometry:
@@ -89,6 +103,9 @@ class Odometry:
         self._given = camera.model
         self.calibration = calibration
         """What is known of the rig by now: as given at first, then as the back-end has learned it."""
+        self._tracking = False
+        self._due: tuple[CameraOnBody, Calibration] = camera, calibration
+        self._seen_with = calibration
 
     def add(self, measurement: Measurement) -> list[Step]:
         """Take one measurement; the steps of the frames that are complete by it."""
@@ -127,35 +144,95 @@ class Odometry:
         """The steps of the frames that still wait for readings: nothing more will come."""
         return [self._step(imu, frames) for imu, frames in self._synchroniser.finish()]
 
-    def follow(self, measurements: Iterable[Measurement]) -> Iterator[Step]:
-        """The steps of a whole stream, to its end."""
+    def follow(self, measurements: Iterable[Measurement], *, pipelined: bool = False) -> Iterator[Step]:
+        """The steps of a whole stream, to its end.
+
+        ``pipelined``, a frame's points are followed in a thread of their own while the one before it is estimated from:
+        the same bytes, sooner where there are two cores.
+        """
+        if pipelined:
+            yield from self._follow_ahead(self._packets(measurements))
+        else:
+            for imu, frames in self._packets(measurements):
+                yield self._step(imu, frames)
+
+    def _packets(self, measurements: Iterable[Measurement]) -> Iterator[Packet]:
         for measurement in measurements:
-            yield from self.add(measurement)
-        yield from self.finish()
+            yield from self._synchroniser.add(measurement)
+        yield from self._synchroniser.finish()
+
+    def _follow_ahead(self, packets: Iterable[Packet]) -> Iterator[Step]:
+        """Each step when the points of the next frame are already being followed.
+
+        Only in flight: at a start the next frame depends on what was found.
+        """
+        with limited_threads(), ThreadPoolExecutor(1, "frontend") as thread:
+            ahead: Future[_Seen] | None = None
+            for packet in packets:
+                if ahead is None and not self._tracking:
+                    yield self._step(*packet)
+                    continue
+                before = None if ahead is None else ahead.result()
+                self._see_with_due()
+                ahead = thread.submit(self._see, *packet)
+                if before is not None:
+                    yield self._estimate(before)
+                    self._retime()
+                    if not self._tracking:
+                        seen, ahead = ahead.result(), None
+                        self._see_with_due()
+                        yield self._estimate(seen)
+            if ahead is not None:
+                seen = ahead.result()
+                self._see_with_due()
+                yield self._estimate(seen)
 
     def _step(self, imu: ImuSegment, frames: FrameSet) -> Step:
+        self._retime()
+        seen = self._see(imu, frames)
+        self._see_with_due()
+        return self._estimate(seen)
+
+    def _see(self, imu: ImuSegment, frames: FrameSet) -> _Seen:
+        """Follow the points of one frame."""
         with limited_threads(), self._registry.blaming():
             tracks = self._waiting_tracks.pop(frames.t_ns, None)
             # Those before it belong to frames that were dropped.
             self._waiting_tracks = {t_ns: kept for t_ns, kept in self._waiting_tracks.items() if t_ns > frames.t_ns}
-            seconds: Mapping[str, float] = {}
-            model = self._life.calibration.cameras[0].model
-            if tracks is not None and model != self._given:
-                tracks = tracks.undistorted(model)
             if tracks is None:
-                tracks = self._frontend.track(imu, frames, self.calibration)
-                seconds = self._frontend.stage_seconds
+                tracks = self._frontend.track(imu, frames, self._seen_with)
+                return _Seen(imu, frames, tracks, self._frontend.stage_seconds)
+            model = self._life.calibration.cameras[0].model
+            return _Seen(imu, frames, tracks if model == self._given else tracks.undistorted(model), {})
+
+    def _estimate(self, seen: _Seen) -> Step:
+        """Estimate from one frame that was seen."""
+        in_flight = self._tracking
+        with limited_threads(), self._registry.blaming():
             begin = perf_counter()
-            estimate = self._life.process(imu, tracks)
+            estimate = self._life.process(seen.imu, seen.tracks)
             backend_s = perf_counter() - begin
-        # Another time offset or focal length may have been found while starting.
-        found = self._life.calibration.cameras[0]
-        self._synchroniser.retime(found.time_offset_ns)
-        self._frontend.recalibrate(found.model)
+        self._tracking = estimate.status is Status.TRACKING
         if estimate.calibration is not None:
             self.calibration = estimate.calibration.calibration
+        # Another time offset or focal length may have been found while starting.
+        self._due = self._life.calibration.cameras[0], self.calibration
+        if not in_flight:
+            # In flight the next frame may have been cut, and its points followed, by now: then it counts from the one
+            # behind that, with one thread as with two.
+            self._retime()
+            self._see_with_due()
         within = {f"backend.{stage}": seconds for stage, seconds in estimate.stage_seconds.items()}
-        return Step(frames, tracks, estimate, {**seconds, "backend": backend_s, **within})
+        return Step(seen.frames, seen.tracks, estimate, {**seen.stage_seconds, "backend": backend_s, **within})
+
+    def _retime(self) -> None:
+        """Cut frames from now on as the newest estimate has it."""
+        self._synchroniser.retime(self._due[0].time_offset_ns)
+
+    def _see_with_due(self) -> None:
+        """Follow points from now on with the calibration of the newest estimate."""
+        camera, self._seen_with = self._due
+        self._frontend.recalibrate(camera.model)
 
 
 def _own(image: Image) -> Image:

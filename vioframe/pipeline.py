@@ -41,11 +41,12 @@ def run(
     start_s: float = 0.0,
     duration_s: float | None = None,
     listen: Callable[[Measurement], None] = lambda measurement: None,
+    pipelined: bool = False,
 ) -> Iterator[Step]:
     """Push a data set through ``odometry``, yielding one :class:`~vioframe.types.Step` a frame.
 
     ``start_s`` seconds are skipped, counted from the first frame's stamp; ``duration_s`` is how much is then played.
-    ``listen`` hears every measurement ahead of the odometry.
+    ``listen`` hears every measurement ahead of the odometry. ``pipelined`` as in :meth:`Odometry.follow`.
     """
 
     def heard() -> Iterator[Measurement]:
@@ -53,7 +54,7 @@ def run(
             listen(measurement)
             yield measurement
 
-    return odometry.follow(heard())
+    return odometry.follow(heard(), pipelined=pipelined)
 
 
 @dataclass(frozen=True)
@@ -78,8 +79,11 @@ class Experiment:
     def incidents(self) -> Incidents:
         return self.odometry.incidents
 
-    def steps(self) -> Iterator[Step]:
-        """The main loop, the loop closer taking part; what a plug-in raises comes out as an error that names it."""
+    def steps(self, *, pipelined: bool = False) -> Iterator[Step]:
+        """The main loop, the loop closer taking part; what a plug-in raises comes out as an error that names it.
+
+        ``pipelined`` as in :meth:`~vioframe.odometry.Odometry.follow`.
+        """
         # Around all of it, not each frame alone: a loop closer's own thread works between frames.
         with limited_threads(), self.registry.blaming():
             for step in run(
@@ -88,6 +92,7 @@ class Experiment:
                 start_s=self.config.start_s,
                 duration_s=self.config.duration_s,
                 listen=self.gatherer.add,
+                pipelined=pipelined,
             ):
                 if self.loop_closer is None:
                     yield step
@@ -172,15 +177,16 @@ def record(
     overwrite: bool = False,
     on_step: Callable[[Step], None] = lambda step: None,
     explain: bool = False,
+    pipelined: bool = False,
 ) -> dict[str, Any]:
-    """Run ``experiment`` and write ``folder`` as it goes; returns the summary.
+    """Run ``experiment``, perhaps ``pipelined``, and write ``folder`` as it goes; returns the summary.
 
     Nothing is created or replaced before the first frame has gone through; after that the folder is completed
     however the run ends. The summary has the ``findings`` about the recording: those of its stamps and readings, or
     with ``explain`` all that can be found (:meth:`Experiment.look_closely`) where the run never initialised.
     """
     begin_s = perf_counter()
-    steps = experiment.steps()
+    steps = experiment.steps(pipelined=pipelined)
     first = next(steps, None)
     if first is None:
         raise DatasetError(f"{experiment.dataset.name} has no image to process: {_why_none(experiment)}")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from math import inf
 from pathlib import Path
@@ -43,10 +44,16 @@ _MOST_REASONS = 4
 @click.option("--reader", type=PartName("DATASET"), help="Data-set reader, where several accept DATA.")
 @click.option("--start", "start_s", type=float, metavar="S", help="Skip the first S seconds.")
 @click.option("--duration", "duration_s", type=float, metavar="S", help="Stop after S seconds.")
+@click.option(
+    "--threads",
+    type=click.IntRange(1, 2),
+    help="With 2, points are followed while the frame before is estimated from; the results are the same.  "
+    "[default: 2 where there are as many cores]",
+)
 @click.option("--out", type=FILE, help="Run folder.  [default: runs/DATASET_DETECTOR_BACKEND]")
 @click.option("--overwrite", is_flag=True, help="Replace the run that is in --out.")
 @quiet_option
-def run(out: Path | None, overwrite: bool, quiet: bool, **choices: Any) -> None:
+def run(threads: int | None, out: Path | None, overwrite: bool, quiet: bool, **choices: Any) -> None:
     """Estimate the motion along DATA, a bag or an ASL folder, and write a run folder.
 
     The exit code is 1 where it never initialised; `vioframe check DATA` says more about why.
@@ -61,7 +68,14 @@ def run(out: Path | None, overwrite: bool, quiet: bool, **choices: Any) -> None:
     with Bar(None, quiet=quiet, late=True) as bar:
         experiment = prepare(config, installed)
         folder = out or free_run_folder(Path("runs"), experiment.name)
-        summary = record(experiment, folder, overwrite=overwrite, on_step=_watched(bar, experiment), explain=True)
+        summary = record(
+            experiment,
+            folder,
+            overwrite=overwrite,
+            on_step=_watched(bar, experiment),
+            explain=True,
+            pipelined=(threads or os.cpu_count() or 1) > 1,
+        )
     if not quiet:
         if others := experiment.left_aside:
             used = experiment.dataset.calibration.cameras[0].name

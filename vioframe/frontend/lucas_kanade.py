@@ -79,7 +79,7 @@ def _width(window_px: int) -> int:
     return -(-window_px // int(_LANES)) * int(_LANES)
 
 
-@kernel
+@kernel(reorder_sums=True)
 def _search(before: Image, after: Image, border: int, side: int, xy: Pixels, found: Pixels) -> NDArray[np.bool_]:
     """One level: ``found`` (N, 2), on the level above at first, becomes where the patches at ``xy`` are on this one.
 
@@ -127,7 +127,7 @@ def _search(before: Image, after: Image, border: int, side: int, xy: Pixels, fou
     return lost
 
 
-@kernel
+@kernel(inlined=True)
 def _weights(x: float, y: float) -> tuple[np.float32, np.float32, np.float32, np.float32]:
     """Of the four pixels about a place, by what is beyond the full pixel."""
     a, b = x - math.floor(x), y - math.floor(y)
@@ -139,7 +139,7 @@ def _weights(x: float, y: float) -> tuple[np.float32, np.float32, np.float32, np
     )
 
 
-@kernel
+@kernel(inlined=True)
 def _sample(image: Image, x: float, y: float, patch: Pixels) -> None:
     """``patch`` (H, W) becomes the part of ``image`` whose first pixel is at ``x``, ``y``, bilinearly."""
     w00, w01, w10, w11 = _weights(x, y)
@@ -153,7 +153,7 @@ def _sample(image: Image, x: float, y: float, patch: Pixels) -> None:
                 patch[r, c] = w00 * image[at, k] + w01 * image[at, n] + w10 * image[below, k] + w11 * image[below, n]
 
 
-@kernel(reorder_sums=True)
+@kernel(inlined=True)
 def _gradients(
     patch: Pixels, x: int, y: int, width: int, height: int, template: Pixels, by_x: Pixels, by_y: Pixels
 ) -> tuple[float, float, float]:
@@ -185,7 +185,7 @@ def _gradients(
     return float(xx), float(xy), float(yy)
 
 
-@kernel(reorder_sums=True)
+@kernel(inlined=True)
 def _mismatch(image: Image, x: float, y: float, template: Pixels, by_x: Pixels, by_y: Pixels) -> tuple[float, float]:
     """Sums of what the part of ``image`` at ``x``, ``y`` has beyond ``template``, times its gradients."""
     w00, w01, w10, w11 = _weights(x, y)
