@@ -70,6 +70,7 @@ def test_compiled_rotations_agree():
     for phi in [*rng.normal(size=(20, 3)), *(1e-5 * rng.normal(size=(20, 3))), np.zeros(3)]:
         np.testing.assert_allclose(kernels.exp(phi), so3.exp(phi), atol=1e-12)
         np.testing.assert_allclose(kernels.right_jacobian(phi), so3.right_jacobian(phi), atol=1e-9)
+        np.testing.assert_allclose(kernels.right_jacobian_inverse(phi), so3.right_jacobian_inverse(phi), atol=1e-9)
         np.testing.assert_allclose(kernels.hat(phi), so3.hat(phi))
     near_half_a_turn = [(np.pi - d) * axis for d in (0.0, 1e-9, 1e-3) for axis in so3.exp([0.3, -0.2, 0.9])]
     for phi in [*rng.normal(size=(20, 3)), *(1e-9 * rng.normal(size=(5, 3))), np.zeros(3), *near_half_a_turn]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,7 +11,15 @@ from sliding_window_helpers import flown_window, moved, natural, only, standing
 
 from vioframe.bench import run_backend
 from vioframe.estimation.factors.inertial import ImuFactors, StateArrays
-from vioframe.estimation.factors.problem import STATE_SIZE, Prior, Problem, Variables, marginalise_oldest, schur
+from vioframe.estimation.factors.problem import (
+    STATE_SIZE,
+    Prior,
+    Problem,
+    Variables,
+    marginalise_oldest,
+    schur,
+    symmetric,
+)
 from vioframe.simulation import simulated_sequence
 from vioframe.types import DP, DTHETA, DV, Float, NavState
 from vioframe_sliding_window import window as window_module
@@ -90,7 +98,7 @@ def part(problem: Problem, prior: Prior, frames: slice, readings: slice, rows: n
     s = s._replace(seen=s.seen[:, frames], xy=s.xy[:, frames], velocity=s.velocity[:, frames], to_px=s.to_px[:, frames])
     s = s._replace(lens=lens)
     f = problem.readings
-    some = ImuFactors(*(getattr(f, field.name)[readings] for field in fields(f)))
+    some = ImuFactors(*(values[readings] for values in f))
     still = {k - frames.start: still for k, still in problem.still.items() if frames.start <= k < frames.stop}
     return replace(problem, prior=prior, readings=some, sightings=s, still=still)
 
@@ -116,7 +124,7 @@ def solution(problem: Problem, x: Variables) -> tuple[Float, Float, Float]:
     """Step (n,), covariance (n, n) in natural units, and step of the landmarks (L, 3), of the linearised problem."""
     unit, normal = natural(x), problem.linearise(x)
     S, g, eliminated = normal.reduced(0.0)
-    cov = np.linalg.inv(S * np.outer(unit, unit))
+    cov = np.linalg.inv(symmetric(S) * np.outer(unit, unit))
     step = -cov @ (g * unit)
     return step, cov, normal.landmark_step(step * unit, eliminated)
 

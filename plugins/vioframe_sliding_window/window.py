@@ -214,7 +214,7 @@ class Window:
         )
         x = solution.variables
         self._states, self._camera, self.tracks.landmarks[rows] = x.states, x.camera, x.landmarks
-        S, _, _ = problem.linearise(x).reduced(0.0)
+        S, _, _ = solution.normal.reduced(0.0)
         self._cov, self._camera_sigma = self._covariance(S)
         return solution.iterations
 

@@ -123,6 +123,23 @@ def right_jacobian(phi: Float) -> Float:
 
 
 @kernel
+def right_jacobian_inverse(phi: Float) -> Float:
+    """(3,) rad -> (3, 3), J_r^-1 with Log(Exp(phi) Exp(d)) ~ phi + J_r^-1 d."""
+    a2 = phi[0] * phi[0] + phi[1] * phi[1] + phi[2] * phi[2]
+    if a2 < 1e-8:
+        c = 1.0 / 12.0 + a2 / 720.0
+    else:
+        half = 0.5 * math.sqrt(a2)
+        c = (1.0 - half * math.cos(half) / math.sin(half)) / a2
+    x, y, z = phi[0], phi[1], phi[2]
+    J = np.empty((3, 3))
+    J[0, 0], J[0, 1], J[0, 2] = 1.0 - c * (y * y + z * z), c * x * y - 0.5 * z, c * x * z + 0.5 * y
+    J[1, 0], J[1, 1], J[1, 2] = c * x * y + 0.5 * z, 1.0 - c * (x * x + z * z), c * y * z - 0.5 * x
+    J[2, 0], J[2, 1], J[2, 2] = c * x * z - 0.5 * y, c * y * z + 0.5 * x, 1.0 - c * (x * x + y * y)
+    return J
+
+
+@kernel
 def distort(model: int, k: Float, x: float, y: float) -> tuple[Float, Float]:
     """A point on the z = 1 plane -> pixel (2,) and its Jacobian d px / d (x, y) (2, 2)."""
     r2 = x * x + y * y

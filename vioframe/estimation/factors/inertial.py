@@ -7,13 +7,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from vioframe.arrays import Bool
 from vioframe.estimation.inertial.preintegration import Preintegrated
-from vioframe.geometry import so3
-from vioframe.types import DBA, DBG, DP, DTHETA, DV, Float, Int, NavState, g_W
+from vioframe.geometry.kernels import exp, log, product, right_jacobian, right_jacobian_inverse, turned
+from vioframe.jit import kernel
+from vioframe.types import Float, Int, NavState, g_W
+
+States = tuple[Float, Float, Float, Float, Float]
+"""The arrays of :class:`StateArrays`, as kernels take them."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,7 +32,7 @@ class StateArrays:
     bias_accel_B: Float
 
     @property
-    def parts(self) -> tuple[Float, Float, Float, Float, Float]:
+    def parts(self) -> States:
         return self.R_WB, self.p_WB, self.v_WB, self.bias_gyro_B, self.bias_accel_B
 
     @staticmethod
@@ -62,22 +67,14 @@ class StateArrays:
 
     def difference(self, other: StateArrays) -> Float:
         """(K, 15) by which :meth:`retract` moves the ``other`` ones here."""
-        rotation = so3.log(np.swapaxes(other.R_WB, -1, -2) @ self.R_WB)
-        return np.hstack([rotation, *(a - b for a, b in zip(self.parts[1:], other.parts[1:], strict=True))])
+        return difference(self.parts, other.parts)
 
     def retract(self, step: Float) -> StateArrays:
         """Moved by ``step`` (K, 15): rotations by right perturbation, the rest additively."""
-        return StateArrays(
-            self.R_WB @ so3.exp(step[:, DTHETA]),
-            self.p_WB + step[:, DP],
-            self.v_WB + step[:, DV],
-            self.bias_gyro_B + step[:, DBG],
-            self.bias_accel_B + step[:, DBA],
-        )
+        return StateArrays(*retract(self.parts, step))
 
 
-@dataclass(frozen=True, slots=True)
-class ImuFactors:
+class ImuFactors(NamedTuple):
     """K pre-integrated measurements, the k-th between the states i and j given for it.
 
     ``sqrt_information`` (K, 15, 15) whitens a residual: its squared norm is the Mahalanobis distance.
@@ -110,46 +107,96 @@ class ImuFactors:
 
     def residuals(self, i: StateArrays, j: StateArrays) -> Float:
         """(K, 15), [dtheta dp dv dbg dba] of state j beyond what state i and the readings predict [45]."""
-        r, *_ = self._evaluate(i, j)
-        return r
+        return self.linearise(i, j)[0]
 
     def linearise(self, i: StateArrays, j: StateArrays) -> tuple[Float, Float, Float]:
         """Residuals (K, 15) and their Jacobians (K, 15, 15) by the errors of states i and j [App. C]."""
-        r, R_BiW, p_i, v_i, correction = self._evaluate(i, j)
-        count = len(r)
-        J_i, J_j = np.zeros((count, 15, 15)), np.zeros((count, 15, 15))
-        Jr_inv = so3.right_jacobian_inverse(r[:, DTHETA])
-        E_T = so3.exp(-r[:, DTHETA])
-        R_BjBi = np.swapaxes(j.R_WB, -1, -2) @ i.R_WB
-        by_bias = self.bias_jacobian
-        eye = np.eye(3)
+        return _linearise_each(self, i.parts, j.parts)
 
-        J_i[:, DTHETA, DTHETA] = -Jr_inv @ R_BjBi
-        J_j[:, DTHETA, DTHETA] = Jr_inv
-        J_i[:, DTHETA, DBG] = -Jr_inv @ E_T @ so3.right_jacobian(correction[:, DTHETA]) @ by_bias[:, DTHETA, 0:3]
-        J_i[:, DP, DTHETA], J_i[:, DV, DTHETA] = so3.hat(p_i), so3.hat(v_i)
-        J_i[:, DP, DP], J_j[:, DP, DP] = -R_BiW, R_BiW
-        J_i[:, DP, DV] = -R_BiW * self.dt_s[:, None, None]
-        J_i[:, DV, DV], J_j[:, DV, DV] = -R_BiW, R_BiW
-        J_i[:, DP, DBG], J_i[:, DP, DBA] = -by_bias[:, DP, 0:3], -by_bias[:, DP, 3:6]
-        J_i[:, DV, DBG], J_i[:, DV, DBA] = -by_bias[:, DV, 0:3], -by_bias[:, DV, 3:6]
-        J_i[:, DBG, DBG], J_i[:, DBA, DBA] = -eye, -eye
-        J_j[:, DBG, DBG], J_j[:, DBA, DBA] = eye, eye
-        return r, J_i, J_j
 
-    def _evaluate(self, i: StateArrays, j: StateArrays) -> tuple[Float, Float, Float, Float, Float]:
-        """Residuals, R_BiW, the two states' relative position and velocity in Bi free of gravity, bias correction."""
-        T = self.dt_s[:, None]
-        R_BiW = np.swapaxes(i.R_WB, -1, -2)
-        p_i = (R_BiW @ (j.p_WB - i.p_WB - i.v_WB * T - 0.5 * g_W * T * T)[..., None])[..., 0]
-        v_i = (R_BiW @ (j.v_WB - i.v_WB - g_W * T)[..., None])[..., 0]
-        change = np.concatenate([i.bias_gyro_B - self.bias_gyro_B, i.bias_accel_B - self.bias_accel_B], axis=1)
-        correction = (self.bias_jacobian @ change[..., None])[..., 0]
-        dR = self.dR @ so3.exp(correction[:, DTHETA])
-        r = np.empty((len(T), 15))
-        r[:, DTHETA] = so3.log(np.swapaxes(dR, -1, -2) @ R_BiW @ j.R_WB)
-        r[:, DP] = p_i - self.dp - correction[:, DP]
-        r[:, DV] = v_i - self.dv - correction[:, DV]
-        r[:, DBG] = j.bias_gyro_B - i.bias_gyro_B
-        r[:, DBA] = j.bias_accel_B - i.bias_accel_B
-        return r, R_BiW, p_i, v_i, correction
+@kernel
+def difference(states: States, others: States) -> Float:
+    """(K, 15) by which :func:`retract` moves the ``others`` to ``states``."""
+    count = len(states[0])
+    out = np.empty((count, 15))
+    for k in range(count):
+        out[k, 0:3] = log(product(others[0][k].T, states[0][k]))
+        for m in range(3):
+            out[k, 3 + m] = states[1][k, m] - others[1][k, m]
+            out[k, 6 + m] = states[2][k, m] - others[2][k, m]
+            out[k, 9 + m] = states[3][k, m] - others[3][k, m]
+            out[k, 12 + m] = states[4][k, m] - others[4][k, m]
+    return out
+
+
+@kernel
+def retract(states: States, step: Float) -> States:
+    """``states`` moved by ``step`` (K, 15)."""
+    R_WB = np.empty((len(step), 3, 3))
+    for k in range(len(step)):
+        R_WB[k] = product(states[0][k], exp(step[k, 0:3]))
+    return (
+        R_WB,
+        states[1] + step[:, 3:6],
+        states[2] + step[:, 6:9],
+        states[3] + step[:, 9:12],
+        states[4] + step[:, 12:15],
+    )
+
+
+@kernel
+def linearise_reading(
+    factors: ImuFactors, k: int, states_i: States, i: int, states_j: States, j: int, r: Float, J: Float
+) -> None:
+    """``r`` (15,) of the k-th factor between two states, and ``J`` (15, 30) by the errors of both, neither whitened."""
+    T, by_bias = factors.dt_s[k], factors.bias_jacobian[k]
+    R_WBi, R_BiW = states_i[0][i], states_i[0][i].T
+    p, v, change = np.empty(3), np.empty(3), np.empty(6)
+    for m in range(3):
+        v_W = states_i[2][i, m]
+        p[m] = states_j[1][j, m] - states_i[1][i, m] - v_W * T - 0.5 * g_W[m] * T * T
+        v[m] = states_j[2][j, m] - v_W - g_W[m] * T
+        change[m] = states_i[3][i, m] - factors.bias_gyro_B[k, m]
+        change[3 + m] = states_i[4][i, m] - factors.bias_accel_B[k, m]
+        r[9 + m] = states_j[3][j, m] - states_i[3][i, m]
+        r[12 + m] = states_j[4][j, m] - states_i[4][i, m]
+    correction = np.zeros(9)
+    for m in range(9):
+        for n in range(6):
+            correction[m] += by_bias[m, n] * change[n]
+    R_BjBi = product(states_j[0][j].T, R_WBi)
+    dR = product(factors.dR[k], exp(correction[0:3]))
+    phi = log(product(dR.T, R_BjBi.T))
+    p_i, v_i = turned(R_BiW, p), turned(R_BiW, v)  # relative position and velocity in Bi, free of gravity
+    for m in range(3):
+        r[m] = phi[m]
+        r[3 + m] = p_i[m] - factors.dp[k, m] - correction[3 + m]
+        r[6 + m] = v_i[m] - factors.dv[k, m] - correction[6 + m]
+
+    Jr_inv = right_jacobian_inverse(phi)
+    by_theta = product(Jr_inv, R_BjBi)
+    by_gyro = product(product(Jr_inv, exp(-phi)), product(right_jacobian(correction[0:3]), by_bias[0:3, 0:3]))
+    J[:] = 0.0
+    for m in range(3):
+        n1, n2 = (m + 1) % 3, (m + 2) % 3
+        # The skew matrices of p_i and v_i.
+        J[3 + m, n1], J[3 + m, n2] = -p_i[n2], p_i[n1]
+        J[6 + m, n1], J[6 + m, n2] = -v_i[n2], v_i[n1]
+        for n in range(3):
+            J[m, n], J[m, 15 + n], J[m, 9 + n] = -by_theta[m, n], Jr_inv[m, n], -by_gyro[m, n]
+            J[3 + m, 3 + n], J[3 + m, 18 + n] = -R_BiW[m, n], R_BiW[m, n]
+            J[3 + m, 6 + n] = -T * R_BiW[m, n]
+            J[6 + m, 6 + n], J[6 + m, 21 + n] = -R_BiW[m, n], R_BiW[m, n]
+        for n in range(6):
+            J[3 + m, 9 + n], J[6 + m, 9 + n] = -by_bias[3 + m, n], -by_bias[6 + m, n]
+    for m in range(9, 15):
+        J[m, m], J[m, 15 + m] = -1.0, 1.0
+
+
+@kernel
+def _linearise_each(factors: ImuFactors, states_i: States, states_j: States) -> tuple[Float, Float, Float]:
+    count = len(factors.dt_s)
+    r, J = np.empty((count, 15)), np.empty((count, 15, 30))
+    for k in range(count):
+        linearise_reading(factors, k, states_i, k, states_j, k, r[k], J[k])
+    return r, J[:, :, :15].copy(), J[:, :, 15:].copy()

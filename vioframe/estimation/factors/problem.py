@@ -16,22 +16,29 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vioframe.arrays import Bool, Float
-from vioframe.estimation.factors.inertial import ImuFactors, StateArrays
+from vioframe.estimation.factors import inertial
+from vioframe.estimation.factors.inertial import ImuFactors, StateArrays, States, linearise_reading, retract
 from vioframe.estimation.factors.reprojection import (
     CALIBRATION_SIZE,
-    INTRINSICS,
     OFFSET,
     READOUT,
     Calibrated,
     Poses,
     Sightings,
     eliminate,
+    linearise,
+    relative_poses,
 )
 from vioframe.estimation.standstill import Standstill
-from vioframe.geometry import so3
+from vioframe.geometry.kernels import exp, log, product
+from vioframe.jit import kernel
 from vioframe.types import NavState
 
 STATE_SIZE = 15
+PriorArrays = tuple[Float, Float, States, Calibrated, Bool]
+"""A :class:`Prior` as kernels take it."""
+Eliminated = tuple[Float, Float, Float]
+"""Y, z and inverse factors of :func:`eliminate`."""
 # Eigenvalues below this part of the largest tell nothing: rounding made them.
 _NULL = 1e-12
 
@@ -50,17 +57,8 @@ class Variables:
 
     def retract(self, step: Float, landmark_step: Float) -> Variables:
         """Moved by ``step`` (15 K + 16,) and ``landmark_step`` (L, 3)."""
-        n = STATE_SIZE * len(self.states)
-        camera, d = self.camera, step[n:]
-        camera = Calibrated(
-            camera.R_BC @ so3.exp(d[:3]),
-            camera.p_BC + d[3:6],
-            float(camera.offset_s + d[OFFSET]),
-            float(camera.readout_s + d[READOUT]),
-            camera.intrinsics + d[INTRINSICS],
-        )
-        states = self.states.retract(step[:n].reshape(-1, STATE_SIZE))
-        return Variables(states, camera, self.landmarks + landmark_step)
+        states, camera = _moved(self.states.parts, self.camera, step)
+        return Variables(StateArrays(*states), camera, self.landmarks + landmark_step)
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,12 +101,11 @@ class Prior:
 
     def difference(self, x: Variables) -> Float:
         """``x`` beyond the first estimates, (n,); zero for states that the prior does not know."""
-        d = x.states.difference(self.states)
-        d[~self.frozen] = 0.0
-        first, now = self.camera, x.camera
-        times = [now.offset_s - first.offset_s, now.readout_s - first.readout_s]
-        rotation, lens = so3.log(first.R_BC.T @ now.R_BC), now.intrinsics - first.intrinsics
-        return np.concatenate([d.ravel(), rotation, now.p_BC - first.p_BC, times, lens])
+        return _difference(self._parts, x.states.parts, x.camera)
+
+    @property
+    def _parts(self) -> PriorArrays:
+        return self.H, self.b, self.states.parts, self.camera, self.frozen
 
     def first(self, states: StateArrays) -> StateArrays:
         """``states``, with the first estimates of those that are frozen in their place."""
@@ -130,35 +127,24 @@ class Problem:
 
     def cost(self, x: Variables) -> float:
         """Half the sum of squares, robust for the sightings, up to a constant."""
-        d = self.prior.difference(x)
-        total = 0.5 * d @ self.prior.H @ d + self.prior.b @ d
-        total += self.sightings.cost(x.poses, x.camera, x.landmarks)
-        r = self.reading_residuals(x.states)
-        total += 0.5 * float((r * r).sum())
-        for k, still in self.still.items():
-            total += 0.5 * float(((_still_residual(still, x.states, k) / still.sigma) ** 2).sum())
-        return float(total)
+        return self.linearise(x).cost
 
     def linearise(self, x: Variables) -> Normal:
-        """The normal equations at ``x``."""
-        K = len(x.states)
+        """The normal equations at ``x``, and the cost."""
+        states = x.states.parts
         first = self.prior.first(x.states) if self.first_estimates else x.states
-        d = self.prior.difference(x)
-        H, b = self.prior.H.copy(), self.prior.b + self.prior.H @ d
-        self._add_readings(H, b, x.states, first)
+        equations = _normal_equations(
+            self.prior._parts, self.readings, self.sightings, self.first_estimates, states, x.camera, x.landmarks
+        )
+        normal = Normal(*equations, self.sightings.seen)
         for k, still in self.still.items():
-            residual = _still_residual(still, x.states, k) / still.sigma
+            residual = still.residual(*(part[k] for part in states if part is not x.states.p_WB)) / still.sigma
             J = -still.jacobian(first.R_WB[k]) / still.sigma[:, None]
             at = slice(STATE_SIZE * k, STATE_SIZE * (k + 1))
-            H[at, at] += J.T @ J
-            b[at] += J.T @ residual
-        poses = x.poses
-        first_poses = Poses.of(first.R_WB, first.p_WB) if self.first_estimates else poses
-        H_visual, b_visual, V, W, c = self.sightings.linearise(poses, first_poses, x.camera, x.landmarks)
-        columns = pose_columns(K)
-        H[np.ix_(columns, columns)] += H_visual
-        b[columns] += b_visual
-        return Normal(H, b, V, W, c, columns)
+            normal.H[at, at] += J.T @ J
+            normal.b[at] += J.T @ residual
+            normal.cost += 0.5 * float(residual @ residual)
+        return normal
 
     def reading_residuals(self, states: StateArrays) -> Float:
         """Of the readings between each state and the next, whitened, (count, 15)."""
@@ -166,50 +152,173 @@ class Problem:
         r = self.readings.residuals(states[:count], states[1 : count + 1])
         return np.asarray((self.readings.sqrt_information @ r[..., None])[..., 0])
 
-    def _add_readings(self, H: Float, b: Float, states: StateArrays, first: StateArrays) -> None:
-        count = len(self.readings.dt_s)
-        if not count:
-            return
-        r = self.reading_residuals(states)
-        _, J_i, J_j = self.readings.linearise(first[:count], first[1 : count + 1])
-        J = self.readings.sqrt_information @ np.concatenate([J_i, J_j], axis=2)
-        J_T = np.swapaxes(J, -1, -2)
-        blocks, gradients = J_T @ J, (J_T @ r[..., None])[..., 0]
-        for k in range(count):
-            at = slice(STATE_SIZE * k, STATE_SIZE * (k + 2))
-            H[at, at] += blocks[k]
-            b[at] += gradients[k]
 
-
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class Normal:
-    """Normal equations [H W^T; W V], gradients b and c; ``W`` (L, 3, m) has the columns ``columns`` (m,) of H."""
+    """Normal equations [H W^T; W V], gradients b and c; ``W`` (L, 3, m) has the columns ``columns`` (m,) of H.
+
+    Of ``H`` (n, n) the upper half counts. ``cost`` is that of the problem, ``errors`` (L,) are the landmarks' root mean
+    square residuals (:meth:`Sightings.errors`), which are ``seen`` (L, K).
+    """
 
     H: Float
     b: Float
     V: Float
     W: Float
     c: Float
+    cost: float
+    errors: Float
     columns: NDArray[np.intp]
+    seen: Bool
 
-    def reduced(self, damping: float) -> tuple[Float, Float, tuple[Float, Float, Float]]:
-        """Damped equations S (n, n) and gradient (n,) without the landmarks, and what :meth:`landmark_step` needs."""
-        Y, z, inverse = eliminate(self.V, self.W, self.c, damping)
-        flat = Y.reshape(-1, len(self.columns))
-        S, g = self.H.copy(), self.b.copy()
-        S[np.diag_indices_from(S)] *= 1.0 + damping
-        S[np.ix_(self.columns, self.columns)] -= flat.T @ flat
-        g[self.columns] -= flat.T @ z.ravel()
-        return S, g, (Y, z, inverse)
+    def reduced(self, damping: float) -> tuple[Float, Float, Eliminated]:
+        """Damped equations S (n, n) and gradient (n,) without the landmarks, and what :meth:`landmark_step` needs.
 
-    def landmark_step(self, step: Float, eliminated: tuple[Float, Float, Float]) -> Float:
+        Of S the upper half counts.
+        """
+        return _reduced(self.H, self.b, self.V, self.W, self.c, self.columns, self.seen, damping)
+
+    def landmark_step(self, step: Float, eliminated: Eliminated) -> Float:
         """(L, 3), given the ``step`` (n,) of the rest."""
-        Y, z, inverse = eliminated
-        return -(np.swapaxes(inverse, -1, -2) @ (z + Y @ step[self.columns])[..., None])[..., 0]
+        return _landmark_step(eliminated, step[self.columns])
 
 
-def _still_residual(still: Standstill, states: StateArrays, k: int) -> Float:
-    return still.residual(states.R_WB[k], states.v_WB[k], states.bias_gyro_B[k], states.bias_accel_B[k])
+@kernel
+def _moved(states: States, camera: Calibrated, step: Float) -> tuple[States, Calibrated]:
+    """States and camera moved by ``step`` (15 K + 16,)."""
+    n = STATE_SIZE * len(states[0])
+    d = step[n:]
+    moved = Calibrated(
+        product(camera.R_BC, exp(d[:3])),
+        camera.p_BC + d[3:6],
+        camera.offset_s + d[OFFSET],
+        camera.readout_s + d[READOUT],
+        camera.intrinsics + d[8:],
+    )
+    return retract(states, step[:n].reshape(-1, STATE_SIZE)), moved
+
+
+@kernel
+def _difference(prior: PriorArrays, states: States, camera: Calibrated) -> Float:
+    """What :meth:`Prior.difference` says."""
+    _, b, first, first_camera, frozen = prior
+    n = len(b) - CALIBRATION_SIZE
+    out = np.empty(len(b))
+    out[:n] = inertial.difference(states, first).ravel()
+    for k in range(len(frozen)):
+        if not frozen[k]:
+            out[STATE_SIZE * k : STATE_SIZE * (k + 1)] = 0.0
+    out[n : n + 3] = log(product(first_camera.R_BC.T, camera.R_BC))
+    out[n + 3 : n + 6] = camera.p_BC - first_camera.p_BC
+    out[n + OFFSET] = camera.offset_s - first_camera.offset_s
+    out[n + READOUT] = camera.readout_s - first_camera.readout_s
+    out[n + 8 :] = camera.intrinsics - first_camera.intrinsics
+    return out
+
+
+@kernel
+def _normal_equations(
+    prior: PriorArrays,
+    readings: ImuFactors,
+    sightings: Sightings,
+    first_estimates: bool,
+    states: States,
+    camera: Calibrated,
+    landmarks: Float,
+) -> tuple[Float, Float, Float, Float, Float, float, Float, NDArray[np.intp]]:
+    """All but standstill of :meth:`Problem.linearise`."""
+    frozen = prior[4] if first_estimates else np.zeros(len(prior[4]), np.bool_)
+    first = _with_those_of(prior[2], states, frozen)
+    d = _difference(prior, states, camera)
+    H, b = prior[0].copy(), prior[0] @ d
+    cost = 0.0
+    for k in range(len(d)):
+        cost += d[k] * (0.5 * b[k] + prior[1][k])
+        b[k] += prior[1][k]
+    cost += _add_readings(readings, states, first, frozen, H, b)
+    poses = Poses(*relative_poses(states[0], states[1]))
+    first_poses = Poses(*relative_poses(first[0], first[1]))
+    H_visual, b_visual, V, W, c, visual_cost, errors = linearise(poses, first_poses, camera, sightings, landmarks)
+    columns = pose_columns(len(frozen))
+    for u in range(len(columns)):
+        b[columns[u]] += b_visual[u]
+        own, visual = H[columns[u]], H_visual[u]
+        for v in range(u, len(columns)):
+            own[columns[v]] += visual[v]
+    return H, b, V, W, c, cost + visual_cost, errors, columns
+
+
+@kernel
+def _with_those_of(others: States, states: States, where: Bool) -> States:
+    """What :meth:`StateArrays.with_those_of` gives."""
+    R_WB, p_WB, v_WB = states[0].copy(), states[1].copy(), states[2].copy()
+    bias_gyro_B, bias_accel_B = states[3].copy(), states[4].copy()
+    for k in range(len(where)):
+        if where[k]:
+            R_WB[k], p_WB[k], v_WB[k] = others[0][k], others[1][k], others[2][k]
+            bias_gyro_B[k], bias_accel_B[k] = others[3][k], others[4][k]
+    return R_WB, p_WB, v_WB, bias_gyro_B, bias_accel_B
+
+
+@kernel
+def _add_readings(readings: ImuFactors, states: States, first: States, frozen: Bool, H: Float, b: Float) -> float:
+    """Add to the upper half of ``H`` and to ``b``; returns the cost. Jacobians are taken at ``first``."""
+    cost = 0.0
+    r, r_first, r_white = np.empty(15), np.empty(15), np.empty(15)
+    J, J_white = np.empty((15, 30)), np.empty((15, 30))
+    for k in range(len(readings.dt_s)):
+        linearise_reading(readings, k, states, k, states, k + 1, r, J)
+        if frozen[k] or frozen[k + 1]:
+            linearise_reading(readings, k, first, k, first, k + 1, r_first, J)
+        L = readings.sqrt_information[k]
+        J_white[:] = 0.0
+        for i in range(15):
+            r_white[i] = 0.0
+            own = J_white[i]
+            for m in range(i + 1):
+                r_white[i] += L[i, m] * r[m]
+                a, row = L[i, m], J[m]
+                for v in range(30):
+                    own[v] += a * row[v]
+            cost += 0.5 * r_white[i] * r_white[i]
+        at = STATE_SIZE * k
+        for i in range(15):
+            row = J_white[i]
+            for u in range(30):
+                a, own = row[u], H[at + u, at : at + 30]
+                b[at + u] += a * r_white[i]
+                for v in range(u, 30):
+                    own[v] += a * row[v]
+    return cost
+
+
+@kernel
+def _reduced(
+    H: Float, b: Float, V: Float, W: Float, c: Float, columns: NDArray[np.intp], seen: Bool, damping: float
+) -> tuple[Float, Float, Eliminated]:
+    S, g = H.copy(), b.copy()
+    for u in range(len(b)):
+        S[u, u] *= 1.0 + damping
+    S_visual, g_visual, eliminated = eliminate(seen, V, W, c, damping)
+    for u in range(len(columns)):
+        g[columns[u]] -= g_visual[u]
+        own, visual = S[columns[u]], S_visual[u]
+        for v in range(u, len(columns)):
+            own[columns[v]] -= visual[v]
+    return S, g, eliminated
+
+
+@kernel
+def _landmark_step(eliminated: Eliminated, step: Float) -> Float:
+    Y, z, inverse = eliminated
+    out = np.zeros(z.shape)
+    right = Y.reshape(-1, len(step)) @ step
+    for i in range(len(z)):
+        for k in range(3):
+            right_k = z[i, k] + right[3 * i + k]
+            for m in range(k + 1):
+                out[i, m] -= inverse[i, k, m] * right_k
+    return out
 
 
 def calibration_information(cov: Float) -> Float:
@@ -217,10 +326,14 @@ def calibration_information(cov: Float) -> Float:
     return np.linalg.inv(cov + np.diag(np.where(np.diag(cov) > 0.0, 0.0, 1.0)))
 
 
+@kernel
 def pose_columns(K: int) -> NDArray[np.intp]:
     """Indices of [dtheta dp] of every state, and of the calibration, in the error vector of K states."""
-    poses = (STATE_SIZE * np.arange(K)[:, None] + np.arange(6)).ravel()
-    return np.concatenate([poses, STATE_SIZE * K + np.arange(CALIBRATION_SIZE)])
+    out = np.empty(6 * K + CALIBRATION_SIZE, np.intp)
+    for u in range(6 * K):
+        out[u] = STATE_SIZE * (u // 6) + u % 6
+    out[6 * K :] = STATE_SIZE * K + np.arange(CALIBRATION_SIZE)
+    return out
 
 
 def marginalise_oldest(problem: Problem, x: Variables) -> Prior:
@@ -229,8 +342,8 @@ def marginalise_oldest(problem: Problem, x: Variables) -> Prior:
     ``problem`` holds just the factors that touch the first state. Its landmarks go with it, robust weights as they are
     at ``x``. States it touches are frozen at ``x`` unless they were before.
     """
-    normal = problem.linearise(x)
-    H, b, _ = normal.reduced(0.0)
+    S, b, _ = problem.linearise(x).reduced(0.0)
+    H = symmetric(S)
     K = len(x.states)
     touched = (H[: STATE_SIZE * K].reshape(K, -1) != 0.0).any(axis=1)
     prior = problem.prior
@@ -239,6 +352,12 @@ def marginalise_oldest(problem: Problem, x: Variables) -> Prior:
     b = b - H @ prior.difference(x)
     H, b = schur(H, b, STATE_SIZE)
     return Prior(H, b, first[1:], prior.camera, (prior.frozen | touched)[1:])
+
+
+def symmetric(S: Float) -> Float:
+    """The whole of a matrix of which the upper half counts."""
+    upper = np.triu(S)
+    return upper + np.triu(S, 1).T
 
 
 def schur(H: Float, b: Float, count: int) -> tuple[Float, Float]:

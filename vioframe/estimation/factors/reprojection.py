@@ -19,7 +19,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vioframe.arrays import Bool, Float
+from vioframe.arrays import Bool, Float, Int
 from vioframe.geometry.kernels import distort, exp, intrinsics_jacobian
 from vioframe.jit import kernel
 
@@ -31,7 +31,8 @@ OFFSET, READOUT, INTRINSICS = 6, 7, slice(8, 16)
 """Where in that error they are, behind the camera's pose on the body."""
 
 
-Linearised = tuple[Float, Float, Float, Float, Float]
+Linearised = tuple[Float, Float, Float, Float, Float, float, Float]
+View = tuple[Float, Float, Float]
 
 
 class Calibrated(NamedTuple):
@@ -59,10 +60,7 @@ class Poses(NamedTuple):
 
     @staticmethod
     def of(R_WB: Float, p_WB: Float) -> Poses:
-        R_BW = np.swapaxes(R_WB, -1, -2)
-        R_fh = R_BW[:, None] @ R_WB[None]
-        t_fh = (R_BW[:, None] @ (p_WB[None] - p_WB[:, None])[..., None])[..., 0]
-        return Poses(np.ascontiguousarray(R_WB), R_fh, t_fh)
+        return Poses(*relative_poses(R_WB, p_WB))
 
 
 class Shutter(NamedTuple):
@@ -125,12 +123,29 @@ class Sightings(NamedTuple):
         return _evaluate(poses, camera, self, landmarks)[1]
 
     def linearise(self, poses: Poses, first: Poses, camera: Calibrated, landmarks: Float) -> Linearised:
-        """H (n, n), b (n,) of poses and calibration, and V (L, 3, 3), W (L, 3, n), c (L, 3) of the landmarks.
+        """H (n, n), b (n,) of poses and calibration, V (L, 3, 3), W (L, 3, n), c (L, 3) of the landmarks; cost, errors.
 
         n = 6 K + 16: [dtheta dp] of every frame, then the calibration. The gradient is [b c], the Gauss-Newton matrix
-        [H W^T; W V], with the robust weights in them. Jacobians are taken at the poses ``first``.
+        [H W^T; W V], with the robust weights in them; of ``H`` the upper half. Jacobians are taken at the poses
+        ``first``. The last two are those of :meth:`cost` and :meth:`errors`.
         """
-        return _linearise(poses, first, camera, self, landmarks)
+        return linearise(poses, first, camera, self, landmarks)
+
+
+@kernel
+def relative_poses(R_WB: Float, p_WB: Float) -> tuple[Float, Float, Float]:
+    """What :class:`Poses` holds of the poses of K frames."""
+    count = len(R_WB)
+    R_fh, t_fh = np.empty((count, count, 3, 3)), np.empty((count, count, 3))
+    for f in range(count):
+        R = R_WB[f]
+        for h in range(count):
+            x, y, z = p_WB[h, 0] - p_WB[f, 0], p_WB[h, 1] - p_WB[f, 1], p_WB[h, 2] - p_WB[f, 2]
+            for i in range(3):
+                t_fh[f, h, i] = R[0, i] * x + R[1, i] * y + R[2, i] * z
+                for k in range(3):
+                    R_fh[f, h, i, k] = R[0, i] * R_WB[h, 0, k] + R[1, i] * R_WB[h, 1, k] + R[2, i] * R_WB[h, 2, k]
+    return R_WB, R_fh, t_fh
 
 
 @kernel
@@ -165,12 +180,18 @@ def pixels_by_intrinsics(model: int, k: Float, xy: Float, seen: Bool) -> Float:
 
 
 @kernel
-def eliminate(V: Float, W: Float, c: Float, damping: float) -> tuple[Float, Float, Float]:
-    """Y (L, 3, n), z (L, 3) and inverse factors (L, 3, 3) with Y^T Y = W^T V^-1 W, Y^T z = W^T V^-1 c, V damped."""
+def eliminate(
+    seen: Bool, V: Float, W: Float, c: Float, damping: float
+) -> tuple[Float, Float, tuple[Float, Float, Float]]:
+    """What is known of the rest through the landmarks: W^T V^-1 W (n, n), the upper half, and W^T V^-1 c (n,).
+
+    With them Y (L, 3, n), z (L, 3) and inverse factors (L, 3, 3) of V, which is damped: the former two are Y^T Y and
+    Y^T z.
+    """
     count, _, n = W.shape
-    Y = np.empty((count, 3, n))
-    z = np.empty((count, 3))
-    inverse = np.zeros((count, 3, 3))
+    frames = seen.shape[1]
+    Y, z, inverse = np.empty((count, 3, n)), np.empty((count, 3)), np.zeros((count, 3, 3))
+    S, g = np.zeros((n, n)), np.zeros(n)
     for i in range(count):
         # Cholesky's factor of V, inverted. The constant keeps a landmark without parallax solvable.
         a = V[i, 0, 0] * (1.0 + damping) + 1e-9
@@ -186,15 +207,32 @@ def eliminate(V: Float, W: Float, c: Float, damping: float) -> tuple[Float, Floa
         i20 = -(l20 * i00 + l21 * i10) * i22
         inverse[i, 0, 0], inverse[i, 1, 0], inverse[i, 1, 1] = i00, i10, i11
         inverse[i, 2, 0], inverse[i, 2, 1], inverse[i, 2, 2] = i20, i21, i22
+        w_0, w_1, w_2, y_0, y_1, y_2 = W[i, 0], W[i, 1], W[i, 2], Y[i, 0], Y[i, 1], Y[i, 2]
         for j in range(n):
-            w0, w1, w2 = W[i, 0, j], W[i, 1, j], W[i, 2, j]
-            Y[i, 0, j] = i00 * w0
-            Y[i, 1, j] = i10 * w0 + i11 * w1
-            Y[i, 2, j] = i20 * w0 + i21 * w1 + i22 * w2
+            y_0[j] = i00 * w_0[j]
+            y_1[j] = i10 * w_0[j] + i11 * w_1[j]
+            y_2[j] = i20 * w_0[j] + i21 * w_1[j] + i22 * w_2[j]
         z[i, 0] = i00 * c[i, 0]
         z[i, 1] = i10 * c[i, 0] + i11 * c[i, 1]
         z[i, 2] = i20 * c[i, 0] + i21 * c[i, 1] + i22 * c[i, 2]
-    return Y, z, inverse
+    order, _ = _by_host(seen)
+    for k in range(0, count, 2):
+        # Two at a time that frames have in common.
+        i, j = order[k], order[min(k + 1, count - 1)]
+        other = 1.0 if k + 1 < count else 0.0
+        y_0, y_1, y_2, y_3, y_4, y_5 = Y[i, 0], Y[i, 1], Y[i, 2], Y[j, 0], Y[j, 1], Y[j, 2]
+        for u in range(n):
+            if u < 6 * frames and not (seen[i, u // 6] or seen[j, u // 6]):
+                continue
+            a_0, a_1, a_2 = y_0[u], y_1[u], y_2[u]
+            a_3, a_4, a_5 = other * y_3[u], other * y_4[u], other * y_5[u]
+            g[u] += a_0 * z[i, 0] + a_1 * z[i, 1] + a_2 * z[i, 2] + a_3 * z[j, 0] + a_4 * z[j, 1] + a_5 * z[j, 2]
+            own = S[u]
+            for v in range(u, n):
+                own[v] += (
+                    a_0 * y_0[v] + a_1 * y_1[v] + a_2 * y_2[v] + a_3 * y_3[v] + a_4 * y_4[v] + a_5 * y_5[v]
+                )  # fmt: skip
+    return S, g, (Y, z, inverse)
 
 
 @kernel
@@ -296,22 +334,6 @@ def _residual_jacobian(
 
 
 @kernel
-def _times_transposed(A: Float, M: Float, out: Float) -> None:
-    """``out`` = A M^T, (2, 3) times (3, 3)."""
-    for i in range(2):
-        for k in range(3):
-            out[i, k] = A[i, 0] * M[k, 0] + A[i, 1] * M[k, 1] + A[i, 2] * M[k, 2]
-
-
-@kernel
-def _times(A: Float, M: Float, out: Float) -> None:
-    """``out`` = A M, (2, 3) times (3, 3)."""
-    for i in range(2):
-        for k in range(3):
-            out[i, k] = A[i, 0] * M[0, k] + A[i, 1] * M[1, k] + A[i, 2] * M[2, k]
-
-
-@kernel
 def _evaluate(poses: Poses, camera: Calibrated, s: Sightings, landmarks: Float) -> tuple[float, Float]:
     """Half the robust sum of squares, and each landmark's root mean square residual."""
     R_BC, p_BC, offset_s, _, intrinsics = camera
@@ -345,104 +367,224 @@ def _evaluate(poses: Poses, camera: Calibrated, s: Sightings, landmarks: Float) 
 
 
 @kernel
-def _linearise(poses: Poses, first: Poses, camera: Calibrated, s: Sightings, landmarks: Float) -> Linearised:
+def linearise(poses: Poses, first: Poses, camera: Calibrated, s: Sightings, landmarks: Float) -> Linearised:
     R_BC, p_BC, offset_s, _, intrinsics = camera
     seen, xy, velocity, to_px, sigma, cauchy, on_sphere, shutter, lens = s
-    rolling, size = shutter.rolling, CALIBRATION_SIZE
-    R_rowC, p_rowC = R_BC.copy(), p_BC.copy()
+    rolling = shutter.rolling
     count, frames = seen.shape
-    n = 6 * frames + size
+    at_camera = 6 * frames
+    n = at_camera + CALIBRATION_SIZE
     H, g = np.zeros((n, n)), np.zeros(n)
     V, W, c = np.zeros((count, 3, 3)), np.zeros((count, 3, n)), np.zeros((count, 3))
-    q, b, X, r, T = np.empty(3), np.empty(3), np.empty(3), np.empty(2), np.empty((2, 3))
-    D, A, B, C, E = np.empty((2, 3)), np.empty((2, 3)), np.empty((2, 3)), np.empty((2, 3)), np.empty((2, 3))
-    A_row = np.empty((2, 3))
-    by_offset, p_row = np.empty(2), np.empty(3)
-    J = np.zeros((2, 12 + size))  # host, frame, calibration
-    end = 12 + size if lens.varied else 12 + READOUT + 1
-    J_m = np.empty((2, 3))
-    columns = np.empty(12 + size, np.int64)
-    for k in range(size):
-        columns[12 + k] = 6 * frames + k
-    ray = np.ones(3)
-    for i in range(count):
-        host = -1
-        rho = landmarks[i, 2]
-        ray[0], ray[1] = landmarks[i, 0], landmarks[i, 1]
-        _in_body(R_BC, p_BC, landmarks[i], q)
-        for f in range(frames):
-            if not seen[i, f]:
-                continue
-            host = f if host < 0 else host
-            vx, vy = velocity[i, f, 0], velocity[i, f, 1]
-            x, y = xy[i, f, 0] - offset_s * vx, xy[i, f, 1] - offset_s * vy
-            if rolling:
-                camera_at_row(camera, shutter, i, f, R_rowC, p_rowC)
-            _in_camera(poses.R_fh[f, host], poses.t_fh[f, host], R_rowC, p_rowC, rho, q, b, X)
-            _residual(X, x, y, to_px[i, f], on_sphere, T, r)
-            if lens.varied:
-                _add_lens(lens, i, f, intrinsics, r)
-            weight = 1.0 / (1.0 + (r[0] * r[0] + r[1] * r[1]) / (sigma * sigma * cauchy * cauchy))
-            scale = math.sqrt(weight) / sigma
+    cost, squares, views, behind = 0.0, np.zeros(count), np.zeros(count), np.zeros(count, np.bool_)
+    hosted, begins = _by_host(seen)
 
-            _in_camera(first.R_fh[f, host], first.t_fh[f, host], R_rowC, p_rowC, rho, q, b, X)
-            _residual_jacobian(X, vx, vy, to_px[i, f], on_sphere, T, D, by_offset)
-            _times_transposed(D, R_rowC, A)
-            _times_transposed(D, R_BC, A_row)
-            _times(A, first.R_fh[f, host], B)
-            _times(B, R_BC, C)
-            _times(A, first.R_WB[f].T, E)
+    # Of all sightings of a frame whose landmarks have the same host: by [dtheta_host dp_host dtheta_frame calibration],
+    # the residual behind it. By dp_frame it is minus that by dp_host.
+    rows, own = np.zeros((2 * count + 2, 26)), np.empty((25, 26))
+    D, J_m = np.empty((2, 3)), np.empty((2, 3))
+    q, b, X, r, T = np.empty(3), np.empty(3), np.empty(3), np.empty(2), np.empty((2, 3))
+    by_offset, p_row = np.empty(2), np.empty(3)
+    R_rowC, p_rowC = R_BC.copy(), p_BC.copy()
+    now, then = _empty_view(), _empty_view()
+    for host in range(frames):
+        for f in range(host, frames):
             moved = host != f
             # In the host itself a landmark is where it was seen, unless rows are read at different times.
             apart = moved or rolling
-            for k in range(3):
-                p_row[k] = rho * p_BC[k] + R_BC[k, 0] * X[0] + R_BC[k, 1] * X[1] + R_BC[k, 2] * X[2]
-            for a in range(2):
-                r[a] *= scale
-                by_rho, by_readout = 0.0, 0.0
-                for k in range(3):
-                    i1, i2 = (k + 1) % 3, (k + 2) % 3  # a x b in its component k
-                    by_host = q[i1] * B[a, i2] - q[i2] * B[a, i1]
-                    by_frame = A[a, i1] * b[i2] - A[a, i2] * b[i1]
-                    by_camera = D[a, i1] * X[i2] - D[a, i2] * X[i1] + ray[i1] * C[a, i2] - ray[i2] * C[a, i1]
-                    J[a, k] = scale * by_host if moved else 0.0
-                    J[a, 3 + k] = scale * rho * E[a, k] if moved else 0.0
-                    J[a, 6 + k] = scale * by_frame if moved else 0.0
-                    J[a, 9 + k] = -J[a, 3 + k]
-                    J[a, 12 + k] = scale * by_camera if apart else 0.0
-                    J[a, 15 + k] = scale * rho * (B[a, k] - A_row[a, k]) if apart else 0.0
-                    by_rho += A[a, k] * first.t_fh[f, host, k] + (B[a, k] - A[a, k]) * p_BC[k]
-                    by_rho -= A[a, k] * (p_rowC[k] - p_BC[k])
-                J[a, 18] = scale * by_offset[a]
+            filled = 0
+            R_fh, t_fh, R_BW = first.R_fh[f, host], first.t_fh[f, host], first.R_WB[f].T
+            _view(poses.R_fh[f, host], poses.t_fh[f, host], R_rowC, p_rowC, R_BC, p_BC, now)
+            _view(R_fh, t_fh, R_rowC, p_rowC, R_BC, p_BC, then)
+            M, N, t = then
+            for i in hosted[begins[host] : begins[host + 1]]:
+                if not seen[i, f]:
+                    continue
+                m_x, m_y, rho = landmarks[i, 0], landmarks[i, 1], landmarks[i, 2]
+                vx, vy = velocity[i, f, 0], velocity[i, f, 1]
+                px = to_px[i, f]
                 if rolling:
-                    rate, velocity_B = shutter.rate_B[f], shutter.velocity_B[f]
-                    for k in range(3):
-                        i1, i2 = (k + 1) % 3, (k + 2) % 3
-                        by_readout -= A_row[a, k] * (rate[i1] * p_row[i2] - rate[i2] * p_row[i1])
-                        by_readout -= rho * A[a, k] * velocity_B[k]
-                    J[a, 19] = scale * by_readout * shutter.row[i, f]
+                    camera_at_row(camera, shutter, i, f, R_rowC, p_rowC)
+                    _view(poses.R_fh[f, host], poses.t_fh[f, host], R_rowC, p_rowC, R_BC, p_BC, now)
+                    _view(R_fh, t_fh, R_rowC, p_rowC, R_BC, p_BC, then)
+                _direction(now, m_x, m_y, rho, X)
+                _residual(X, xy[i, f, 0] - offset_s * vx, xy[i, f, 1] - offset_s * vy, px, on_sphere, T, r)
                 if lens.varied:
-                    for k in range(8):
-                        J[a, 20 + k] = scale * lens.px[i, f, a, k]
-                J_m[a, 0], J_m[a, 1] = scale * C[a, 0], scale * C[a, 1]
-                J_m[a, 2] = scale * by_rho if apart else 0.0
-            for k in range(6):
-                columns[k], columns[6 + k] = 6 * host + k, 6 * f + k
+                    _add_lens(lens, i, f, intrinsics, r)
+                squared = (r[0] * r[0] + r[1] * r[1]) / (sigma * sigma)
+                cost += 0.5 * cauchy * cauchy * math.log(1.0 + squared / (cauchy * cauchy))
+                squares[i] += squared
+                views[i] += 1.0
+                behind[i] |= X[2] <= _LEAST_DEPTH_RATIO
+                scale = math.sqrt(1.0 / (1.0 + squared / (cauchy * cauchy))) / sigma
 
-            begin = 0 if host != f else 12
-            for u in range(begin, end):
-                cu = columns[u]
-                g[cu] += J[0, u] * r[0] + J[1, u] * r[1]
-                # The host is the first that saw it: columns ascend, and the upper half will do.
-                for v in range(u, end):
-                    H[cu, columns[v]] += J[0, u] * J[0, v] + J[1, u] * J[1, v]
+                _direction(then, m_x, m_y, rho, X)
+                _residual_jacobian(X, vx, vy, px, on_sphere, T, D, by_offset)
                 for k in range(3):
-                    W[i, k, cu] += J_m[0, k] * J[0, u] + J_m[1, k] * J[1, u]
-            for k in range(3):
-                c[i, k] += J_m[0, k] * r[0] + J_m[1, k] * r[1]
-                for v in range(3):
-                    V[i, k, v] += J_m[0, k] * J_m[0, v] + J_m[1, k] * J_m[1, v]
-    for u in range(n):
-        for v in range(u):
-            H[u, v] = H[v, u]
-    return H, g, V, W, c
+                    q[k] = R_BC[k, 0] * m_x + R_BC[k, 1] * m_y + R_BC[k, 2] + rho * p_BC[k]
+                    b[k] = R_rowC[k, 0] * X[0] + R_rowC[k, 1] * X[1] + R_rowC[k, 2] * X[2] + rho * p_rowC[k]
+                for a in range(2):
+                    J = rows[filled + a]
+                    J[25] = scale * r[a]
+                    d_0, d_1, d_2 = scale * D[a, 0], scale * D[a, 1], scale * D[a, 2]
+                    # By the landmark's ray in its host, and by its points in the bodies of host and frame.
+                    c_0 = d_0 * M[0, 0] + d_1 * M[1, 0] + d_2 * M[2, 0]
+                    c_1 = d_0 * M[0, 1] + d_1 * M[1, 1] + d_2 * M[2, 1]
+                    c_2 = d_0 * M[0, 2] + d_1 * M[1, 2] + d_2 * M[2, 2]
+                    B_0 = d_0 * N[0, 0] + d_1 * N[1, 0] + d_2 * N[2, 0]
+                    B_1 = d_0 * N[0, 1] + d_1 * N[1, 1] + d_2 * N[2, 1]
+                    B_2 = d_0 * N[0, 2] + d_1 * N[1, 2] + d_2 * N[2, 2]
+                    A_0 = d_0 * R_rowC[0, 0] + d_1 * R_rowC[0, 1] + d_2 * R_rowC[0, 2]
+                    A_1 = d_0 * R_rowC[1, 0] + d_1 * R_rowC[1, 1] + d_2 * R_rowC[1, 2]
+                    A_2 = d_0 * R_rowC[2, 0] + d_1 * R_rowC[2, 1] + d_2 * R_rowC[2, 2]
+                    J_m[a, 0], J_m[a, 1] = c_0, c_1
+                    if moved:
+                        J[0], J[1], J[2] = q[1] * B_2 - q[2] * B_1, q[2] * B_0 - q[0] * B_2, q[0] * B_1 - q[1] * B_0
+                        J[3] = rho * (A_0 * R_BW[0, 0] + A_1 * R_BW[1, 0] + A_2 * R_BW[2, 0])
+                        J[4] = rho * (A_0 * R_BW[0, 1] + A_1 * R_BW[1, 1] + A_2 * R_BW[2, 1])
+                        J[5] = rho * (A_0 * R_BW[0, 2] + A_1 * R_BW[1, 2] + A_2 * R_BW[2, 2])
+                        J[6], J[7], J[8] = A_1 * b[2] - A_2 * b[1], A_2 * b[0] - A_0 * b[2], A_0 * b[1] - A_1 * b[0]
+                    else:
+                        for k in range(9):
+                            J[k] = 0.0
+                    if rolling:
+                        a_0 = d_0 * R_BC[0, 0] + d_1 * R_BC[0, 1] + d_2 * R_BC[0, 2]
+                        a_1 = d_0 * R_BC[1, 0] + d_1 * R_BC[1, 1] + d_2 * R_BC[1, 2]
+                        a_2 = d_0 * R_BC[2, 0] + d_1 * R_BC[2, 1] + d_2 * R_BC[2, 2]
+                    else:
+                        a_0, a_1, a_2 = A_0, A_1, A_2
+                    if apart:
+                        J_m[a, 2] = d_0 * t[0] + d_1 * t[1] + d_2 * t[2]
+                        J[9] = d_1 * X[2] - d_2 * X[1] + m_y * c_2 - c_1
+                        J[10] = d_2 * X[0] - d_0 * X[2] + c_0 - m_x * c_2
+                        J[11] = d_0 * X[1] - d_1 * X[0] + m_x * c_1 - m_y * c_0
+                        J[12], J[13], J[14] = rho * (B_0 - a_0), rho * (B_1 - a_1), rho * (B_2 - a_2)
+                    else:
+                        J_m[a, 2] = 0.0
+                        for k in range(9, 15):
+                            J[k] = 0.0
+                    J[15], J[16] = scale * by_offset[a], 0.0
+                    if rolling:
+                        for k in range(3):
+                            p_row[k] = rho * p_BC[k] + R_BC[k, 0] * X[0] + R_BC[k, 1] * X[1] + R_BC[k, 2] * X[2]
+                        rate, v_B = shutter.rate_B[f], shutter.velocity_B[f]
+                        J[16] -= a_0 * (rate[1] * p_row[2] - rate[2] * p_row[1]) + rho * A_0 * v_B[0]
+                        J[16] -= a_1 * (rate[2] * p_row[0] - rate[0] * p_row[2]) + rho * A_1 * v_B[1]
+                        J[16] -= a_2 * (rate[0] * p_row[1] - rate[1] * p_row[0]) + rho * A_2 * v_B[2]
+                        J[16] *= shutter.row[i, f]
+                    if lens.varied:
+                        for k in range(8):
+                            J[17 + k] = scale * lens.px[i, f, a, k]
+
+                J_0, J_1 = rows[filled], rows[filled + 1]
+                filled += 2
+                for k in range(3):
+                    a_0, a_1 = J_m[0, k], J_m[1, k]
+                    c[i, k] += a_0 * J_0[25] + a_1 * J_1[25]
+                    for v in range(3):
+                        V[i, k, v] += a_0 * J_m[0, v] + a_1 * J_m[1, v]
+                    w = W[i, k]
+                    for v in range(CALIBRATION_SIZE):
+                        w[at_camera + v] += a_0 * J_0[9 + v] + a_1 * J_1[9 + v]
+                    if moved:
+                        for v in range(6):
+                            w[6 * host + v] += a_0 * J_0[v] + a_1 * J_1[v]
+                        for v in range(3):
+                            w[6 * f + v] = a_0 * J_0[6 + v] + a_1 * J_1[6 + v]
+                            w[6 * f + 3 + v] = -(a_0 * J_0[3 + v] + a_1 * J_1[3 + v])
+            _squared(rows, filled, own)
+            _add_own(own, host, f, H, g)
+    errors = np.sqrt(0.5 * squares / np.maximum(views, 1.0))
+    errors[behind] = np.inf
+    return H, g, V, W, c, cost, errors
+
+
+@kernel
+def _by_host(seen: Bool) -> tuple[Int, Int]:
+    """The landmarks in the order of the frames that saw them first, and where in it each frame begins (K + 1,)."""
+    count, frames = seen.shape
+    hosts, begins = np.full(count, -1), np.zeros(frames + 1, np.int64)
+    for i in range(count):
+        for f in range(frames):
+            if seen[i, f]:
+                hosts[i] = f
+                begins[f + 1] += 1
+                break
+    for f in range(frames):
+        begins[f + 1] += begins[f]
+    order, at = np.empty(count, np.int64), begins.copy()
+    for i in range(count):
+        if hosts[i] >= 0:
+            order[at[hosts[i]]] = i
+            at[hosts[i]] += 1
+    return order, begins
+
+
+@kernel
+def _squared(rows: Float, count: int, out: Float) -> None:
+    """The upper half of J^T [J r], (25, 26), of the first ``count`` rows [J r], an even number, four at a time."""
+    if count % 4:
+        rows[count : count + 2] = 0.0
+    out[:] = 0.0
+    for k in range(0, count, 4):
+        J_0, J_1, J_2, J_3 = rows[k], rows[k + 1], rows[k + 2], rows[k + 3]
+        for u in range(25):
+            own, a_0, a_1, a_2, a_3 = out[u], J_0[u], J_1[u], J_2[u], J_3[u]
+            for v in range(u, 26):
+                own[v] += a_0 * J_0[v] + a_1 * J_1[v] + a_2 * J_2[v] + a_3 * J_3[v]
+
+
+@kernel
+def _empty_view() -> View:
+    return np.empty((3, 3)), np.empty((3, 3)), np.empty(3)
+
+
+@kernel
+def _view(R_fh: Float, t_fh: Float, R_rowC: Float, p_rowC: Float, R_BC: Float, p_BC: Float, view: View) -> None:
+    """``view`` from the host: rotations from its camera and its body to the frame's camera, and the translation."""
+    R_CC, R_CB, t_C = view
+    for i in range(3):
+        for k in range(3):
+            R_CB[i, k] = R_rowC[0, i] * R_fh[0, k] + R_rowC[1, i] * R_fh[1, k] + R_rowC[2, i] * R_fh[2, k]
+    for i in range(3):
+        t_C[i] = 0.0
+        for k in range(3):
+            R_CC[i, k] = R_CB[i, 0] * R_BC[0, k] + R_CB[i, 1] * R_BC[1, k] + R_CB[i, 2] * R_BC[2, k]
+            t_C[i] += R_CB[i, k] * p_BC[k] + R_rowC[k, i] * (t_fh[k] - p_rowC[k])
+
+
+@kernel
+def _direction(view: View, x: float, y: float, rho: float, X: Float) -> None:
+    """``X`` (3,): rho times the position in the frame's camera of the landmark [x y rho]."""
+    R_CC, _, t_C = view
+    for i in range(3):
+        X[i] = R_CC[i, 0] * x + R_CC[i, 1] * y + R_CC[i, 2] + rho * t_C[i]
+
+
+@kernel
+def _add_own(own: Float, host: int, f: int, H: Float, g: Float) -> None:
+    """Add what :func:`_squared` makes of a frame's sightings of a host's landmarks; of ``H`` the upper half."""
+    at_h, at_f, at_camera = 6 * host, 6 * f, len(g) - CALIBRATION_SIZE
+    if host != f:
+        for u in range(9):
+            row = at_h + u if u < 6 else at_f + u - 6
+            g[row] += own[u, 25]
+            for v in range(u, 6):
+                H[row, at_h + v] += own[u, v]
+            for v in range(max(u, 6), 9):
+                H[row, at_f + v - 6] += own[u, v]
+            for v in range(9, 25):
+                H[row, at_camera + v - 9] += own[u, v]
+            for v in range(3):  # dp_frame
+                H[row, at_f + 3 + v] -= own[u, 3 + v] if u < 3 + v else own[3 + v, u]
+        for u in range(3, 6):
+            row = at_f + u
+            g[row] -= own[u, 25]
+            for v in range(u, 6):
+                H[row, at_f + v] += own[u, v]
+            for v in range(9, 25):
+                H[row, at_camera + v - 9] -= own[u, v]
+    for u in range(CALIBRATION_SIZE):
+        g[at_camera + u] += own[9 + u, 25]
+        for v in range(u, CALIBRATION_SIZE):
+            H[at_camera + u, at_camera + v] += own[9 + u, 9 + v]

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from time import perf_counter
 
@@ -10,19 +11,27 @@ import numpy as np
 from scipy.linalg.lapack import dpotrf, dpotrs
 
 from vioframe.arrays import Float, Int
-from vioframe.estimation.factors.problem import Problem, Variables
+from vioframe.estimation.factors.problem import Normal, Problem, Variables
+from vioframe.jit import kernel
 
 _FIRST_DAMPING, _LARGEST_DAMPING = 1e-6, 1e3
 
 
 @dataclass(frozen=True, slots=True)
 class Solution:
-    """Where the solver came to; ``iterations`` counts the steps it took, which may not have been enough."""
+    """Where the solver came to, and the equations there.
+
+    ``iterations`` counts the steps it took, which may not have been enough.
+    """
 
     variables: Variables
-    cost: float
+    normal: Normal
     iterations: int
     converged: bool
+
+    @property
+    def cost(self) -> float:
+        return self.normal.cost
 
 
 def solve(
@@ -39,33 +48,64 @@ def solve(
     where it is not zero. Raises ``LinAlgError`` where nothing finite comes out.
     """
     begin_s = perf_counter()
-    damping, cost = _FIRST_DAMPING, problem.cost(x)
+    damping, normal = _FIRST_DAMPING, problem.linearise(x)
     for iteration in range(max_iterations):
-        normal = problem.linearise(x)
         while True:
-            S, g, eliminated = normal.reduced(damping)
-            step = np.zeros(len(g))
-            step[active] = -solve_positive(S[np.ix_(active, active)], g[active])
-            trial = x.retract(step, normal.landmark_step(step, eliminated))
-            trial_cost = problem.cost(trial)
-            if trial_cost <= cost:
+            trial = x.retract(*_step(normal, active, damping))
+            # Nearly all steps lead down: their equations are those of the next one.
+            trial_normal = problem.linearise(trial)
+            if trial_normal.cost <= normal.cost:
                 break
             damping = max(10.0 * damping, 1e-4)
-            if damping > _LARGEST_DAMPING or not np.isfinite(trial_cost):
+            if damping > _LARGEST_DAMPING or not np.isfinite(trial_normal.cost):
                 # No step leads down: a minimum to rounding.
-                return _finite(Solution(x, cost, iteration, bool(np.isfinite(trial_cost))))
-        small = cost - trial_cost < relative_decrease * max(abs(trial_cost), 1.0)
-        x, cost, damping = trial, trial_cost, 0.1 * damping
+                return _finite(Solution(x, normal, iteration, bool(np.isfinite(trial_normal.cost))))
+        small = normal.cost - trial_normal.cost < relative_decrease * max(abs(trial_normal.cost), 1.0)
+        x, normal, damping = trial, trial_normal, 0.1 * damping
         if small or 0.0 < max_seconds < perf_counter() - begin_s:
-            return _finite(Solution(x, cost, iteration + 1, small))
-    return _finite(Solution(x, cost, max_iterations, False))
+            return _finite(Solution(x, normal, iteration + 1, small))
+    return _finite(Solution(x, normal, max_iterations, False))
+
+
+def _step(normal: Normal, active: Int, damping: float) -> tuple[Float, Float]:
+    """Of the states and the calibration (n,), and of the landmarks (L, 3)."""
+    S, g, eliminated = normal.reduced(damping)
+    scaled, right, scale = _scaled(S, g, active)
+    L, bad = dpotrf(scaled.T, lower=1, clean=0, overwrite_a=1)
+    if bad:
+        raise np.linalg.LinAlgError("the window's equations are not positive definite")
+    solved, _ = dpotrs(L, right, lower=1, overwrite_b=1)
+    step = np.zeros(len(g))
+    step[active] = -scale * solved
+    return step, normal.landmark_step(step, eliminated)
+
+
+@kernel
+def _scaled(S: Float, g: Float, active: Int) -> tuple[Float, Float, Float]:
+    """The upper half of the ``active`` equations, the right side, and the Jacobi scaling that is in both.
+
+    The entries of S differ by many orders of magnitude.
+    """
+    count = len(active)
+    out, right, scale = np.empty((count, count)), np.empty(count), np.empty(count)
+    for u in range(count):
+        scale[u] = 1.0 / math.sqrt(max(S[active[u], active[u]], 1e-12))
+        right[u] = scale[u] * g[active[u]]
+    for u in range(count):
+        row = S[active[u]]
+        for v in range(u, count):
+            out[u, v] = scale[u] * scale[v] * row[active[v]]
+    return out, right, scale
 
 
 def solve_positive(S: Float, g: Float) -> Float:
-    """S^-1 g for a positive definite S (n, n), g (n,) or (n, m); raises ``LinAlgError`` for any other."""
+    """S^-1 g for a positive definite S (n, n), g (n,) or (n, m); raises ``LinAlgError`` for any other.
+
+    Of S the upper half counts.
+    """
     # Jacobi scaling: the entries of S differ by many orders of magnitude.
     scale = 1.0 / np.sqrt(np.maximum(np.diag(S), 1e-12))
-    L, bad = dpotrf(S * scale[:, None] * scale, lower=1, overwrite_a=1)
+    L, bad = dpotrf((S * scale[:, None] * scale).T, lower=1, overwrite_a=1)
     if bad:
         raise np.linalg.LinAlgError("the window's equations are not positive definite")
     scaled = (scale * g.T).T
