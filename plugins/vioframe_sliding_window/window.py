@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -204,9 +205,8 @@ class Window:
     def optimise(self) -> int:
         """Move states, calibration and landmarks to where all factors agree best; returns the number of steps."""
         options, rows = self._options, np.flatnonzero(self.tracks.known)
-        problem = self._problem(rows)
         solution = solve(
-            problem,
+            self._problem(self._readings, self._still, self._sightings(rows)),
             self._variables(rows),
             self._active(),
             options.max_iterations,
@@ -250,7 +250,9 @@ class Window:
         rows = np.flatnonzero(tracks.known & (tracks.hosts == 0))
         seen = tracks.seen[rows]
         seen[seen[:, -1], (len(self) + 1) // 2 :] = False
-        problem = self._oldest_problem(rows, seen)
+        sightings = self._sightings(rows)._replace(seen=seen)
+        still = {k: still for k, still in self._still.items() if k == 0}
+        problem = self._problem(self._readings[:1], still, sightings)
         self._prior = marginalise_oldest(problem, self._variables(rows))
         ids, p_WF = tracks.ids[rows], positions(self._states, self._camera, tracks.hosts[rows], tracks.landmarks[rows])
         tracks.drop_frame(0)
@@ -272,19 +274,9 @@ class Window:
     def _variables(self, rows: Int) -> Variables:
         return Variables(self._states, self._camera, self.tracks.landmarks[rows])
 
-    def _problem(self, rows: Int) -> Problem:
-        """All factors of the window, with the landmarks of ``rows``."""
-        first_estimates = self._options.first_estimate_jacobians
-        readings = ImuFactors.stack(self._readings)
-        return Problem(self._prior, readings, self._still, self._sightings(rows), first_estimates)
-
-    def _oldest_problem(self, rows: Int, seen: Bool) -> Problem:
-        """The factors that touch the oldest state; ``seen`` (L, K) is what counts of the sightings of ``rows``."""
-        return replace(
-            self._problem(rows),
-            readings=ImuFactors.stack(self._readings[:1]),
-            still={k: still for k, still in self._still.items() if k == 0},
-            sightings=self._sightings(rows)._replace(seen=seen),
+    def _problem(self, readings: list[Preintegrated], still: Mapping[int, Standstill], sightings: Sightings) -> Problem:
+        return Problem(
+            self._prior, ImuFactors.stack(readings), still, sightings, self._options.first_estimate_jacobians
         )
 
     def _sightings(self, rows: Int) -> Sightings:

@@ -111,7 +111,11 @@ class ImuFactors(NamedTuple):
 
     def linearise(self, i: StateArrays, j: StateArrays) -> tuple[Float, Float, Float]:
         """Residuals (K, 15) and their Jacobians (K, 15, 15) by the errors of states i and j [App. C]."""
-        return _linearise_each(self, i.parts, j.parts)
+        count = len(self.dt_s)
+        r, J = np.empty((count, 15)), np.empty((count, 15, 30))
+        for k in range(count):
+            linearise_reading(self, k, i.parts, k, j.parts, k, r[k], J[k])
+        return r, J[:, :, :15], J[:, :, 15:]
 
 
 @kernel
@@ -191,12 +195,3 @@ def linearise_reading(
             J[3 + m, 9 + n], J[6 + m, 9 + n] = -by_bias[3 + m, n], -by_bias[6 + m, n]
     for m in range(9, 15):
         J[m, m], J[m, 15 + m] = -1.0, 1.0
-
-
-@kernel
-def _linearise_each(factors: ImuFactors, states_i: States, states_j: States) -> tuple[Float, Float, Float]:
-    count = len(factors.dt_s)
-    r, J = np.empty((count, 15)), np.empty((count, 15, 30))
-    for k in range(count):
-        linearise_reading(factors, k, states_i, k, states_j, k, r[k], J[k])
-    return r, J[:, :, :15].copy(), J[:, :, 15:].copy()

@@ -41,10 +41,7 @@ def in_images(states: StateArrays, camera: Calibrated, hosts: Int, landmarks: Fl
     Points that are not in front are at the centre, at an infinite depth.
     """
     R_WC, p_WC = camera_poses(states, camera)
-    p_C = np.einsum("kji,lkj->lki", R_WC, positions(states, camera, hosts, landmarks)[:, None] - p_WC)
-    in_front = p_C[..., 2] > MIN_DEPTH_M
-    z = np.where(in_front, p_C[..., 2], np.inf)
-    return p_C[..., :2] / z[..., None], z
+    return _in_images(R_WC, p_WC, positions(states, camera, hosts, landmarks))
 
 
 def image_velocities(states: StateArrays, camera: Calibrated, gyro_B: Float, xy: Float, depth: Float) -> Float:
@@ -55,11 +52,9 @@ def image_velocities(states: StateArrays, camera: Calibrated, gyro_B: Float, xy:
     multiplies a residual with the same noise, would pass for a time offset. It is that at the stamp: until the row of a
     rolling shutter is read it hardly changes.
     """
-    ray = np.concatenate([xy, np.ones((*depth.shape, 1))], axis=-1)
     rate_B, velocity_B = motion_in_body(states, gyro_B)
     velocity_B = velocity_B + np.cross(rate_B, camera.p_BC)
-    moved = -np.cross(rate_B @ camera.R_BC, ray) - velocity_B @ camera.R_BC / depth[..., None]
-    return np.asarray(moved[..., :2] - ray[..., :2] * moved[..., 2:])
+    return _image_velocities(rate_B @ camera.R_BC, velocity_B @ camera.R_BC, xy, depth)
 
 
 def motion_in_body(states: StateArrays, gyro_B: Float) -> tuple[Float, Float]:
@@ -70,6 +65,39 @@ def motion_in_body(states: StateArrays, gyro_B: Float) -> tuple[Float, Float]:
 def camera_poses(states: StateArrays, camera: Calibrated) -> tuple[Float, Float]:
     """R_WC (K, 3, 3) and p_WC (K, 3)."""
     return states.R_WB @ camera.R_BC, states.R_WB @ camera.p_BC + states.p_WB
+
+
+@kernel
+def _in_images(R_WC: Float, p_WC: Float, p_WF: Float) -> tuple[Float, Float]:
+    """What :func:`in_images` gives, of landmarks at ``p_WF`` (L, 3) m."""
+    count, frames = len(p_WF), len(p_WC)
+    xy, depth = np.zeros((count, frames, 2)), np.full((count, frames), np.inf)
+    for f in range(frames):
+        R = R_WC[f]
+        for i in range(count):
+            x, y, z = p_WF[i, 0] - p_WC[f, 0], p_WF[i, 1] - p_WC[f, 1], p_WF[i, 2] - p_WC[f, 2]
+            ahead = R[0, 2] * x + R[1, 2] * y + R[2, 2] * z
+            if ahead > MIN_DEPTH_M:
+                depth[i, f] = ahead
+                xy[i, f, 0] = (R[0, 0] * x + R[1, 0] * y + R[2, 0] * z) / ahead
+                xy[i, f, 1] = (R[0, 1] * x + R[1, 1] * y + R[2, 1] * z) / ahead
+    return xy, depth
+
+
+@kernel
+def _image_velocities(rate_C: Float, velocity_C: Float, xy: Float, depth: Float) -> Float:
+    """What :func:`image_velocities` gives, of cameras that turn and fly at so much (K, 3), in their own axes."""
+    count, frames = depth.shape
+    out = np.empty((count, frames, 2))
+    for f in range(frames):
+        w_0, w_1, w_2 = rate_C[f, 0], rate_C[f, 1], rate_C[f, 2]
+        v_0, v_1, v_2 = velocity_C[f, 0], velocity_C[f, 1], velocity_C[f, 2]
+        for i in range(count):
+            x, y, nearness = xy[i, f, 0], xy[i, f, 1], 1.0 / depth[i, f]
+            along = w_1 * x - w_0 * y - v_2 * nearness
+            out[i, f, 0] = w_2 * y - w_1 - v_0 * nearness - x * along
+            out[i, f, 1] = w_0 - w_2 * x - v_1 * nearness - y * along
+    return out
 
 
 @kernel

@@ -132,13 +132,13 @@ class Problem:
     def linearise(self, x: Variables) -> Normal:
         """The normal equations at ``x``, and the cost."""
         states = x.states.parts
-        first = self.prior.first(x.states) if self.first_estimates else x.states
         equations = _normal_equations(
             self.prior._parts, self.readings, self.sightings, self.first_estimates, states, x.camera, x.landmarks
         )
         normal = Normal(*equations, self.sightings.seen)
         for k, still in self.still.items():
             residual = still.residual(*(part[k] for part in states if part is not x.states.p_WB)) / still.sigma
+            first = self.prior.first(x.states) if self.first_estimates else x.states
             J = -still.jacobian(first.R_WB[k]) / still.sigma[:, None]
             at = slice(STATE_SIZE * k, STATE_SIZE * (k + 1))
             normal.H[at, at] += J.T @ J

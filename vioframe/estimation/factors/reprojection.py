@@ -215,24 +215,44 @@ def eliminate(
         z[i, 0] = i00 * c[i, 0]
         z[i, 1] = i10 * c[i, 0] + i11 * c[i, 1]
         z[i, 2] = i20 * c[i, 0] + i21 * c[i, 1] + i22 * c[i, 2]
-    order, _ = _by_host(seen)
+    _add_squares(seen, Y, z, S, g)
+    return S, g, (Y, z, inverse)
+
+
+@kernel
+def _add_squares(seen: Bool, Y: Float, z: Float, S: Float, g: Float) -> None:
+    """Add Y^T Y to the upper half of ``S`` (n, n) and Y^T z to ``g`` (n,), two landmarks at a time.
+
+    These are neighbours in an order by which most have been seen by the same frames.
+    """
+    count, frames = seen.shape
+    n, at_camera = len(g), 6 * frames
+    first, last = np.full(count, frames), np.zeros(count, np.int64)
+    for i in range(count):
+        for f in range(frames):
+            if seen[i, f]:
+                first[i], last[i] = min(first[i], f), f
+    order = np.argsort(first * frames + last, kind="mergesort")
     for k in range(0, count, 2):
-        # Two at a time that frames have in common.
         i, j = order[k], order[min(k + 1, count - 1)]
         other = 1.0 if k + 1 < count else 0.0
         y_0, y_1, y_2, y_3, y_4, y_5 = Y[i, 0], Y[i, 1], Y[i, 2], Y[j, 0], Y[j, 1], Y[j, 2]
-        for u in range(n):
-            if u < 6 * frames and not (seen[i, u // 6] or seen[j, u // 6]):
+        begin, end = 6 * min(first[i], first[j]), 6 * max(last[i], last[j]) + 6
+        for u in range(begin, n):
+            if end <= u < at_camera:
                 continue
             a_0, a_1, a_2 = y_0[u], y_1[u], y_2[u]
             a_3, a_4, a_5 = other * y_3[u], other * y_4[u], other * y_5[u]
             g[u] += a_0 * z[i, 0] + a_1 * z[i, 1] + a_2 * z[i, 2] + a_3 * z[j, 0] + a_4 * z[j, 1] + a_5 * z[j, 2]
             own = S[u]
-            for v in range(u, n):
+            for v in range(u, end):
                 own[v] += (
                     a_0 * y_0[v] + a_1 * y_1[v] + a_2 * y_2[v] + a_3 * y_3[v] + a_4 * y_4[v] + a_5 * y_5[v]
                 )  # fmt: skip
-    return S, g, (Y, z, inverse)
+            for v in range(max(u, at_camera), n):
+                own[v] += (
+                    a_0 * y_0[v] + a_1 * y_1[v] + a_2 * y_2[v] + a_3 * y_3[v] + a_4 * y_4[v] + a_5 * y_5[v]
+                )  # fmt: skip
 
 
 @kernel
