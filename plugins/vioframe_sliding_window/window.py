@@ -17,7 +17,7 @@ from vioframe.estimation.factors.landmarks import (
     positions,
     triangulate_tracks,
 )
-from vioframe.estimation.factors.problem import STATE_SIZE, Prior, Problem, Variables, marginalise_oldest
+from vioframe.estimation.factors.problem import STATE_SIZE, Normal, Prior, Problem, Variables, marginalise_oldest
 from vioframe.estimation.factors.reprojection import (
     CALIBRATION_SIZE,
     FIXED_LENS,
@@ -31,8 +31,9 @@ from vioframe.estimation.factors.reprojection import (
     Sightings,
     pixels_by_intrinsics,
     pixels_by_residual,
+    undistorted,
 )
-from vioframe.estimation.factors.solver import solve, solve_positive
+from vioframe.estimation.factors.solver import covariance_of_last, solve
 from vioframe.estimation.factors.tracks import LandmarkTable, TrackTable
 from vioframe.estimation.inertial.noise import noise_over
 from vioframe.estimation.inertial.preintegration import Preintegrated, join_segments, preintegrate
@@ -144,7 +145,8 @@ class Window:
     def _add_tracks(self, tracks: FrameTracks) -> None:
         on_sphere, intrinsics = self._options.residual == "sphere", self._camera.intrinsics
         if self._varies_lens:
-            tracks = tracks.undistorted(self._given.cameras[0].model.with_intrinsics(intrinsics)).finite()
+            xy_normalised = undistorted(self._camera_model, intrinsics, tracks.xy, tracks.xy_normalised)
+            tracks = replace(tracks, xy_normalised=xy_normalised).finite()
         self._undistorted_with = np.concatenate([self._undistorted_with, intrinsics[None]])
         to_px = pixels_by_residual(self._camera_model, intrinsics, tracks.xy_normalised, on_sphere)
         rows = self.tracks.add_frame(tracks)
@@ -214,8 +216,7 @@ class Window:
         )
         x = solution.variables
         self._states, self._camera, self.tracks.landmarks[rows] = x.states, x.camera, x.landmarks
-        S, _, _ = solution.normal.reduced(0.0)
-        self._cov, self._camera_sigma = self._covariance(S)
+        self._cov, self._camera_sigma = self._covariance(solution.normal)
         return solution.iterations
 
     def reject_outliers(self) -> tuple[int, int]:
@@ -315,17 +316,12 @@ class Window:
         """The entries of the error vector that are estimated."""
         return np.flatnonzero(np.append(np.ones(STATE_SIZE * len(self), bool), self._calibrated))
 
-    def _covariance(self, S: Float) -> tuple[Float, Float]:
+    def _covariance(self, normal: Normal) -> tuple[Float, Float]:
         """Of the newest state (15, 15), and the standard deviations of the calibration, zero where it is fixed."""
-        active = self._active()
-        at = STATE_SIZE * (len(self) - 1)
-        unit = np.zeros((len(active), len(active) - at))
-        unit[at:] = np.eye(len(active) - at)
-        end = solve_positive(S[np.ix_(active, active)], unit)[at:]
+        end = covariance_of_last(normal, self._active(), STATE_SIZE + int(self._calibrated.sum()))
         sigma = np.zeros(CALIBRATION_SIZE)
-        sigma[active[at + STATE_SIZE :] - at - STATE_SIZE] = np.sqrt(np.diag(end)[STATE_SIZE:])
-        cov = end[:STATE_SIZE, :STATE_SIZE]
-        return 0.5 * (cov + cov.T), sigma
+        sigma[self._calibrated] = np.sqrt(np.diag(end)[STATE_SIZE:])
+        return end[:STATE_SIZE, :STATE_SIZE], sigma
 
 
 def _calibrated(options: SlidingWindowOptions) -> Bool:

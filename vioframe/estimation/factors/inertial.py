@@ -5,6 +5,7 @@ Forster et al. (T-RO 2017), numbers in brackets. Shared by the initialisation an
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -102,7 +103,7 @@ class ImuFactors(NamedTuple):
             stacked("bias_gyro_B", 3),
             stacked("bias_accel_B", 3),
             stacked("bias_jacobian", 9, 6),
-            np.linalg.inv(np.linalg.cholesky(stacked("cov", 15, 15))),
+            _whitening(stacked("cov", 15, 15)),
         )
 
     def residuals(self, i: StateArrays, j: StateArrays) -> Float:
@@ -116,6 +117,28 @@ class ImuFactors(NamedTuple):
         for k in range(count):
             linearise_reading(self, k, i.parts, k, j.parts, k, r[k], J[k])
         return r, J[:, :, :15], J[:, :, 15:]
+
+
+@kernel
+def _whitening(cov: Float) -> Float:
+    """(K, 15, 15) inverses of the Cholesky factors of covariances (K, 15, 15)."""
+    out = np.zeros(cov.shape)
+    L = np.zeros((15, 15))
+    for k in range(len(cov)):
+        for i in range(15):
+            for j in range(i + 1):
+                rest = cov[k, i, j]
+                for m in range(j):
+                    rest -= L[i, m] * L[j, m]
+                L[i, j] = math.sqrt(rest) if i == j else rest / L[j, j]
+        for j in range(15):
+            out[k, j, j] = 1.0 / L[j, j]
+            for i in range(j + 1, 15):
+                rest = 0.0
+                for m in range(j, i):
+                    rest -= L[i, m] * out[k, m, j]
+                out[k, i, j] = rest / L[i, i]
+    return out
 
 
 @kernel

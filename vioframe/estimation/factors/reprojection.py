@@ -20,7 +20,7 @@ from typing import NamedTuple
 import numpy as np
 
 from vioframe.arrays import Bool, Float, Int
-from vioframe.geometry.kernels import distort, exp, intrinsics_jacobian
+from vioframe.geometry.kernels import distort, exp, intrinsics_jacobian, undistort
 from vioframe.jit import kernel
 
 # Depth in a frame over depth in the host: a landmark nearer than this is beside the camera, and cannot be seen.
@@ -149,6 +149,19 @@ def relative_poses(R_WB: Float, p_WB: Float) -> tuple[Float, Float, Float]:
 
 
 @kernel
+def undistorted(model: int, k: Float, xy: Float, guess: Float) -> Float:
+    """(N, 2) px -> (N, 2) on the z = 1 plane, from a ``guess`` (N, 2) by nearly the same camera; NaN where it fails."""
+    out = np.empty(xy.shape)
+    for i in range(len(xy)):
+        out[i, 0], out[i, 1] = undistort(model, k, xy[i, 0], xy[i, 1], guess[i, 0], guess[i, 1])
+        px, J = distort(model, k, out[i, 0], out[i, 1])
+        # Past the fold of the distortion the image is mirrored.
+        if not (abs(px[0] - xy[i, 0]) + abs(px[1] - xy[i, 1]) < 1e-3 and J[0, 0] * J[1, 1] > J[0, 1] * J[1, 0]):
+            out[i] = np.nan
+    return out
+
+
+@kernel
 def pixels_by_residual(model: int, k: Float, xy: Float, on_sphere: bool) -> Float:
     """(N, 2, 2) px of the distorted image by the residual at points (N, 2) of the z = 1 plane."""
     out = np.empty((len(xy), 2, 2))
@@ -189,7 +202,6 @@ def eliminate(
     Y^T z.
     """
     count, _, n = W.shape
-    frames = seen.shape[1]
     Y, z, inverse = np.empty((count, 3, n)), np.empty((count, 3)), np.zeros((count, 3, 3))
     S, g = np.zeros((n, n)), np.zeros(n)
     for i in range(count):

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 from time import perf_counter
 
 import numpy as np
-from scipy.linalg.lapack import dpotrf, dpotrs
+from scipy.linalg.lapack import dpotrf, dpotri, dpotrs
 
 from vioframe.arrays import Float, Int
-from vioframe.estimation.factors.problem import Normal, Problem, Variables
+from vioframe.estimation.factors.problem import Normal, Problem, Variables, symmetric
 from vioframe.jit import kernel
 
 _FIRST_DAMPING, _LARGEST_DAMPING = 1e-6, 1e3
@@ -70,14 +70,29 @@ def solve(
 def _step(normal: Normal, active: Int, damping: float) -> tuple[Float, Float]:
     """Of the states and the calibration (n,), and of the landmarks (L, 3)."""
     S, g, eliminated = normal.reduced(damping)
-    scaled, right, scale = _scaled(S, g, active)
-    L, bad = dpotrf(scaled.T, lower=1, clean=0, overwrite_a=1)
-    if bad:
-        raise np.linalg.LinAlgError("the window's equations are not positive definite")
+    L, right, scale = _factored(S, g, active)
     solved, _ = dpotrs(L, right, lower=1, overwrite_b=1)
     step = np.zeros(len(g))
     step[active] = -scale * solved
     return step, normal.landmark_step(step, eliminated)
+
+
+def covariance_of_last(normal: Normal, active: Int, count: int) -> Float:
+    """(count, count) of the last unknowns that are ``active``, all others being free."""
+    S, g, _ = normal.reduced(0.0)
+    L, _, scale = _factored(S, g, active)
+    # The last rows of the factor are that of the equations which remain, all others being eliminated.
+    cov, _ = dpotri(L[-count:, -count:], lower=1)
+    return np.asarray(symmetric(cov.T) * np.outer(scale[-count:], scale[-count:]))
+
+
+def _factored(S: Float, g: Float, active: Int) -> tuple[Float, Float, Float]:
+    """Cholesky's factor of the ``active`` equations, of which the lower half counts, right side and scaling of both."""
+    scaled, right, scale = _scaled(S, g, active)
+    L, bad = dpotrf(scaled.T, lower=1, clean=0, overwrite_a=1)
+    if bad:
+        raise np.linalg.LinAlgError("the window's equations are not positive definite")
+    return L, right, scale
 
 
 @kernel
