@@ -5,11 +5,13 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from numpy.lib.stride_tricks import sliding_window_view
 from simulation_helpers import small_calibration
 
 from vioframe.errors import ConfigError
 from vioframe.geometry import so3
 from vioframe.geometry.cameras import Camera
+from vioframe.geometry.meshes import ray_scene
 from vioframe.io.calibration import packaged_calibration
 from vioframe.simulation.camera import Photographer, Shot, Studio, take_pictures
 from vioframe.simulation.conditions import Conditions
@@ -17,7 +19,7 @@ from vioframe.simulation.renderer import Renderer
 from vioframe.simulation.textures import SIZE, images_as_textures, procedural_textures
 from vioframe.simulation.world import MeshBuilder, MeshWorld, draw_movers
 
-pytest.importorskip("open3d", exc_type=ImportError)
+open3d = pytest.importorskip("open3d", exc_type=ImportError)
 
 EUROC = packaged_calibration("euroc", cameras=["cam0"]).cameras[0].model
 SMALL = small_calibration().cameras[0].model
@@ -87,6 +89,43 @@ def test_a_vertex_is_drawn_where_it_projects_to(camera, seed):
         assert np.linalg.norm(drawn - centroid(outline)) < 0.1
 
 
+@pytest.mark.parametrize("camera", [EUROC, FISHEYE], ids=["radtan", "equidistant"])
+@pytest.mark.parametrize("rolling", [False, True], ids=["still", "rolling"])
+def test_every_pixel_sees_what_its_ray_hits(camera, rolling):
+    """White boxes and pipes in fog, on a floor, some of them around the camera: as bright as Open3D's hits are far."""
+    rng, fog_per_m = np.random.default_rng(5), 0.1
+    builder = MeshBuilder()
+    builder.quad(np.array([-20.0, -20.0, -1.0]), *(40.0 * np.eye(3)[:2]), 0, 1.0, np.zeros(2))
+    for low in rng.uniform(-6.0, 5.0, (60, 3)):
+        builder.box(low, low + rng.uniform(0.2, 1.5, 3), np.zeros(6, int), 1.0, np.zeros(2))
+    for start in rng.uniform(-6.0, 6.0, (10, 3)):
+        builder.tube(start, start + rng.uniform(-8.0, 8.0, 3), 0.1, 0, 1.0, np.zeros(2))
+    mesh = builder.build()
+    movers = draw_movers(3, np.zeros(1), np.zeros((1, 1, 3)), 1, rng)
+    p_WM, R_WC, p_WC = rng.uniform(-3.0, 3.0, (3, 3)), so3.exp(rng.normal(0.0, 1.0, 3)), rng.normal(0.0, 0.1, 3)
+    white = MeshWorld(mesh, (np.full((8, 8), 255, np.uint8),))
+    height = camera.resolution[1]
+    pose = (np.tile(R_WC, (height, 1, 1)), np.tile(p_WC, (height, 1))) if rolling else (R_WC, p_WC)
+    light = Renderer(camera, white, movers, fog_per_m=fog_per_m).render(*pose, p_WM)
+
+    rays_C = np.column_stack([camera.undistort(np.argwhere(light.T >= 0.0)), np.ones(light.size)])
+    rays = np.column_stack([np.tile(p_WC, (light.size, 1)), rays_C @ R_WC.T]).astype(np.float32)
+    scene = ray_scene(np.concatenate([mesh.corners, movers.corners(p_WM)]))
+    hits = scene.cast_rays(open3d.core.Tensor.from_numpy(rays))
+    normal_W, triangle = hits["primitive_normals"].numpy(), hits["primitive_ids"].numpy().reshape(light.T.shape).T
+    facing = np.sign((normal_W * rays[:, 3:]).sum(axis=1))
+    brightness = 1.0 - facing * (normal_W @ [0.22, 0.11, 0.20])
+    clear = np.exp(-fog_per_m * hits["t_hit"].numpy() * np.linalg.norm(rays_C, axis=1))
+    at_all = np.isfinite(hits["t_hit"].numpy())  # a lens may have no ray for a pixel
+    expected = np.where(at_all, clear * brightness + 0.5 * (1.0 - clear), 0.5).reshape(light.T.shape).T
+
+    # Where a pixel's neighbours see another triangle, it may be a mean over several.
+    around = sliding_window_view(triangle, (3, 3)).reshape(light.shape[0] - 2, -1, 9)
+    alone = (around == around[..., :1]).all(axis=-1)
+    assert 0.6 < alone.mean() < 0.99
+    np.testing.assert_allclose(light[1:-1, 1:-1][alone], expected[1:-1, 1:-1][alone], atol=1e-4)
+
+
 def test_light_is_that_of_the_texture_and_of_the_surface():
     """Straight on, a white wall is as bright everywhere; what is beyond it is grey."""
     renderer = Renderer(SMALL, board())
@@ -127,7 +166,7 @@ def shots(count: int, instants: int = 1) -> list[Shot]:
     return [Shot(0, R, np.tile([0.0, 0.1 * k, -2.0], (instants, 1)), None, 1.0, (1, k)) for k in range(count)]
 
 
-def test_the_number_of_processes_makes_no_difference():
+def test_the_number_of_threads_makes_no_difference():
     studio = Studio((SMALL,), board(), conditions=Conditions(noise=0.6))
     alone, together = (list(take_pictures(studio, shots(11), workers)) for workers in (1, 2))
     assert len(alone) == len(together) == 11

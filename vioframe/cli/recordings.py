@@ -65,7 +65,7 @@ _COMPRESSIONS = sorted({name for format in FORMATS.values() for name in format.c
 )
 @click.option("--config", "file", type=FILE, help="Configuration, or manifest of a recording to make again.")
 @click.option("--compression", type=click.Choice(["bz2", "lz4", "zstd"]), help="Compress bags.  [default: no]")
-@click.option("--workers", type=click.IntRange(1), help="Processes that render.  [default: the number of cores]")
+@click.option("--workers", type=click.IntRange(1), help="Threads that render.  [default: the number of cores]")
 @click.option("--overwrite", is_flag=True, help="Replace a simulated recording of the same name.")
 @quiet_option
 def simulate(

@@ -2,24 +2,19 @@
 
 from __future__ import annotations
 
-import os
-import signal
 from collections import deque
 from collections.abc import Iterable, Iterator
-from concurrent.futures import Future, ProcessPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
-from multiprocessing import get_context, parent_process
-from threading import Thread
 
 import numpy as np
 
 from vioframe.arrays import Float, Image
-from vioframe.errors import DatasetError
 from vioframe.geometry.cameras import Camera
 from vioframe.interfaces import World
 from vioframe.simulation.conditions import Conditions
-from vioframe.simulation.renderer import Float32, Renderer
+from vioframe.simulation.rasterizer import Float32
+from vioframe.simulation.renderer import Renderer
 from vioframe.simulation.world import Movers
 
 _MIDDLE_GREY = 0.4
@@ -47,7 +42,7 @@ class Shot:
 
 @dataclass(frozen=True)
 class Studio:
-    """All that is the same for every picture: world, optics and sensors. Small enough to be sent to other processes."""
+    """All that is the same for every picture: world, optics and sensors."""
 
     cameras: tuple[Camera, ...]
     world: World
@@ -101,50 +96,17 @@ def digitise(
 
 
 def take_pictures(studio: Studio, shots: Iterable[Shot], workers: int) -> Iterator[Image]:
-    """The pictures in the order of the shots, taken by ``workers`` processes; by this one where that is one.
-
-    Raises :class:`DatasetError` where a process ends before its time.
-    """
-    if workers == 1:
-        yield from map(Photographer(studio).take, shots)
-        return
-    # Spawned, not forked: threads of BLAS and Open3D do not survive a fork.
-    pool = ProcessPoolExecutor(workers, get_context("spawn"), _open_studio, (studio,))
+    """The pictures in the order of the shots, taken by ``workers`` threads: compiled loops run side by side."""
+    take = Photographer(studio).take
+    pool = ThreadPoolExecutor(workers)
     waiting: deque[Future[Image]] = deque()
     try:
         for shot in shots:
-            waiting.append(pool.submit(_take, shot))
+            waiting.append(pool.submit(take, shot))
             # A few ahead for each, and no more: shots and pictures must not pile up.
             if len(waiting) > 4 * workers:
                 yield waiting.popleft().result()
         while waiting:
             yield waiting.popleft().result()
-    except BrokenProcessPool as error:
-        raise DatasetError("a rendering process died, perhaps of too little memory; try fewer --workers") from error
     finally:
         pool.shutdown(wait=True, cancel_futures=True)
-
-
-_photographer: Photographer | None = None
-"""That of a worker process: what it renders with is built once, not for every shot."""
-
-
-def _open_studio(studio: Studio) -> None:
-    global _photographer
-    # Ctrl-C goes to the whole group of processes; the one that waits for these ends them.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    Thread(target=_end_with_parent, daemon=True).start()
-    _photographer = Photographer(studio)
-
-
-def _end_with_parent() -> None:
-    """Where the one that waits is killed, nobody else would end this process."""
-    parent = parent_process()
-    assert parent is not None
-    parent.join()
-    os._exit(1)
-
-
-def _take(shot: Shot) -> Image:
-    assert _photographer is not None
-    return _photographer.take(shot)

@@ -35,7 +35,7 @@ _JUMP_EVERY_S = (1.5, 4.0)
 
 
 class SimulatedRecording:
-    """A data set that is made as it is read, by ``workers`` processes; the same whatever their number.
+    """A data set that is made as it is read, by ``workers`` threads; the same whatever their number.
 
     ``config`` is complete. ``true_calibration`` is that of the rig which the images are rendered with, all its cameras
     triggered together; ``calibration`` is what an estimator is told. ``ground_truth`` holds a state for every reading

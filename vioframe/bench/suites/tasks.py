@@ -112,7 +112,7 @@ def failure(attempts: int, error: str) -> Figures:
 
 
 def simulate(recording: Recording, store: Store, processes: int) -> None:
-    """Make a recording by so many ``processes``, unless it is there already."""
+    """Make a recording in as many threads as there may be ``processes``, unless it is there already."""
     if not (path := store.recording(recording.name)).exists():
         with single_threaded():
             record(SimulatedRecording(recording.config, installed(), processes), [path])
