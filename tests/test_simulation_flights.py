@@ -119,9 +119,9 @@ class TestInspection:
         truth = dict(zip(sequence.ground_truth.t_ns.tolist(), sequence.ground_truth.p_WB, strict=True))
         moved = run.states[-1].p_WB - run.states[0].p_WB
         truly = truth[run.states[-1].t_ns] - truth[run.states[0].t_ns]
-        # The estimate's own yaw is free: heights and horizontal distances compare.
+        # The estimate's own yaw is free: heights and horizontal distances compare, to the scale that a start must know.
         assert abs(moved[2] - truly[2]) < 0.05
-        assert abs(np.hypot(*moved[:2]) - np.hypot(*truly[:2])) < 0.05
+        assert abs(np.hypot(*moved[:2]) - np.hypot(*truly[:2])) < 0.06 * np.hypot(*truly[:2])
 
 
 def test_size_and_speed_scale_a_flight():
