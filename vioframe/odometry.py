@@ -23,7 +23,7 @@ from numpy.typing import ArrayLike
 from vioframe.errors import DatasetError
 from vioframe.estimation.lifecycle import LifeCycle, warm_up
 from vioframe.estimation.options import EstimationOptions
-from vioframe.frontend import Frontend, FrontendOptions
+from vioframe.frontend import Frontend, FrontendOptions, lucas_kanade
 from vioframe.incidents import Incidents
 from vioframe.interfaces import Backend, Detector
 from vioframe.io.synchronise import Packet, Synchroniser
@@ -95,6 +95,7 @@ class Odometry:
             warm = self._registry.create_backend(backend, backend_options)
             with self._registry.blaming(), limited_threads():
                 warm_up(warm, calibration)
+                lucas_kanade.warm_up()
             backend = self._registry.create_backend(backend, backend_options)
         self._frontend = Frontend(detector, calibration, frontend or FrontendOptions(), self.incidents)
         self._life = LifeCycle(backend, calibration, estimation, initial_state, name)

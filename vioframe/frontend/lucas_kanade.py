@@ -74,6 +74,13 @@ def search(
     return found, ok
 
 
+def warm_up() -> None:
+    """Compile the kernels, or load them from the cache, so that the first frame does not wait."""
+    image = np.zeros((64, 64), np.uint8)
+    pyramid, xy = Pyramid.of(image, 0, 15), np.full((1, 2), 32.0, np.float32)
+    search(pyramid, pyramid, xy, xy.copy())
+
+
 def _width(window_px: int) -> int:
     """Columns of a patch, rounded up to whole groups."""
     return -(-window_px // int(_LANES)) * int(_LANES)
