@@ -159,16 +159,17 @@ def difference(states: States, others: States) -> Float:
 @kernel
 def retract(states: States, step: Float) -> States:
     """``states`` moved by ``step`` (K, 15)."""
-    R_WB = np.empty((len(step), 3, 3))
-    for k in range(len(step)):
+    count = len(step)
+    R_WB, p_WB, v_WB = np.empty((count, 3, 3)), np.empty((count, 3)), np.empty((count, 3))
+    bias_gyro_B, bias_accel_B = np.empty((count, 3)), np.empty((count, 3))
+    for k in range(count):
         R_WB[k] = product(states[0][k], exp(step[k, 0:3]))
-    return (
-        R_WB,
-        states[1] + step[:, 3:6],
-        states[2] + step[:, 6:9],
-        states[3] + step[:, 9:12],
-        states[4] + step[:, 12:15],
-    )
+        for m in range(3):
+            p_WB[k, m] = states[1][k, m] + step[k, 3 + m]
+            v_WB[k, m] = states[2][k, m] + step[k, 6 + m]
+            bias_gyro_B[k, m] = states[3][k, m] + step[k, 9 + m]
+            bias_accel_B[k, m] = states[4][k, m] + step[k, 12 + m]
+    return R_WB, p_WB, v_WB, bias_gyro_B, bias_accel_B
 
 
 @kernel

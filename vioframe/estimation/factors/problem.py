@@ -187,32 +187,33 @@ class Normal:
 def _moved(states: States, camera: Calibrated, step: Float) -> tuple[States, Calibrated]:
     """States and camera moved by ``step`` (15 K + 16,)."""
     n = STATE_SIZE * len(states[0])
-    d = step[n:]
-    moved = Calibrated(
-        product(camera.R_BC, exp(d[:3])),
-        camera.p_BC + d[3:6],
-        camera.offset_s + d[OFFSET],
-        camera.readout_s + d[READOUT],
-        camera.intrinsics + d[8:],
-    )
+    d, p_BC, intrinsics = step[n:], camera.p_BC.copy(), camera.intrinsics.copy()
+    for k in range(3):
+        p_BC[k] += d[3 + k]
+    for k in range(8):
+        intrinsics[k] += d[8 + k]
+    R_BC = product(camera.R_BC, exp(d[:3]))
+    moved = Calibrated(R_BC, p_BC, camera.offset_s + d[OFFSET], camera.readout_s + d[READOUT], intrinsics)
     return retract(states, step[:n].reshape(-1, STATE_SIZE)), moved
 
 
 @kernel
 def _difference(prior: PriorArrays, states: States, camera: Calibrated) -> Float:
     """What :meth:`Prior.difference` says."""
-    _, b, first, first_camera, frozen = prior
+    _, b, first, given, frozen = prior
     n = len(b) - CALIBRATION_SIZE
-    out = np.empty(len(b))
-    out[:n] = inertial.difference(states, first).ravel()
+    out = np.zeros(len(b))
+    moved = inertial.difference(states, first)
     for k in range(len(frozen)):
-        if not frozen[k]:
-            out[STATE_SIZE * k : STATE_SIZE * (k + 1)] = 0.0
-    out[n : n + 3] = log(product(first_camera.R_BC.T, camera.R_BC))
-    out[n + 3 : n + 6] = camera.p_BC - first_camera.p_BC
-    out[n + OFFSET] = camera.offset_s - first_camera.offset_s
-    out[n + READOUT] = camera.readout_s - first_camera.readout_s
-    out[n + 8 :] = camera.intrinsics - first_camera.intrinsics
+        if frozen[k]:
+            for m in range(STATE_SIZE):
+                out[STATE_SIZE * k + m] = moved[k, m]
+    rotation = log(product(given.R_BC.T, camera.R_BC))
+    for k in range(3):
+        out[n + k], out[n + 3 + k] = rotation[k], camera.p_BC[k] - given.p_BC[k]
+    out[n + OFFSET], out[n + READOUT] = camera.offset_s - given.offset_s, camera.readout_s - given.readout_s
+    for k in range(8):
+        out[n + 8 + k] = camera.intrinsics[k] - given.intrinsics[k]
     return out
 
 

@@ -239,12 +239,8 @@ def _add_squares(seen: Bool, Y: Float, z: Float, S: Float, g: Float) -> None:
     """
     count, frames = seen.shape
     n, at_camera = len(g), 6 * frames
-    first, last = np.full(count, frames), np.zeros(count, np.int64)
-    for i in range(count):
-        for f in range(frames):
-            if seen[i, f]:
-                first[i], last[i] = min(first[i], f), f
-    order = np.argsort(first * frames + last, kind="mergesort")
+    first, last = _ends(seen)
+    order, _ = _sorted(first * frames + last, frames * frames)
     for k in range(0, count, 2):
         i, j = order[k], order[min(k + 1, count - 1)]
         other = 1.0 if k + 1 < count else 0.0
@@ -409,7 +405,7 @@ def linearise(poses: Poses, first: Poses, camera: Calibrated, s: Sightings, land
     H, g = np.zeros((n, n)), np.zeros(n)
     V, W, c = np.zeros((count, 3, 3)), np.zeros((count, 3, n)), np.zeros((count, 3))
     cost, squares, views, behind = 0.0, np.zeros(count), np.zeros(count), np.zeros(count, np.bool_)
-    hosted, begins = _by_host(seen)
+    hosted, begins = _sorted(_ends(seen)[0], frames)
 
     # Of all sightings of a frame whose landmarks have the same host: by [dtheta_host dp_host dtheta_frame calibration],
     # the residual behind it. By dp_frame it is minus that by dp_host.
@@ -526,29 +522,36 @@ def linearise(poses: Poses, first: Poses, camera: Calibrated, s: Sightings, land
                             w[6 * f + 3 + v] = -(a_0 * J_0[3 + v] + a_1 * J_1[3 + v])
             _squared(rows, filled, own)
             _add_own(own, host, f, H, g)
-    errors = np.sqrt(0.5 * squares / np.maximum(views, 1.0))
-    errors[behind] = np.inf
+    errors = np.empty(count)
+    for i in range(count):
+        errors[i] = np.inf if behind[i] else math.sqrt(0.5 * squares[i] / max(views[i], 1.0))
     return H, g, V, W, c, cost, errors
 
 
 @kernel
-def _by_host(seen: Bool) -> tuple[Int, Int]:
-    """The landmarks in the order of the frames that saw them first, and where in it each frame begins (K + 1,)."""
+def _ends(seen: Bool) -> tuple[Int, Int]:
+    """(L,) and (L,): the first and the last frame that saw each landmark; K and 0 where none did."""
     count, frames = seen.shape
-    hosts, begins = np.full(count, -1), np.zeros(frames + 1, np.int64)
+    first, last = np.full(count, frames), np.zeros(count, np.int64)
     for i in range(count):
         for f in range(frames):
             if seen[i, f]:
-                hosts[i] = f
-                begins[f + 1] += 1
-                break
-    for f in range(frames):
-        begins[f + 1] += begins[f]
-    order, at = np.empty(count, np.int64), begins.copy()
-    for i in range(count):
-        if hosts[i] >= 0:
-            order[at[hosts[i]]] = i
-            at[hosts[i]] += 1
+                first[i], last[i] = min(first[i], f), f
+    return first, last
+
+
+@kernel
+def _sorted(keys: Int, most: int) -> tuple[Int, Int]:
+    """The order of ``keys`` (N,), which lie within 0 and ``most``, and where in it each of them begins."""
+    begins = np.zeros(most + 2, np.int64)
+    for key in keys:
+        begins[key + 1] += 1
+    for key in range(most + 1):
+        begins[key + 1] += begins[key]
+    order, at = np.empty(len(keys), np.int64), begins.copy()
+    for i in range(len(keys)):
+        order[at[keys[i]]] = i
+        at[keys[i]] += 1
     return order, begins
 
 
