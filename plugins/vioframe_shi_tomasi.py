@@ -10,10 +10,11 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 
+from vioframe.frontend.distinct import distinct
 from vioframe.interfaces import DetectorFactory
 from vioframe.jit import kernel
 from vioframe.parts.hooks import hookimpl
-from vioframe.types import Image, Int, Keypoints
+from vioframe.types import Image, Keypoints
 
 # Gradients as Sobel's filter sums them, over the 3 x 3 pixels about each, in terms of grey levels from 0 to 1.
 _SCALE = np.float32((1.0 / (4.0 * 3.0 * 255.0)) ** 2)
@@ -43,8 +44,9 @@ class ShiTomasi:
         rows, columns = np.divmod(np.flatnonzero((eigenvalue == highest_near) & (eigenvalue > least)), image.shape[1])
         score = eigenvalue[rows, columns]
         order = np.argsort(-score, kind="stable")
-        taken = order[_apart(rows[order], columns[order], image.shape, self._min_distance_px, max_points)]
-        return Keypoints(np.column_stack([columns[taken], rows[taken]]).astype(np.float32), score[taken])
+        xy = np.column_stack([columns[order], rows[order]]).astype(np.float32)
+        taken = distinct(xy, self._min_distance_px, max_points)
+        return Keypoints(xy[taken], score[order[taken]])
 
 
 @kernel
@@ -69,37 +71,6 @@ def _least_eigenvalue(dx: NDArray[np.int16], dy: NDArray[np.int16]) -> NDArray[n
             c = np.float32(0.5) * (yy[k] + yy[m] + yy[n])
             out[r, m] = _SCALE * (a + c - np.sqrt((a - c) * (a - c) + b * b))
     return out
-
-
-@kernel
-def _apart(rows: Int, columns: Int, shape: tuple[int, int], distance: float, count: int) -> Int:
-    """Places of the first ``count`` that keep ``distance`` px from all taken before them."""
-    cell = max(1, int(distance))
-    reach = int(np.ceil(distance / cell))
-    height, width = shape[0] // cell + 1, shape[1] // cell + 1
-    # In a cell as large as the distance there is room for no more than a few.
-    held, room = np.zeros((height, width), np.int64), 4
-    members = np.empty((height, width, room), np.int64)
-    taken = np.empty(min(count, len(rows)), np.int64)
-    n = 0
-    for i in range(len(rows)):
-        if n == len(taken):
-            break
-        y, x = rows[i] // cell, columns[i] // cell
-        free = True
-        for v in range(max(0, y - reach), min(height, y + reach + 1)):
-            for u in range(max(0, x - reach), min(width, x + reach + 1)):
-                for k in range(held[v, u]):
-                    j = members[v, u, k]
-                    dy, dx = rows[i] - rows[j], columns[i] - columns[j]
-                    if dx * dx + dy * dy < distance * distance:
-                        free = False
-        if free:
-            taken[n] = i
-            n += 1
-            members[y, x, held[y, x]] = i
-            held[y, x] += 1
-    return taken[:n]
 
 
 @hookimpl

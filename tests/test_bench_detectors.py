@@ -13,7 +13,6 @@ from vioframe.bench.detectors.flight import _with_leads, coverage, lives, surviv
 from vioframe.bench.detectors.metrics import (
     PairScore,
     corner_error_px,
-    distinct,
     fit_homography,
     lands_inside,
     matching_score,
@@ -25,6 +24,7 @@ from vioframe.bench.detectors.metrics import (
 from vioframe.bench.detectors.quality import summary
 from vioframe.bench.detectors.tables import verdict
 from vioframe.errors import ConfigError
+from vioframe.frontend.distinct import distinct
 from vioframe.types import FrameTracks, Keypoints
 
 SIZE = (320, 240)

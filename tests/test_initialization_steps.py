@@ -11,9 +11,10 @@ from scipy.stats import chi2
 from vioframe.estimation.factors.inertial import StateArrays
 from vioframe.estimation.factors.landmarks import camera_poses, positions
 from vioframe.estimation.factors.problem import Problem, Variables
+from vioframe.estimation.factors.reprojection import Calibrated
 from vioframe.estimation.inertial.preintegration import Preintegrated, preintegrate
 from vioframe.estimation.initialization import static
-from vioframe.estimation.initialization.bundle_adjustment import adjusted, adjustment, calibrated, covariance
+from vioframe.estimation.initialization.bundle_adjustment import adjusted, adjustment, covariance
 from vioframe.estimation.initialization.closed_form import (
     _solve_on_gravity_sphere,
     align,
@@ -105,7 +106,7 @@ def scene(
 
 def problem_of(s: Scene) -> tuple[Problem, Variables]:
     """The bundle adjustment of a scene, and its true values."""
-    camera = calibrated(CAMERA)
+    camera = Calibrated.of(CAMERA)
     R_WC, p_WC = camera_poses(s.truth, camera)
     host = s.window.seen.argmax(axis=0)
     p_C = np.einsum("lji,lj->li", R_WC[host], s.p_WF - p_WC[host])

@@ -193,6 +193,25 @@ def test_with_two_threads_the_next_frame_is_seen_before_the_last_is_estimated():
     assert len(seen) == k + 1
 
 
+@pytest.mark.parametrize("pipelined", [False, True])
+def test_what_came_before_a_source_failed_is_estimated(pipelined: bool):
+    """Of 30 frames followed by 100 ms of readings all are there, also the one whose points the other thread had."""
+    measurements = short_flight()
+    end_ns = [m.t_ns for m in measurements if isinstance(m, FrameSet)][29] + NS_PER_S // 10
+
+    def broken() -> Iterator[Measurement]:
+        yield from (m for m in measurements if m.t_ns <= end_ns)
+        raise DatasetError("cut off")
+
+    steps: list[Step] = []
+    with pytest.raises(DatasetError, match="cut off"):
+        steps.extend(Odometry(CALIBRATION, installed=INSTALLED).follow(broken(), pipelined=pipelined))
+    whole = list(Odometry(CALIBRATION, installed=INSTALLED).follow(measurements))
+    assert len(steps) >= 30
+    assert tracked(steps) > 10
+    assert all_bytes(steps) == all_bytes(whole[: len(steps)])
+
+
 def test_a_detector_that_fails_in_its_thread_is_named():
     class Never:
         def detect(self, image: Image, max_points: int) -> Keypoints:

@@ -31,7 +31,6 @@ from vioframe.parts import registry
 from vioframe.parts.registry import Registry
 from vioframe.types import (
     Calibration,
-    CameraOnBody,
     FrameSet,
     FrameTracks,
     Image,
@@ -105,7 +104,6 @@ class Odometry:
         self.calibration = calibration
         """What is known of the rig by now: as given at first, then as the back-end has learned it."""
         self._tracking = False
-        self._due: tuple[CameraOnBody, Calibration] = camera, calibration
         self._seen_with = calibration
 
     def add(self, measurement: Measurement) -> list[Step]:
@@ -162,36 +160,46 @@ class Odometry:
             yield from self._synchroniser.add(measurement)
         yield from self._synchroniser.finish()
 
-    def _follow_ahead(self, packets: Iterable[Packet]) -> Iterator[Step]:
+    def _follow_ahead(self, packets: Iterator[Packet]) -> Iterator[Step]:
         """Each step when the points of the next frame are already being followed.
 
         Only in flight: at a start the next frame depends on what was found.
         """
         with limited_threads(), ThreadPoolExecutor(1, "frontend") as thread:
             ahead: Future[_Seen] | None = None
-            for packet in packets:
+            failure: Exception | None = None
+            while True:
+                try:
+                    packet = next(packets)
+                except StopIteration:
+                    break
+                except Exception as error:  # of whoever brings the measurements: what came before it still counts
+                    failure = error
+                    break
                 if ahead is None and not self._tracking:
                     yield self._step(*packet)
                     continue
                 before = None if ahead is None else ahead.result()
-                self._see_with_due()
+                self._recalibrate()
                 ahead = thread.submit(self._see, *packet)
                 if before is not None:
                     yield self._estimate(before)
                     self._retime()
                     if not self._tracking:
                         seen, ahead = ahead.result(), None
-                        self._see_with_due()
-                        yield self._estimate(seen)
+                        yield self._estimate_next(seen)
             if ahead is not None:
-                seen = ahead.result()
-                self._see_with_due()
-                yield self._estimate(seen)
+                yield self._estimate_next(ahead.result())
+            if failure is not None:
+                raise failure
 
     def _step(self, imu: ImuSegment, frames: FrameSet) -> Step:
         self._retime()
-        seen = self._see(imu, frames)
-        self._see_with_due()
+        return self._estimate_next(self._see(imu, frames))
+
+    def _estimate_next(self, seen: _Seen) -> Step:
+        """Estimate from the frame that was seen last, before another is."""
+        self._recalibrate()
         return self._estimate(seen)
 
     def _see(self, imu: ImuSegment, frames: FrameSet) -> _Seen:
@@ -216,24 +224,23 @@ class Odometry:
         self._tracking = estimate.status is Status.TRACKING
         if estimate.calibration is not None:
             self.calibration = estimate.calibration.calibration
-        # Another time offset or focal length may have been found while starting.
-        self._due = self._life.calibration.cameras[0], self.calibration
         if not in_flight:
-            # In flight the next frame may have been cut, and its points followed, by now: then it counts from the one
-            # behind that, with one thread as with two.
+            # Another time offset or focal length may have been found while starting. In flight the next frame may have
+            # been cut, and its points followed, by now: then it counts from the one behind that, with one thread as
+            # with two.
             self._retime()
-            self._see_with_due()
+            self._recalibrate()
         within = {f"backend.{stage}": seconds for stage, seconds in estimate.stage_seconds.items()}
         return Step(seen.frames, seen.tracks, estimate, {**seen.stage_seconds, "backend": backend_s, **within})
 
     def _retime(self) -> None:
         """Cut frames from now on as the newest estimate has it."""
-        self._synchroniser.retime(self._due[0].time_offset_ns)
+        self._synchroniser.retime(self._life.calibration.cameras[0].time_offset_ns)
 
-    def _see_with_due(self) -> None:
+    def _recalibrate(self) -> None:
         """Follow points from now on with the calibration of the newest estimate."""
-        camera, self._seen_with = self._due
-        self._frontend.recalibrate(camera.model)
+        self._seen_with = self.calibration
+        self._frontend.recalibrate(self._life.calibration.cameras[0].model)
 
 
 def _own(image: Image) -> Image:

@@ -90,9 +90,8 @@ def _observe(w, c, p_WF, p_WF_first, xy, block, residual):
         J[i, 2] = -(D[i, 0] * x + D[i, 1] * y) / p_C[2]
     J_B = product(J, R_rowC.T)
     J_W = product(J_B, R_first.T)
-    J_row = (
-        J_B if w.readout_s == 0.0 else product(J, w.R_BC.T)
-    )  # by the point as seen from the body at the time of the row
+    # By the point as seen from the body at the time of the row.
+    J_row = J_B if w.readout_s == 0.0 else product(J, w.R_BC.T)
     block[:, 0:3] = product(J, hat(p_C))
     block[:, 3:6] = -J_row
     block[:, 6] = 0.0  # the time offset acts through the clone

@@ -74,10 +74,8 @@ class Window:
         self._t_ns = [state.t_ns]
         self._states = StateArrays.stack([state])
         self._gyro_B = start.imu.gyro_B[-1:]
-        self._camera_model, intrinsics = intrinsics_of(camera.model)
-        # Contiguous, as what the solver makes of it is: kernels are compiled for each layout that they meet.
-        R_BC, p_BC = np.ascontiguousarray(camera.R_BC), np.ascontiguousarray(camera.p_BC)
-        self._camera = Calibrated(R_BC, p_BC, 0.0, camera.readout_s, intrinsics)
+        self._camera_model, _ = intrinsics_of(camera.model)
+        self._camera = Calibrated.of(camera)
         known = sigma.stacked()
         known[READOUT] = known[READOUT] or options.calibrate_readout * UNKNOWN_READOUT_S
         self._calibrated = _calibrated(options) & (known > 0.0)

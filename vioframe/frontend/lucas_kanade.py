@@ -16,13 +16,16 @@ from vioframe.jit import kernel
 from vioframe.types import Image
 
 Pixels = NDArray[np.float32]
+Weights = tuple[np.float32, np.float32, np.float32, np.float32]
+"""Of a pixel, the one beside it, the one below, and the one beside that."""
 
 _ITERATIONS, _EPSILON_PX = 30, 0.01
 # Least squared gradient across a patch, in whichever direction has least, (grey levels / px)^2: others slide.
 _LEAST_GRADIENT = 0.1
 # Columns of a patch go by so many at once, which compilers make one operation; unsigned, as every index is, because of
 # signed ones numba asks whether they count from the end.
-_LANES = np.uint64(16)
+_GROUP = 16
+_LANES = np.uint64(_GROUP)
 _ONE, _TWO = np.uint64(1), np.uint64(2)
 
 
@@ -39,7 +42,7 @@ class Pyramid:
         """With up to ``levels`` above the image; none that is not larger than a patch."""
         import cv2
 
-        border_px = _width(window_px) + int(_LANES) + 2
+        border_px = _width(window_px) + _GROUP + 2
         images: list[Image] = []
         for _ in range(levels + 1):
             b = border_px
@@ -66,6 +69,7 @@ def search(
             after.images[level],
             before.border_px,
             before.window_px,
+            _width(before.window_px),
             xy * np.float32(0.5**level),
             found,
         )
@@ -83,24 +87,22 @@ def warm_up() -> None:
 
 def _width(window_px: int) -> int:
     """Columns of a patch, rounded up to whole groups."""
-    return -(-window_px // int(_LANES)) * int(_LANES)
+    return -(-window_px // _GROUP) * _GROUP
 
 
 @kernel(reorder_sums=True)
-def _search(before: Image, after: Image, border: int, side: int, xy: Pixels, found: Pixels) -> NDArray[np.bool_]:
+def _search(
+    before: Image, after: Image, border: int, side: int, wide: int, xy: Pixels, found: Pixels
+) -> NDArray[np.bool_]:
     """One level: ``found`` (N, 2), on the level above at first, becomes where the patches at ``xy`` are on this one.
 
-    Returns which of them cannot be followed here, as nothing in them can be told apart or they left the image.
+    Patches have ``side`` rows, and as many columns that count of ``wide`` that are looked at. Returns which of them
+    cannot be followed here, as nothing in them can be told apart or they left the image.
     """
-    wide = -(-side // 16) * 16
     half = 0.5 * (side - 1)
     height, width = before.shape[0] - 2 * border, before.shape[1] - 2 * border
-    patch = np.empty((side + 2, wide + 16), np.float32)
-    template, by_x, by_y = (
-        np.empty((side, wide), np.float32),
-        np.empty((side, wide), np.float32),
-        np.empty((side, wide), np.float32),
-    )
+    patch, template = np.empty((side + 2, wide + _GROUP), np.float32), np.empty((side, wide), np.float32)
+    by_x, by_y = np.empty((side, wide), np.float32), np.empty((side, wide), np.float32)
     lost = np.zeros(len(xy), np.bool_)
     for n in range(len(xy)):
         found[n] *= np.float32(2.0)
@@ -135,7 +137,7 @@ def _search(before: Image, after: Image, border: int, side: int, xy: Pixels, fou
 
 
 @kernel(inlined=True)
-def _weights(x: float, y: float) -> tuple[np.float32, np.float32, np.float32, np.float32]:
+def _weights(x: float, y: float) -> Weights:
     """Of the four pixels about a place, by what is beyond the full pixel."""
     a, b = x - math.floor(x), y - math.floor(y)
     return (
@@ -147,17 +149,24 @@ def _weights(x: float, y: float) -> tuple[np.float32, np.float32, np.float32, np
 
 
 @kernel(inlined=True)
+def _between(image: Image, r: np.uint64, c: np.uint64, weights: Weights) -> np.float32:
+    """The four pixels that begin at row ``r`` and column ``c``, weighed."""
+    below, beside = r + _ONE, c + _ONE
+    upper = weights[0] * image[r, c] + weights[1] * image[r, beside]
+    value: np.float32 = upper + weights[2] * image[below, c] + weights[3] * image[below, beside]
+    return value
+
+
+@kernel(inlined=True)
 def _sample(image: Image, x: float, y: float, patch: Pixels) -> None:
     """``patch`` (H, W) becomes the part of ``image`` whose first pixel is at ``x``, ``y``, bilinearly."""
-    w00, w01, w10, w11 = _weights(x, y)
+    weights = _weights(x, y)
     u, v = np.uint64(math.floor(x)), np.uint64(math.floor(y))
     for r in range(np.uint64(patch.shape[0])):
-        at, below = v + r, v + r + _ONE
         for first in range(np.uint64(0), np.uint64(patch.shape[1]), _LANES):
             for lane in range(_LANES):
                 c = first + lane
-                k, n = u + c, u + c + _ONE
-                patch[r, c] = w00 * image[at, k] + w01 * image[at, n] + w10 * image[below, k] + w11 * image[below, n]
+                patch[r, c] = _between(image, v + r, u + c, weights)
 
 
 @kernel(inlined=True)
@@ -195,17 +204,14 @@ def _gradients(
 @kernel(inlined=True)
 def _mismatch(image: Image, x: float, y: float, template: Pixels, by_x: Pixels, by_y: Pixels) -> tuple[float, float]:
     """Sums of what the part of ``image`` at ``x``, ``y`` has beyond ``template``, times its gradients."""
-    w00, w01, w10, w11 = _weights(x, y)
+    weights = _weights(x, y)
     u, v = np.uint64(math.floor(x)), np.uint64(math.floor(y))
     along_x, along_y = np.float32(0.0), np.float32(0.0)
     for r in range(np.uint64(template.shape[0])):
-        at, below = v + r, v + r + _ONE
         for first in range(np.uint64(0), np.uint64(template.shape[1]), _LANES):
             for lane in range(_LANES):
                 c = first + lane
-                k, n = u + c, u + c + _ONE
-                seen = w00 * image[at, k] + w01 * image[at, n] + w10 * image[below, k] + w11 * image[below, n]
-                off = seen - template[r, c]
+                off = _between(image, v + r, u + c, weights) - template[r, c]
                 along_x += off * by_x[r, c]
                 along_y += off * by_y[r, c]
     return float(along_x), float(along_y)

@@ -144,46 +144,14 @@ def draw(
     tiles: Tiles,
     rays: Float32,
     fog_per_m: float,
+    where: Bool,
     light: Float32,
     surface: Int32,
 ) -> None:
-    """``light`` and ``surface`` (H, W) where the ``rays`` (2, H, W) through the pixels end."""
-    height, width = light.shape
-    size = tiles.height * tiles.width
-    x, y = np.empty(size, np.float32), np.empty(size, np.float32)
-    inverse_depth, value = np.empty(size, np.float32), np.empty(size, np.float32)
-    found = np.empty(size, np.int32)
-    for row, column in np.ndindex(seen.span.shape[:2]):
-        top, left = row * tiles.height, column * tiles.width
-        bottom, right = min(top + tiles.height, height), min(left + tiles.width, width)
-        count = 0
-        for i in range(top, bottom):
-            for j in range(left, right):
-                x[count], y[count] = rays[0, i, j], rays[1, i, j]
-                count += 1
-        _cast(seen, row, column, x[:count], y[:count], inverse_depth, found)
-        _shade(seen, faces, pyramid, found, x[:count], y[:count], fog_per_m, value)
-        count = 0
-        for i in range(top, bottom):
-            for j in range(left, right):
-                s = found[count]
-                light[i, j] = value[count]
-                surface[i, j] = NOTHING if s < 0 else faces.surface[seen.face[s]]
-                count += 1
+    """Put the mean over where the ``rays`` (S, 2, H, W) end into ``light`` (H, W), there ``where`` (H, W) has it.
 
-
-@kernel
-def soften(
-    seen: Seen,
-    faces: Faces,
-    pyramid: Pyramid,
-    tiles: Tiles,
-    rays: Float32,
-    fog_per_m: float,
-    edges: Bool,
-    light: Float32,
-) -> None:
-    """Put the mean over the ``rays`` (S, 2, H, W) into ``light`` (H, W) at the ``edges`` (H, W)."""
+    ``surface`` (H, W) is what the last of them hits.
+    """
     height, width = light.shape
     samples = len(rays)
     size = tiles.height * tiles.width * samples
@@ -196,7 +164,7 @@ def soften(
         count = 0
         for i in range(top, bottom):
             for j in range(left, right):
-                if edges[i, j]:
+                if where[i, j]:
                     for sample in range(samples):
                         x[count], y[count] = rays[sample, 0, i, j], rays[sample, 1, i, j]
                         count += 1
@@ -207,9 +175,14 @@ def soften(
         count = 0
         for i in range(top, bottom):
             for j in range(left, right):
-                if edges[i, j]:
-                    light[i, j] = value[count : count + samples].mean()
+                if where[i, j]:
+                    total = np.float32(0.0)
+                    for sample in range(samples):
+                        total += value[count + sample]
                     count += samples
+                    light[i, j] = total / samples
+                    s = found[count - 1]
+                    surface[i, j] = NOTHING if s < 0 else faces.surface[seen.face[s]]
 
 
 @kernel

@@ -9,7 +9,7 @@ import numpy as np
 from vioframe.arrays import Bool, Float, Image
 from vioframe.geometry.cameras import Camera
 from vioframe.interfaces import World
-from vioframe.simulation.rasterizer import Faces, Float32, Pyramid, Tiles, draw, see, soften
+from vioframe.simulation.rasterizer import Faces, Float32, Pyramid, Tiles, draw, see
 from vioframe.simulation.world import Movers
 from vioframe.types import Int32, Mesh
 
@@ -63,8 +63,8 @@ class Renderer:
         light = np.empty(self._rays.shape[2:], np.float32)
         surface = np.empty(light.shape, np.int32)
         look = seen, faces, self._pyramid, tiles
-        draw(*look, self._rays[0], self._fog_per_m, light, surface)
-        soften(*look, self._rays[1:], self._fog_per_m, _edges(surface, light), light)
+        draw(*look, self._rays[:1], self._fog_per_m, np.ones(light.shape, np.bool_), light, surface)
+        draw(*look, self._rays[1:], self._fog_per_m, _edges(surface, light), light, surface)
         return light
 
 

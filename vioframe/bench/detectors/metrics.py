@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vioframe.bench.detectors.images import corners_of
-from vioframe.jit import kernel
+from vioframe.frontend.distinct import distinct
 from vioframe.types import Float, Int, Keypoints
 
 WITHIN_PX = 3.0
@@ -128,23 +128,3 @@ def corner_error_px(H: Float | None, H_21: Float, resolution: tuple[int, int]) -
     corners = corners_of(resolution)
     off = warp(H, corners) - warp(H_21, corners)
     return float(np.linalg.norm(off, axis=1).mean()) if np.isfinite(off).all() else np.inf
-
-
-@kernel
-def distinct(xy: Float, distance_px: float, count: int) -> Int:
-    """Places of the first ``count`` of ``xy`` (N, 2) px, strongest first, that keep ``distance_px`` from all before."""
-    kept = np.empty(min(count, len(xy)), np.int64)
-    n = 0
-    for i in range(len(xy)):
-        if n == len(kept):
-            break
-        free = True
-        for k in range(n):
-            dx, dy = xy[i, 0] - xy[kept[k], 0], xy[i, 1] - xy[kept[k], 1]
-            if dx * dx + dy * dy < distance_px * distance_px:
-                free = False
-                break
-        if free:
-            kept[n] = i
-            n += 1
-    return kept[:n]

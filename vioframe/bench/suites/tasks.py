@@ -111,11 +111,11 @@ def failure(attempts: int, error: str) -> Figures:
     return {"status": "failed", "error": error, "attempts": attempts, "machine": machine.describe()}
 
 
-def simulate(recording: Recording, store: Store, processes: int) -> None:
-    """Make a recording in as many threads as there may be ``processes``, unless it is there already."""
+def simulate(recording: Recording, store: Store, threads: int) -> None:
+    """Make a recording in so many ``threads``, unless it is there already."""
     if not (path := store.recording(recording.name)).exists():
         with single_threaded():
-            record(SimulatedRecording(recording.config, installed(), processes), [path])
+            record(SimulatedRecording(recording.config, installed(), threads), [path])
 
 
 def code() -> str:

@@ -14,7 +14,7 @@ import numpy as np
 
 from vioframe.arrays import Bool
 from vioframe.estimation.inertial.preintegration import Preintegrated
-from vioframe.geometry.kernels import exp, log, product, right_jacobian, right_jacobian_inverse, turned
+from vioframe.geometry.kernels import exp, log, product, right_jacobian, right_jacobian_inverse, turned, turned_by
 from vioframe.jit import kernel
 from vioframe.types import Float, Int, NavState, g_W
 
@@ -159,17 +159,13 @@ def difference(states: States, others: States) -> Float:
 @kernel
 def retract(states: States, step: Float) -> States:
     """``states`` moved by ``step`` (K, 15)."""
-    count = len(step)
-    R_WB, p_WB, v_WB = np.empty((count, 3, 3)), np.empty((count, 3)), np.empty((count, 3))
-    bias_gyro_B, bias_accel_B = np.empty((count, 3)), np.empty((count, 3))
-    for k in range(count):
-        R_WB[k] = product(states[0][k], exp(step[k, 0:3]))
-        for m in range(3):
-            p_WB[k, m] = states[1][k, m] + step[k, 3 + m]
-            v_WB[k, m] = states[2][k, m] + step[k, 6 + m]
-            bias_gyro_B[k, m] = states[3][k, m] + step[k, 9 + m]
-            bias_accel_B[k, m] = states[4][k, m] + step[k, 12 + m]
-    return R_WB, p_WB, v_WB, bias_gyro_B, bias_accel_B
+    return (
+        turned_by(states[0], step[:, 0:3]),
+        states[1] + step[:, 3:6],
+        states[2] + step[:, 6:9],
+        states[3] + step[:, 9:12],
+        states[4] + step[:, 12:15],
+    )
 
 
 @kernel

@@ -20,8 +20,9 @@ from typing import NamedTuple
 import numpy as np
 
 from vioframe.arrays import Bool, Float, Int
-from vioframe.geometry.kernels import distort, exp, intrinsics_jacobian, undistort
+from vioframe.geometry.kernels import distort, exp, intrinsics_jacobian, intrinsics_of, undistort
 from vioframe.jit import kernel
+from vioframe.types import CameraOnBody
 
 # Depth in a frame over depth in the host: a landmark nearer than this is beside the camera, and cannot be seen.
 _LEAST_DEPTH_RATIO = 0.05
@@ -46,6 +47,13 @@ class Calibrated(NamedTuple):
     offset_s: float = 0.0
     readout_s: float = 0.0
     intrinsics: Float = np.zeros(8)
+
+    @staticmethod
+    def of(camera: CameraOnBody) -> Calibrated:
+        """``camera`` as it is given."""
+        # Contiguous, as what the solver makes of it is: kernels are compiled for each layout that they meet.
+        R_BC, p_BC = np.ascontiguousarray(camera.R_BC), np.ascontiguousarray(camera.p_BC)
+        return Calibrated(R_BC, p_BC, 0.0, camera.readout_s, intrinsics_of(camera.model)[1])
 
 
 class Poses(NamedTuple):

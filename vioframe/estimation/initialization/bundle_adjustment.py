@@ -62,15 +62,8 @@ def adjustment(window: Window, imu: list[Preintegrated], x: Variables, camera: C
         shutter = Shutter(True, row, *motion_in_body(x.states, gyro_B))
     sightings = Sightings(seen, xy, velocity, to_px, PIXEL_SIGMA, _CAUCHY, shutter=shutter, lens=lens)
     return Problem(
-        _prior(x, 0, _HELD, calibrated(camera), known), ImuFactors.stack(imu), {}, sightings, first_estimates=False
+        _prior(x, 0, _HELD, Calibrated.of(camera), known), ImuFactors.stack(imu), {}, sightings, first_estimates=False
     )
-
-
-def calibrated(camera: CameraOnBody) -> Calibrated:
-    """``camera`` as it is given, where the adjustment begins."""
-    # Contiguous, as what the solver makes of it is: kernels are compiled for each layout that they meet.
-    R_BC, p_BC = np.ascontiguousarray(camera.R_BC), np.ascontiguousarray(camera.p_BC)
-    return Calibrated(R_BC, p_BC, 0.0, camera.readout_s, intrinsics_of(camera.model)[1])
 
 
 def adjusted(problem: Problem, x: Variables, known: Float, roughly: bool = False) -> Solution:
@@ -80,7 +73,7 @@ def adjusted(problem: Problem, x: Variables, known: Float, roughly: bool = False
 
 def with_calibration(problem: Problem, x: Variables, camera: CameraOnBody, known: Float) -> Problem:
     """``problem`` with another prior on the calibration."""
-    return replace(problem, prior=_prior(x, 0, _HELD, calibrated(camera), known))
+    return replace(problem, prior=_prior(x, 0, _HELD, Calibrated.of(camera), known))
 
 
 def covariance(problem: Problem, x: Variables, known: Float) -> Float:

@@ -24,7 +24,6 @@ from vioframe.estimation.inertial.preintegration import Preintegrated, preintegr
 from vioframe.estimation.initialization.bundle_adjustment import (
     adjusted,
     adjustment,
-    calibrated,
     covariance,
     with_calibration,
 )
@@ -153,7 +152,7 @@ def _believed(
     """
     camera, x = calibration.cameras[0], solution.variables
     problem = with_calibration(problem, x, camera, known)
-    believed = adjusted(problem, replace(x, camera=calibrated(camera)), known)
+    believed = adjusted(problem, replace(x, camera=Calibrated.of(camera)), known)
     if not believed.cost < solution.cost + _CONTRADICTED * _variance(problem, x):
         raise ContradictedError(x.camera, _camera(cov))
     return problem, believed.variables
@@ -206,7 +205,7 @@ def _start_of_adjustment(
     host = window.seen.argmax(axis=0)
     inverse_depth = 1.0 / (alignment.scale * structure.depth[host, track])
     landmarks = np.column_stack([window.xy[host, track], inverse_depth])
-    return Variables(states, calibrated(calibration.cameras[0]), landmarks)
+    return Variables(states, Calibrated.of(calibration.cameras[0]), landmarks)
 
 
 def _adjusted(
@@ -358,6 +357,6 @@ def warm_up(calibration: Calibration) -> None:
     Turns(turns, far_ns, np.zeros((21, 3))).fit(HandEye(np.zeros(3), np.eye(3)), ())
     _with_gyro_bias(window, np.zeros(3), calibration, 1e-3)
     state, landmarks = NavState(0, np.eye(3), *np.zeros((4, 3))), np.column_stack([xy[0], np.full(20, 0.2)])
-    x = Variables(StateArrays.stack([state] * 4), calibrated(calibration.cameras[0]), landmarks)
+    x = Variables(StateArrays.stack([state] * 4), Calibrated.of(calibration.cameras[0]), landmarks)
     problem, solution = _adjusted(window, x, calibration, 1e-4 * np.eye(CALIBRATION_SIZE))
     _explained(problem, solution.variables)

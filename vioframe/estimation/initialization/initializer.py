@@ -90,7 +90,7 @@ class Initializer:
     @property
     def camera_sigma(self) -> CameraSigma:
         """How well the camera's calibration is known."""
-        return GIVEN if self._found is None else self._found.sigma(GIVEN)
+        return self._sigma()
 
     @property
     def refusal(self) -> str:
@@ -194,7 +194,7 @@ class Initializer:
             for _ in range(_MOST_CONTRADICTIONS):
                 if self._packets[-1][1].t_ns != newest_ns:
                     return None  # with another time offset, its readings are still to come
-                known = np.diag(self._prior_sigma().stacked() ** 2)
+                known = np.diag(self._sigma(_WITHOUT_ITS_FRAMES).stacked() ** 2)
                 calibration = replace(self._calibration, imu=self._noise_in_motion())
                 try:
                     packets, doubted = self._last(self._window_s), self._doubted(known)
@@ -219,9 +219,9 @@ class Initializer:
             _log.info("%d %s", estimate.states[-1].t_ns, self._found)
         return estimate
 
-    def _prior_sigma(self) -> CameraSigma:
-        """How well the calibration is known without the frames of the start, which told what was found of it."""
-        return GIVEN if self._found is None else self._found.sigma(GIVEN, _WITHOUT_ITS_FRAMES)
+    def _sigma(self, factor: float = 1.0) -> CameraSigma:
+        """How well the calibration is known, what was found of it ``factor`` times as unsure."""
+        return GIVEN if self._found is None else self._found.sigma(GIVEN, factor)
 
     def _doubted(self, known: Float) -> Float:
         """``known`` (16, 16), with what the calibration may be wrong by where nothing bears it out."""
