@@ -12,7 +12,7 @@ from msckf_helpers import CALIBRATION, drawn_start
 from threadpoolctl import threadpool_limits
 
 from vioframe.errors import ConfigError, DivergedError, PluginError
-from vioframe.estimation.lifecycle import LifeCycle, warm_up
+from vioframe.estimation.lifecycle import LifeCycle
 from vioframe.estimation.options import EstimationOptions
 from vioframe.geometry import so3
 from vioframe.interfaces import Backend
@@ -28,6 +28,7 @@ from vioframe.types import (
     Start,
     Status,
 )
+from vioframe.warming import warm_up
 
 BACKENDS = ("msckf", "sliding_window", "loose_ekf")
 

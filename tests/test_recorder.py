@@ -81,7 +81,7 @@ def test_a_run_says_everything(tmp_path):
     assert summary["tracked_points_mean"] == 2.0
     assert summary["mean_ms"] == pytest.approx({"klt": 4.0, "backend": 6.0, "backend.update": 4.0})
     assert summary["mean_frame_ms"] == pytest.approx(10.0), "a back-end's stages are parts of its whole"
-    assert summary["real_time_factor"] == pytest.approx(0.45 / summary["wall_s"])
+    assert summary["real_time_factor"] == pytest.approx(0.45 / summary["working_s"])
     assert summary["events"] == [{"t_ns": FIRST_NS, "event": "refused: no parallax"}]
     assert summary["event_counts"] == {"refused": 1}
     assert summary["incidents"] == {"imu_nan": 1}

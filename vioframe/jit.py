@@ -7,14 +7,17 @@ so that any change begins a new one.
 
 from __future__ import annotations
 
+import gc
 import hashlib
 import os
 import stat
 import tempfile
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from functools import cache, partial
 from pathlib import Path
+from time import perf_counter
 from typing import Any, TypeVar, cast, overload
 
 import numba
@@ -67,6 +70,45 @@ def heard(tell: Callable[[str], None]) -> Iterator[None]:
     """Within it ``tell`` is called with the name of each kernel that has to be compiled: none, once all are cached."""
     with event.install_listener("numba:compile", _Listener(tell)):
         yield
+
+
+class _Waiting(event.Listener):
+    """Sums up how long each thread was held up, the outermost of what is nested alone.
+
+    It has no garbage collected meanwhile: a compiler makes objects by the million that all stay in use, and looking
+    through them again and again is a tenth of its time.
+    """
+
+    def __init__(self) -> None:
+        self._thread = threading.local()
+
+    def on_start(self, begun: Any) -> None:
+        thread = self._thread
+        thread.depth = getattr(thread, "depth", 0) + 1
+        if thread.depth == 1:
+            thread.begin_s, thread.collected = perf_counter(), gc.isenabled()
+            gc.disable()
+
+    def on_end(self, begun: Any) -> None:
+        thread = self._thread
+        thread.depth -= 1
+        if thread.depth == 0:
+            thread.seconds = self.seconds + perf_counter() - thread.begin_s
+            if thread.collected:
+                gc.enable()
+
+    @property
+    def seconds(self) -> float:
+        return getattr(self._thread, "seconds", 0.0)
+
+
+_waiting = _Waiting()
+event.register("numba:compiler_lock", _waiting)  # type: ignore[no-untyped-call]
+
+
+def waited_s() -> float:
+    """How long this thread has waited by now for kernels to be compiled or loaded from the cache, s."""
+    return _waiting.seconds
 
 
 class _Listener(event.Listener):

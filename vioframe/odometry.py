@@ -14,21 +14,21 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
-from time import perf_counter
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from vioframe.errors import DatasetError
-from vioframe.estimation.lifecycle import LifeCycle, warm_up
+from vioframe.estimation.lifecycle import LifeCycle
 from vioframe.estimation.options import EstimationOptions
-from vioframe.frontend import Frontend, FrontendOptions, lucas_kanade
+from vioframe.frontend import Frontend, FrontendOptions
 from vioframe.incidents import Incidents
 from vioframe.interfaces import Backend, Detector
 from vioframe.io.synchronise import Packet, Synchroniser
 from vioframe.parts import registry
 from vioframe.parts.registry import Registry
+from vioframe.stopwatch import working_s
 from vioframe.types import (
     Calibration,
     FrameSet,
@@ -41,6 +41,7 @@ from vioframe.types import (
     Status,
     Step,
 )
+from vioframe.warming import warm_up
 
 # More threads than this gain nothing on images of this size, and cost on machines that have many.
 _MAX_OPENCV_THREADS = 4
@@ -65,6 +66,9 @@ class Odometry:
     A frame waits until readings from ``wait_ms`` behind it are there, so that a reading may come that much later than
     its turn. In a stream in order 0 gives the least latency: the first reading at or behind a frame lets it go.
 
+    A back-end named is ``warm`` before the first frame: its code is compiled, half a minute once after installation, or
+    loaded. A recording, whose frames wait for it, begins sooner without.
+
     ``incidents`` counts what was handled on the way: dropped samples, unusable images, failing detectors.
     """
 
@@ -80,6 +84,7 @@ class Odometry:
         estimation: EstimationOptions | None = None,
         initial_state: NavState | None = None,
         wait_ms: float = 50.0,
+        warm: bool = True,
         incidents: Incidents | None = None,
         installed: Registry | None = None,
     ) -> None:
@@ -91,10 +96,9 @@ class Odometry:
         name = None
         if isinstance(backend, str):
             name = str(self._registry.find(registry.BACKEND, backend))
-            warm = self._registry.create_backend(backend, backend_options)
-            with self._registry.blaming(), limited_threads():
-                warm_up(warm, calibration)
-                lucas_kanade.warm_up()
+            if warm:
+                with self._registry.blaming(), limited_threads():
+                    warm_up(self._registry.create_backend(backend, backend_options), calibration)
             backend = self._registry.create_backend(backend, backend_options)
         self._frontend = Frontend(detector, calibration, frontend or FrontendOptions(), self.incidents)
         self._life = LifeCycle(backend, calibration, estimation, initial_state, name)
@@ -218,9 +222,9 @@ class Odometry:
         """Estimate from one frame that was seen."""
         in_flight = self._tracking
         with limited_threads(), self._registry.blaming():
-            begin = perf_counter()
+            begin_s = working_s()
             estimate = self._life.process(seen.imu, seen.tracks)
-            backend_s = perf_counter() - begin
+            backend_s = working_s() - begin_s
         self._tracking = estimate.status is Status.TRACKING
         if estimate.calibration is not None:
             self.calibration = estimate.calibration.calibration

@@ -10,7 +10,6 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from itertools import chain
 from pathlib import Path
-from time import perf_counter
 from typing import Any
 
 from vioframe.diagnosis import HOPELESS, Certainty, Diagnosis, Gatherer, diagnose, gather
@@ -28,6 +27,7 @@ from vioframe.parts.config import Config
 from vioframe.parts.registry import BACKEND, DATASET, DETECTOR, LOOP_CLOSER, Registry
 from vioframe.runs import machine
 from vioframe.runs.recorder import Recorder, new_run_folder, write_json
+from vioframe.stopwatch import working_s
 from vioframe.types import LoopClosure, Measurement, Step
 
 # A run looks at stamps and readings of its first minute, and at every so manieth image of it.
@@ -97,9 +97,9 @@ class Experiment:
                 if self.loop_closer is None:
                     yield step
                     continue
-                begin = perf_counter()
+                begin_s = working_s()
                 self.loop_closer.add(step)
-                yield replace(step, stage_seconds={**step.stage_seconds, "loop_closure": perf_counter() - begin})
+                yield replace(step, stage_seconds={**step.stage_seconds, "loop_closure": working_s() - begin_s})
 
     def look_closely(self) -> Diagnosis:
         """Read what was played once more, as `vioframe check` does: what may be the cause where a run came to nothing.
@@ -139,6 +139,7 @@ def prepare(config: Config, registry: Registry) -> Experiment:
         frontend=config.frontend_options,
         estimation=config.estimation_options,
         wait_ms=config.wait_ms,
+        warm=False,
         installed=registry,
     )
     return Experiment(
@@ -185,7 +186,7 @@ def record(
     however the run ends. The summary has the ``findings`` about the recording: those of its stamps and readings, or
     with ``explain`` all that can be found (:meth:`Experiment.look_closely`) where the run never initialised.
     """
-    begin_s = perf_counter()
+    begin_s = working_s()
     steps = experiment.steps(pipelined=pipelined)
     first = next(steps, None)
     if first is None:

@@ -7,10 +7,10 @@ a frame. After Weiss et al. (ICRA 2012) and Lynen et al. (IROS 2013); what diffe
 from __future__ import annotations
 
 import numpy as np
-from scipy.stats import chi2
 
 from vioframe.estimation.inertial.noise import noise_over
 from vioframe.geometry import so3
+from vioframe.quantiles import chi2_quantile
 from vioframe.stopwatch import Stopwatch
 from vioframe.types import Estimate, Float, FrameTracks, ImuSegment, Start, Status
 from vioframe_loose_ekf.fusion import Fusion
@@ -19,7 +19,7 @@ from vioframe_loose_ekf.options import LooseEkfOptions
 from vioframe_loose_ekf.state import VisionPose
 
 # A pose of the odometry beyond this quantile is left out.
-_GATE = float(chi2.ppf(0.99, 6))
+_GATE = float(chi2_quantile(0.99, 6))
 # Drift of the vision frame from one keyframe to the next: scale, relative; orientation, rad; position by the distance
 # between them. Measured on EuRoC's flights and simulated ones.
 _DRIFT_SCALE, _DRIFT_ROTATION, _DRIFT_POSITION = 0.003, float(np.deg2rad(0.03)), 0.01

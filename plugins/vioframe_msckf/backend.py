@@ -7,10 +7,10 @@ first-estimate Jacobians (Li and Mourikis, IJRR 2013) and long-lived landmarks k
 from __future__ import annotations
 
 import numpy as np
-from scipy.stats import chi2
 
 from vioframe.estimation.factors.tracks import TrackTable
 from vioframe.estimation.inertial.noise import noise_over
+from vioframe.quantiles import chi2_quantile
 from vioframe.stopwatch import Stopwatch
 from vioframe.types import Estimate, FrameTracks, ImuSegment, Start, Status
 from vioframe_msckf.options import MsckfOptions
@@ -24,7 +24,7 @@ class Msckf:
     def __init__(self, options: MsckfOptions | None = None) -> None:
         self._options = options or MsckfOptions()
         dof = np.arange(1, 2 * self._options.max_clones + 3)
-        self._gate = np.concatenate([[0.0], chi2.ppf(self._options.gate_quantile, dof)])
+        self._gate = np.concatenate([[0.0], chi2_quantile(self._options.gate_quantile, dof)])
 
     def begin(self, start: Start) -> None:
         """A filter with ``start``'s state and no clones."""

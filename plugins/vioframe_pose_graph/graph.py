@@ -22,13 +22,13 @@ from dataclasses import dataclass, fields
 import numpy as np
 from scipy.sparse import bsr_array, csr_array
 from scipy.sparse.linalg import SuperLU, splu
-from scipy.stats import chi2
 
 from vioframe.arrays import Bool
 from vioframe.geometry.so3 import rotation_z
+from vioframe.quantiles import chi2_quantile
 from vioframe.types import Float, Int
 
-GATE = float(chi2.ppf(0.999, 4))
+GATE = float(chi2_quantile(0.999, 4))
 """Squared Mahalanobis distance in [x y z yaw] that a correct loop stays below in 999 of 1000 cases."""
 
 _ITERATIONS = 50

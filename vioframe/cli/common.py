@@ -127,8 +127,8 @@ class Bar:
     """A progress bar on standard error: what is done, ``figures``, and the time that is left; a context manager.
 
     ``total`` None is unknown. Where it is ``late`` it appears when first something is done: an error ahead of that is
-    then one line and nothing else, and the compiling of kernels is shown. In ``percent`` it counts no things but an
-    amount of work.
+    then one line and nothing else, and the compiling of kernels is shown, ahead of it and within. In ``percent`` it
+    counts no things but an amount of work.
     """
 
     def __init__(
@@ -144,17 +144,21 @@ class Bar:
         )
         self._id = self.progress.add_task("", total=total, figures=figures)
         self._figures, self._late, self._shown, self._quiet = figures, late, False, quiet
-        self._before = ExitStack()
+        self._before, self._within = ExitStack(), ExitStack()
 
     def __enter__(self) -> Self:
         if self._late:
+            from vioframe.jit import heard
+
             self._before.enter_context(compiling_shown(quiet=self._quiet))
+            self._within.enter_context(heard(self._compiling))
         else:
             self._show()
         return self
 
     def __exit__(self, *_: object) -> None:
         self._before.close()
+        self._within.close()
         if self._shown:
             self.progress.stop()
 
@@ -163,6 +167,10 @@ class Bar:
         self._show()
         self._figures = self._figures if figures is None else figures
         self.progress.update(self._id, advance=advance, total=total, figures=self._figures)
+
+    def _compiling(self, kernel: str) -> None:
+        if self._shown:
+            self.progress.update(self._id, figures=f"{_COMPILING}: {kernel}")
 
     @property
     def completed(self) -> float:

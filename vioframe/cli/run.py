@@ -24,6 +24,7 @@ from vioframe.report.units import length
 from vioframe.runs.folder import RunFolder
 from vioframe.runs.recorder import check_run_folder, free_run_folder
 from vioframe.types import NS_PER_S, Step
+from vioframe.warming import helped
 
 _MOST_REASONS = 4
 
@@ -65,7 +66,7 @@ def run(threads: int | None, out: Path | None, overwrite: bool, quiet: bool, **c
         check_run_folder(out, overwrite=overwrite)
     installed = registry.load()
     config = _configure(installed, **choices)
-    with Bar(None, quiet=quiet, late=True) as bar:
+    with Bar(None, quiet=quiet, late=True) as bar, helped(config.backend.name):
         experiment = prepare(config, installed)
         folder = out or free_run_folder(Path("runs"), experiment.name)
         summary = record(

@@ -5,14 +5,12 @@ A back-end is its mathematics and nothing else: how it begins from a state, and 
 
 from __future__ import annotations
 
-from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
 
 from vioframe.errors import ConfigError, DivergedError, PluginError
-from vioframe.estimation import initialization
-from vioframe.estimation.initialization import Initializer
+from vioframe.estimation.initialization import GIVEN, Initializer
 from vioframe.estimation.options import EstimationOptions
 from vioframe.estimation.recovery import check_plausible, continued_from
 from vioframe.estimation.soundness import defect_of
@@ -20,7 +18,6 @@ from vioframe.estimation.standstill import StandstillDetector
 from vioframe.interfaces import Backend
 from vioframe.stopwatch import Stopwatch
 from vioframe.types import (
-    NS_PER_S,
     Calibration,
     CalibrationEstimate,
     Estimate,
@@ -29,11 +26,7 @@ from vioframe.types import (
     NavState,
     Start,
     Status,
-    g_W,
 )
-
-# The flight that compiles everything: frames, and how far the camera moves between two.
-_WARM_UP_FRAMES, _WARM_UP_PERIOD_NS, _WARM_UP_STEP_M = 30, NS_PER_S // 10, 0.2
 
 
 class LifeCycle:
@@ -62,7 +55,7 @@ class LifeCycle:
         self._following = False
         self._last: NavState | None = None
         self._corrected_ns = 0
-        self._known = CalibrationEstimate(calibration, (initialization.GIVEN,))
+        self._known = CalibrationEstimate(calibration, (GIVEN,))
         self._imu_noise = calibration.imu
 
     @property
@@ -161,40 +154,3 @@ class LifeCycle:
     def _begin_anew(self) -> None:
         self._following = False
         self._initializer.reset()
-
-
-def warm_up(backend: Backend, calibration: Calibration) -> None:
-    """Fly ``backend``, which is of no use afterwards, sideways along a wall of points that come and go.
-
-    Long enough to come through every step of a window of some ten frames once, so that all compiled code is there, or
-    loaded from the cache, before the first frame of a flight. A back-end may find this flight too odd to follow.
-    """
-    if not calibration.cameras[0].rotation_known:
-        calibration = calibration.with_camera(0, R_BC=np.eye(3), rotation_known=True)
-    initialization.warm_up(calibration)
-    with suppress(DivergedError, np.linalg.LinAlgError):
-        _fly_along_a_wall(backend, calibration)
-
-
-def _fly_along_a_wall(backend: Backend, calibration: Calibration) -> None:
-    camera = calibration.cameras[0]
-    right_W = camera.R_BC[:, 0]
-    rng = np.random.default_rng(0)
-    wall_C = rng.uniform([-1.5, -1.0, 3.0], [_WARM_UP_FRAMES * _WARM_UP_STEP_M + 1.5, 1.0, 5.0], (600, 3))
-    cov = 1e-4 * np.eye(15)
-    speed = _WARM_UP_STEP_M / (_WARM_UP_PERIOD_NS / NS_PER_S)
-    state = NavState(0, np.eye(3), np.zeros(3), speed * right_W, np.zeros(3), np.zeros(3), cov)
-    for k in range(_WARM_UP_FRAMES):
-        t_ns = np.linspace((k - 1) * _WARM_UP_PERIOD_NS, k * _WARM_UP_PERIOD_NS, 3).astype(np.int64)
-        imu = ImuSegment(t_ns, np.zeros((3, 3)), np.tile(-g_W, (3, 1)))
-        p_C = wall_C - [k * _WARM_UP_STEP_M, 0.0, 0.0]
-        ids = np.flatnonzero(np.abs(p_C[:, 0] / p_C[:, 2]) < 0.35)
-        xy_normalised = p_C[ids, :2] / p_C[ids, 2:]
-        xy = camera.model.distort(xy_normalised)
-        tracks = FrameTracks(int(t_ns[-1]), ids, np.zeros_like(ids), xy, xy_normalised)
-        if k == 0:
-            backend.begin(
-                Start(state, CalibrationEstimate(calibration, (initialization.GIVEN,)), calibration.imu, imu, tracks)
-            )
-        else:
-            backend.process(imu, tracks, False)

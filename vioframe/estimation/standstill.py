@@ -10,12 +10,12 @@ from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import chi2
 
 from vioframe.geometry import so3
+from vioframe.quantiles import chi2_quantile
 from vioframe.types import DBA, DBG, DTHETA, DV, NS_PER_S, Float, FrameTracks, ImuNoise, ImuSegment, g_W
 
-STANDSTILL_GATE = float(chi2.ppf(0.95, 9))
+STANDSTILL_GATE = float(chi2_quantile(0.95, 9))
 """Squared Mahalanobis distance below which the readings agree with standstill."""
 _MIN_COMMON_TRACKS = 10
 _LOOK_BACK_NS = NS_PER_S // 2

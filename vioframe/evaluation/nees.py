@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from vioframe.geometry import so3
 from vioframe.geometry.trajectory import Trajectory
+from vioframe.quantiles import chi2_quantile
 from vioframe.types import DP, DTHETA, Float, Int
 
 _PARTS = {"orientation": DTHETA, "position": DP, "pose": slice(0, 6)}
@@ -69,9 +70,7 @@ def nees(aligned: Trajectory, truth: Trajectory) -> tuple[Nees, ...]:
 
 def band(dof: int) -> tuple[float, float]:
     """The two-sided 95 % interval of the chi-squared distribution."""
-    from scipy.special import gammaincinv
-
-    low, high = (2.0 * float(gammaincinv(0.5 * dof, p)) for p in _BAND)
+    low, high = (float(chi2_quantile(p, dof)) for p in _BAND)
     return low, high
 
 

@@ -23,7 +23,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from itertools import count
 from pathlib import Path
-from time import perf_counter
 from types import TracebackType
 from typing import Any, Self, TextIO
 
@@ -37,6 +36,7 @@ from vioframe.incidents import Incidents
 from vioframe.io.calibration import write_calibration
 from vioframe.io.replace import remove_written
 from vioframe.io.trajectories import tum_line, write_tum
+from vioframe.stopwatch import working_s
 from vioframe.types import NS_PER_S, Calibration, CalibrationEstimate, Float, Int, LoopClosure, NavState, Status, Step
 
 STATE_COLUMNS = (
@@ -104,7 +104,8 @@ def free_run_folder(parent: Path, name: str) -> Path:
 class Recorder:
     """Writes one run, step by step; a context manager that completes the folder however the run ends.
 
-    ``about`` opens the summary, ``incidents`` close it. Wall-clock time counts from ``begin_s`` of ``perf_counter``.
+    ``about`` opens the summary, ``incidents`` close it. Time counts from ``begin_s`` of
+    :func:`~vioframe.stopwatch.working_s`: kernels that had to be compiled or loaded are no part of it.
     """
 
     def __init__(self, folder: Path, about: Mapping[str, Any], incidents: Incidents, begin_s: float) -> None:
@@ -286,7 +287,7 @@ class Recorder:
         frames = self._frames
         if frames == 0:
             return {"frames": 0}
-        wall_s = perf_counter() - self._begin_s
+        seconds = working_s() - self._begin_s
         skipped, begun_ns = self._begun or (frames, None)
         return {
             "frames": frames,
@@ -300,8 +301,8 @@ class Recorder:
             "tracked_points_mean": self._points / frames,
             "mean_ms": {stage: 1e3 * self._stage_totals[stage] / frames for stage in self._stages},
             "mean_frame_ms": 1e3 * self._frame_seconds / frames,
-            "wall_s": wall_s,
-            "real_time_factor": (self._last_t_ns - self._first_t_ns) / NS_PER_S / wall_s,
+            "working_s": seconds,
+            "real_time_factor": (self._last_t_ns - self._first_t_ns) / NS_PER_S / seconds,
         }
 
     def _write_summary(self) -> None:

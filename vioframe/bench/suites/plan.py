@@ -13,7 +13,6 @@ from vioframe.bench.suites import fingerprints, sources
 from vioframe.bench.suites.suite import SEED_SHIFT_S, Suite
 from vioframe.bench.suites.tasks import AnyTask, FlightTask, Recording, SpeedTask, TrialTask
 from vioframe.errors import ConfigError, DatasetError
-from vioframe.estimation.lifecycle import warm_up
 from vioframe.io.calibration import packaged_calibration
 from vioframe.parts import config as configuration
 from vioframe.parts.config import Config, DatasetConfig, PartConfig
@@ -22,6 +21,7 @@ from vioframe.runs.evaluated import create_metrics
 from vioframe.runs.results import CELL, CLEAR, Data
 from vioframe.simulation.config import SimulationConfig
 from vioframe.simulation.flights import flight as named_flight
+from vioframe.warming import warm_up
 
 # About how long things take on one core, for the time that is left: a frame to render, to fly, and a second of a trial.
 _RENDER_S, _FLY_S, _TRIAL_S = 0.2, 0.02, 0.35

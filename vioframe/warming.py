@@ -1,0 +1,99 @@
+"""Compiled code that is there when it is needed: by a flight ahead of the flight, or by another process meanwhile.
+
+python -m vioframe.warming BACKEND
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+
+import numpy as np
+
+from vioframe import jit
+from vioframe.errors import DivergedError
+from vioframe.estimation import initialization
+from vioframe.frontend import lucas_kanade
+from vioframe.interfaces import Backend
+from vioframe.io.calibration import packaged_calibration
+from vioframe.parts import registry
+from vioframe.types import (
+    NS_PER_S,
+    Calibration,
+    CalibrationEstimate,
+    FrameTracks,
+    ImuSegment,
+    NavState,
+    Start,
+    g_W,
+)
+
+# The flight that compiles everything: frames, and how far the camera moves between two.
+_FRAMES, _PERIOD_NS, _STEP_M = 30, NS_PER_S // 10, 0.2
+
+
+def warm_up(backend: Backend, calibration: Calibration) -> None:
+    """Come once through all that is compiled for following points, ``backend`` and its starts, or load it.
+
+    ``backend`` is of no use afterwards; it may find its flight too odd to follow.
+    """
+    if not calibration.cameras[0].rotation_known:
+        calibration = calibration.with_camera(0, R_BC=np.eye(3), rotation_known=True)
+    with suppress(DivergedError, np.linalg.LinAlgError):
+        _fly_along_a_wall(backend, calibration)
+    initialization.warm_up(calibration)
+    lucas_kanade.warm_up()
+
+
+@contextmanager
+def helped(backend: str) -> Iterator[None]:
+    """Within it, from the first kernel that has to be compiled on, another process compiles those of ``backend``.
+
+    What is needed first, to follow points and to start, is compiled here meanwhile; the rest then lies in the cache.
+    """
+    helpers: list[subprocess.Popen[bytes]] = []
+
+    def begin(kernel: str) -> None:
+        if not helpers and (os.cpu_count() or 1) > 1:
+            command = [sys.executable, "-m", "vioframe.warming", backend]
+            quiet = subprocess.DEVNULL
+            helpers.append(subprocess.Popen(command, stdin=quiet, stdout=quiet, stderr=quiet))
+
+    try:
+        with jit.heard(begin):
+            yield
+    finally:
+        for helper in helpers:
+            helper.terminate()
+            helper.wait()
+
+
+def _fly_along_a_wall(backend: Backend, calibration: Calibration) -> None:
+    """Fly sideways along points that come and go, through every step of a window of some ten frames."""
+    camera = calibration.cameras[0]
+    right_W = camera.R_BC[:, 0]
+    rng = np.random.default_rng(0)
+    wall_C = rng.uniform([-1.5, -1.0, 3.0], [_FRAMES * _STEP_M + 1.5, 1.0, 5.0], (600, 3))
+    cov = 1e-4 * np.eye(15)
+    speed = _STEP_M / (_PERIOD_NS / NS_PER_S)
+    state = NavState(0, np.eye(3), np.zeros(3), speed * right_W, np.zeros(3), np.zeros(3), cov)
+    for k in range(_FRAMES):
+        t_ns = np.linspace((k - 1) * _PERIOD_NS, k * _PERIOD_NS, 3).astype(np.int64)
+        imu = ImuSegment(t_ns, np.zeros((3, 3)), np.tile(-g_W, (3, 1)))
+        p_C = wall_C - [k * _STEP_M, 0.0, 0.0]
+        ids = np.flatnonzero(np.abs(p_C[:, 0] / p_C[:, 2]) < 0.35)
+        xy_normalised = p_C[ids, :2] / p_C[ids, 2:]
+        xy = camera.model.distort(xy_normalised)
+        tracks = FrameTracks(int(t_ns[-1]), ids, np.zeros_like(ids), xy, xy_normalised)
+        if k == 0:
+            known = CalibrationEstimate(calibration, (initialization.GIVEN,))
+            backend.begin(Start(state, known, calibration.imu, imu, tracks))
+        else:
+            backend.process(imu, tracks, False)
+
+
+if __name__ == "__main__":
+    warm_up(registry.load().create_backend(sys.argv[1], {}), packaged_calibration("euroc", cameras=["cam0"]))
