@@ -314,8 +314,10 @@ def plots_of(page: Path) -> list[str]:
 
 
 def choose_colours(browser: Any, scheme: str) -> None:
-    feature = {"name": "prefers-color-scheme", "value": scheme}
-    browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": [feature]})
+    """In ``scheme``; and without scrolling smoothly, under which a click may miss."""
+    chosen = {"prefers-color-scheme": scheme, "prefers-reduced-motion": "reduce"}
+    features = [{"name": name, "value": value} for name, value in chosen.items()]
+    browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": features})
 
 
 def settle(browser: Any) -> None:

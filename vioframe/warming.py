@@ -72,7 +72,7 @@ def helped(backend: str) -> Iterator[None]:
 
 
 def _fly_along_a_wall(backend: Backend, calibration: Calibration) -> None:
-    """Fly sideways along points that come and go, through every step of a window of some ten frames."""
+    """Fly sideways along points that come and go, through every step of a window of some ten frames, and halt."""
     camera = calibration.cameras[0]
     right_W = camera.R_BC[:, 0]
     rng = np.random.default_rng(0)
@@ -92,7 +92,7 @@ def _fly_along_a_wall(backend: Backend, calibration: Calibration) -> None:
             known = CalibrationEstimate(calibration, (initialization.GIVEN,))
             backend.begin(Start(state, known, calibration.imu, imu, tracks))
         else:
-            backend.process(imu, tracks, False)
+            backend.process(imu, tracks, k == _FRAMES - 1)
 
 
 if __name__ == "__main__":

@@ -11,7 +11,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from filterpy.kalman import KalmanFilter
 from numpy.typing import NDArray
 from scipy.linalg.lapack import dgeqrf
 
@@ -268,6 +267,8 @@ class FilterState:
 
         The error state is the filter's x = 0. It takes O(n^3), which a frame without visual updates can spare.
         """
+        from filterpy.kalman import KalmanFilter  # with scipy.stats, half a second that few flights have to wait for
+
         n = len(self.cov)
         kalman = KalmanFilter(dim_x=n, dim_z=len(residual))
         kalman.P = self.cov
