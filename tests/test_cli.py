@@ -270,7 +270,7 @@ def test_an_error_before_the_first_frame_leaves_everything_as_it_was(toy):
     before = Path("a/trajectory.tum").read_bytes()
     error_line("run", toy, "--backend", "still", "-o", "raise_at=1", "--quiet", "--out", "a", "--overwrite")
     assert Path("a/trajectory.tum").read_bytes() == before
-    error_line("run", toy, "--backend", "still", "-o", "raise_at=1", "--quiet", "--out", "new")
+    error_line("run", toy, "--backend", "still", "-o", "broken_at=0", "--quiet", "--out", "new")
     assert not Path("new").exists()
 
 

@@ -123,8 +123,11 @@ class Experiment:
         return closure
 
 
-def prepare(config: Config, registry: Registry) -> Experiment:
-    """Check the whole of ``config``, then open the data set and create the parts."""
+def prepare(config: Config, registry: Registry, *, warm: bool = False) -> Experiment:
+    """Check the whole of ``config``, then open the data set and create the parts.
+
+    ``warm``, the back-end has flown once: it begins later, but one that fails does so before anything is replaced.
+    """
     config = configuration.complete(config, registry)
     if config.dataset.path is None:
         raise DatasetError("no data set given; name a bag or folder, or set dataset.path in the configuration")
@@ -139,7 +142,7 @@ def prepare(config: Config, registry: Registry) -> Experiment:
         frontend=config.frontend_options,
         estimation=config.estimation_options,
         wait_ms=config.wait_ms,
-        warm=False,
+        warm=warm,
         installed=registry,
     )
     return Experiment(

@@ -67,7 +67,7 @@ def run(threads: int | None, out: Path | None, overwrite: bool, quiet: bool, **c
     installed = registry.load()
     config = _configure(installed, **choices)
     with Bar(None, quiet=quiet, late=True) as bar, helped(config.backend.name):
-        experiment = prepare(config, installed)
+        experiment = prepare(config, installed, warm=overwrite)
         folder = out or free_run_folder(Path("runs"), experiment.name)
         summary = record(
             experiment,
