@@ -48,7 +48,7 @@ def main(
 ) -> None:
     """Time the front-end on SEQUENCE, image decoding excluded, and hold its tracks against the ground truth."""
     installed = registry.load()
-    dataset = installed.open_dataset(sequence)
+    dataset = installed.open_dataset(sequence, options={"cameras": ["cam0"]})
     options = FrontendOptions(max_points=max_points)
 
     def rows() -> Iterator[Row]:
@@ -56,9 +56,7 @@ def main(
             for threads in thread_counts:
                 cv2.setNumThreads(threads)
                 for name in detectors:
-                    frontend = Frontend(
-                        installed.create_detector(name), dataset.calibration.cameras[0].model, options, Incidents()
-                    )
+                    frontend = Frontend(installed.create_detector(name), dataset.calibration, options, Incidents())
                     yield {"detector": name, "threads": threads, **measure(frontend, dataset)}
 
     present("frontend_speed", TITLE, rows(), COLUMNS, {"sequence": sequence.name, "max_points": max_points}, keep)
@@ -67,7 +65,7 @@ def main(
 def measure(frontend: Frontend, dataset: Dataset) -> Row:
     steps, seconds = [], []
     for imu, frame in synchronise(dataset.measurements(), incidents=Incidents()):
-        steps.append(frontend.track(imu, frame, dataset.calibration.cameras[0].R_BC))
+        steps.append(frontend.track(imu, frame, dataset.calibration))
         seconds.append(frontend.stage_seconds)
     ms = {stage: 1e3 * float(np.mean([s.get(stage, 0.0) for s in seconds])) for stage in seconds[-1]}
     lifetimes = np.unique(np.concatenate([s.ids for s in steps]), return_counts=True)[1]

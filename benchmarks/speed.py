@@ -1,0 +1,163 @@
+"""Milliseconds a frame of whole runs, on one core and on two, against a yardstick measured in the same minutes.
+
+    python benchmarks/speed.py [--record] [--rounds 5] [--against CHECKOUT]
+
+The yardstick is what OpenCV alone takes for such a front-end on the same images: decoding, equalising, following points
+there and back, new points, the essential matrix (``yardstick.py``). Everything takes its turn in each round, so that
+ratios hold where times do not; all figures are medians over the rounds. ``--against`` has another checkout of vioframe,
+such as that of a release, take part.
+
+Targets: on two cores 1.6 times the frames a second of one; the first frame within 0.7 s; the window 5 times faster
+than real time, decoding and recording included.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from collections import defaultdict
+from collections.abc import Iterator
+from functools import partial
+from pathlib import Path
+from statistics import median
+from tempfile import TemporaryDirectory
+from time import monotonic, sleep
+
+import click
+from common import HERE, SHARED_DATA, present
+
+from vioframe.bench import Row
+
+COLUMNS = {
+    "data": "",
+    "run": "",
+    "cores": "d",
+    "rounds": "d",
+    "frame_ms": ".2f",
+    "lowest_ms": ".2f",
+    "highest_ms": ".2f",
+    "by_yardstick": ".2f",
+    "frames_s": ".1f",
+    "real_time": ".2f",
+    "first_s": ".2f",
+    "ratio": ".2f",
+}
+RUNS = ("shi_tomasi+msckf", "shi_tomasi+sliding_window", "keypointnet+msckf")
+_FLIGHT, _FLIGHT_S = "figure_eight", 20
+_POLL_S = 0.005
+
+
+@click.command()
+@click.option("--record", "keep", is_flag=True, help="Write the results to benchmarks/results.")
+@click.option("--rounds", default=5, show_default=True, help="Runs of each, in turn.")
+@click.option("--run", "runs", multiple=True, default=RUNS, show_default=True, metavar="DETECTOR+BACKEND")
+@click.option("--against", type=click.Path(exists=True, file_okay=False, path_type=Path), metavar="CHECKOUT")
+@click.option("--data", type=click.Path(exists=True, path_type=Path), default=SHARED_DATA / "euroc/MH_01_easy_15s")
+def main(keep: bool, rounds: int, runs: tuple[str, ...], against: Path | None, data: Path) -> None:
+    """Whole runs on DATA and on a rendered flight, on one core and on two."""
+    with TemporaryDirectory() as folder:
+        flight = Path(folder) / f"{_FLIGHT}.bag"
+        options = ["--flight", _FLIGHT, "--duration", str(_FLIGHT_S), "--quiet"]
+        subprocess.run([sys.executable, "-m", "vioframe", "simulate", str(flight), *options], check=True)
+        settings = {"rounds": rounds, "runs": list(runs), "against": None if against is None else _commit(against)}
+        rows = (row for recording in (data, flight) for row in _rows(recording, runs, rounds, against, Path(folder)))
+        present("speed", "whole runs", rows, COLUMNS, settings, keep)
+
+
+def _rows(data: Path, runs: tuple[str, ...], rounds: int, against: Path | None, folder: Path) -> Iterator[Row]:
+    """A row for the yardstick and for each run, code and number of cores."""
+    measured = defaultdict(list)
+    for _ in range(rounds):
+        measured["yardstick", None, 1].append({"frame_ms": _yardstick(data)})
+        for run in runs:
+            for checkout in (None, against) if against else (None,):
+                for cores in (1, 2):
+                    if checkout is None or cores == 1:
+                        found = _run(data, run, checkout, cores, folder / "run")
+                        measured[run, checkout, cores].append(found)
+    yardstick = measured["yardstick", None, 1]
+    for (run, checkout, cores), found in measured.items():
+        times = [each["frame_ms"] for each in found]
+        row: Row = {
+            "data": data.name,
+            "run": f"{run} ({_commit(checkout)})" if checkout else run,
+            "cores": cores,
+            "rounds": rounds,
+            "frame_ms": median(times),
+            "lowest_ms": min(times),
+            "highest_ms": max(times),
+            "by_yardstick": median(a["frame_ms"] / b["frame_ms"] for a, b in zip(found, yardstick, strict=True)),
+        }
+        if run != "yardstick":
+            row |= {name: median(each[name] for each in found) for name in ("frames_s", "real_time", "first_s")}
+            stages = found[0]["stage_ms"]
+            row["stage_ms"] = {stage: median(each["stage_ms"].get(stage, 0.0) for each in found) for stage in stages}
+            # Frames a second over those on one core; another checkout's milliseconds a frame in these.
+            if cores == 2:
+                row["ratio"] = _ratio(found, measured[run, None, 1], "frames_s")
+            elif checkout is None and against is not None:
+                row["ratio"] = _ratio(found, measured[run, against, 1], "frame_ms")
+        yield row
+
+
+def _ratio(found: list[Row], others: list[Row], name: str) -> float:
+    return median(a[name] / b[name] for a, b in zip(found, others, strict=True))
+
+
+def _yardstick(data: Path) -> float:
+    return float(_on_cores([sys.executable, str(HERE / "yardstick.py"), str(data)], 1, {}).communicate()[0])
+
+
+def _run(data: Path, run: str, checkout: Path | None, cores: int, out: Path) -> Row:
+    """One run of the command line, by the code of ``checkout``."""
+    detector, backend = run.split("+")
+    command = [sys.executable, "-m", "vioframe", "run", str(data), "--detector", detector, "--backend", backend]
+    command += ["--quiet", "--overwrite", "--out", str(out)]
+    code = {} if checkout is None else {"PYTHONPATH": f"{checkout}{os.pathsep}{checkout / 'plugins'}"}
+    (out / "timings.csv").unlink(missing_ok=True)
+    begin_s = monotonic()
+    process = _on_cores(command, cores, code)
+    while process.poll() is None and _lines(out / "timings.csv") < 2:
+        sleep(_POLL_S)
+    first_s = monotonic() - begin_s
+    if process.wait() != 0:
+        raise click.ClickException(f"{' '.join(command)} failed")
+    summary = json.loads((out / "summary.json").read_text())
+    seconds = (summary["last_frame_t_ns"] - summary["first_frame_t_ns"]) * 1e-9 / summary["real_time_factor"]
+    return {
+        "frame_ms": summary["mean_frame_ms"],
+        "stage_ms": summary["mean_ms"],
+        "frames_s": summary["frames"] / seconds,
+        "real_time": summary["real_time_factor"],
+        "first_s": first_s,
+    }
+
+
+def _lines(path: Path) -> int:
+    try:
+        return path.read_bytes().count(b"\n")
+    except FileNotFoundError:
+        return 0
+
+
+def _on_cores(command: list[str], cores: int, environment: dict[str, str]) -> subprocess.Popen[bytes]:
+    """Begin ``command`` where it may use so many cores, and its BLAS one."""
+    some = sorted(os.sched_getaffinity(0))[:cores]
+    one = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
+    return subprocess.Popen(
+        command,
+        stdout=subprocess.PIPE,
+        env={**os.environ, **one, **environment},
+        preexec_fn=partial(os.sched_setaffinity, 0, some),
+    )
+
+
+def _commit(checkout: Path) -> str:
+    command = ["git", "-C", str(checkout), "rev-parse", "--short=8", "HEAD"]
+    return subprocess.run(command, check=True, capture_output=True, text=True).stdout.strip()
+
+
+if __name__ == "__main__":
+    main()
