@@ -23,8 +23,9 @@ from scipy.stats import chi2
 from trajectory_helpers import run_of
 
 from vioframe.bench.montecarlo import Setup, fly, nees_by_stretch
-from vioframe.bench.processes import installed, map_in_processes, usable_cores
+from vioframe.bench.processes import installed, map_in_processes
 from vioframe.cli import main
+from vioframe.cores import usable_cores
 from vioframe.evaluation import evaluate
 from vioframe.evaluation.consistency import PARTS, average_band, average_nees, over_trials
 from vioframe.geometry import so3

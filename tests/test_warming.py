@@ -55,7 +55,7 @@ def helpers(monkeypatch):
             begun.append("waited for")
 
     monkeypatch.setattr(subprocess, "Popen", Helper)
-    monkeypatch.setattr("os.cpu_count", lambda: 2)
+    monkeypatch.setattr("vioframe.warming.usable_cores", lambda: 2)
     return begun
 
 
@@ -71,7 +71,7 @@ def test_another_process_helps_once_something_is_to_be_compiled(helpers):
 def test_nobody_helps_on_one_core_nor_without_need(helpers, monkeypatch):
     with helped("msckf"):
         pass
-    monkeypatch.setattr("os.cpu_count", lambda: 1)
+    monkeypatch.setattr("vioframe.warming.usable_cores", lambda: 1)
     with helped("msckf"):
         compile_something()
     assert helpers == []

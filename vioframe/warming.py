@@ -5,7 +5,6 @@ python -m vioframe.warming BACKEND
 
 from __future__ import annotations
 
-import os
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -14,6 +13,7 @@ from contextlib import contextmanager, suppress
 import numpy as np
 
 from vioframe import jit
+from vioframe.cores import usable_cores
 from vioframe.errors import DivergedError
 from vioframe.estimation import initialization
 from vioframe.frontend import lucas_kanade
@@ -57,7 +57,7 @@ def helped(backend: str) -> Iterator[None]:
     helpers: list[subprocess.Popen[bytes]] = []
 
     def begin(kernel: str) -> None:
-        if not helpers and (os.cpu_count() or 1) > 1:
+        if not helpers and usable_cores() > 1:
             command = [sys.executable, "-m", "vioframe.warming", backend]
             quiet = subprocess.DEVNULL
             helpers.append(subprocess.Popen(command, stdin=quiet, stdout=quiet, stderr=quiet))

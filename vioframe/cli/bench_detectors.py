@@ -84,8 +84,8 @@ def detectors(
 
     from vioframe.bench.detectors import tables
     from vioframe.bench.detectors.entrants import everyone, line_up, parse_entrants
-    from vioframe.bench.processes import usable_cores
     from vioframe.bench.results import record
+    from vioframe.cores import usable_cores
     from vioframe.parts import registry
 
     installed = registry.load()

@@ -76,11 +76,12 @@ def montecarlo(
     Landmarks instead of images, EuRoC's camera and IMU noise, true calibration, the back-end's own initialisation. A
     trial that fails counts and is shown.
     """
-    from vioframe.bench.processes import map_in_processes, usable_cores
+    from vioframe.bench.processes import map_in_processes
     from vioframe.bench.results import record
     from vioframe.bench.suites.plan import plan
     from vioframe.bench.suites.suite import Suite
     from vioframe.bench.suites.tasks import TrialTask, fly_trial
+    from vioframe.cores import usable_cores
     from vioframe.evaluation.consistency import notes, over_trials
     from vioframe.parts import registry
     from vioframe.parts.config import parse_part, validate

@@ -11,6 +11,7 @@ from typing import Any
 import click
 
 from vioframe.cli.common import FILE, Bar, PartName, calibration_option, print_notes, quiet_option
+from vioframe.cores import usable_cores
 from vioframe.errors import DatasetError
 from vioframe.io.convert import FORMATS, format_of
 from vioframe.io.convert import convert as write_converted
@@ -97,7 +98,7 @@ def simulate(
     check_destinations(destinations, compression, overwrite=overwrite)
     config = configuration.complete(_configure(installed, **choices), installed)
     begin_s = perf_counter()
-    recording = SimulatedRecording(config, installed, workers or os.cpu_count() or 1)
+    recording = SimulatedRecording(config, installed, workers or usable_cores())
     with Bar(recording.frame_count, recording.name, quiet=quiet) as bar:
         record(recording, destinations, compression=compression, overwrite=overwrite, on_frame=lambda _: bar())
     if quiet:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
 from math import inf
 from pathlib import Path
@@ -12,6 +11,7 @@ import click
 
 from vioframe.cli import EXIT_FAILED
 from vioframe.cli.common import FILE, Bar, PartName, calibration_option, print_notes, quiet_option
+from vioframe.cores import usable_cores
 from vioframe.diagnosis import Severity
 from vioframe.errors import DatasetError, TrajectoryError
 from vioframe.evaluation import evaluate
@@ -75,7 +75,7 @@ def run(threads: int | None, out: Path | None, overwrite: bool, quiet: bool, **c
             overwrite=overwrite,
             on_step=_watched(bar, experiment),
             explain=True,
-            pipelined=(threads or os.cpu_count() or 1) > 1,
+            pipelined=(threads or usable_cores()) > 1,
         )
     if not quiet:
         if others := experiment.left_aside:

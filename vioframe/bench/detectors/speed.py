@@ -13,7 +13,7 @@ import pandas as pd
 
 from vioframe.bench.detectors.entrants import detect
 from vioframe.bench.detectors.images import evenly, find_images, fit, frames_of, procedural_images, read_grey
-from vioframe.bench.processes import usable_cores
+from vioframe.cores import usable_cores
 from vioframe.interfaces import Dataset, Detector
 from vioframe.parts.config import LabelledPart
 from vioframe.runs import machine

@@ -15,10 +15,10 @@ from contextlib import contextmanager
 from multiprocessing import resource_tracker
 from typing import TYPE_CHECKING, Any
 
-from vioframe.bench.processes import usable_cores
 from vioframe.bench.suites import tasks
 from vioframe.bench.suites.store import Store
 from vioframe.bench.suites.tasks import AnyTask, Recording, SpeedTask
+from vioframe.cores import usable_cores
 from vioframe.errors import RunError, VioframeError, needs
 from vioframe.parts.registry import describe
 from vioframe.runs.results import FINGERPRINT, Row, read_rows
