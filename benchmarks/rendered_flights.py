@@ -6,7 +6,6 @@ Targets. MH_05_difficult from 5 s on: complete, ATE at most 0.5 m.
 V1_02_medium: at most 0.15 m. The world is simulated: not to be compared with published ATE on the real images.
 """
 
-import os
 from collections.abc import Iterator
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -17,6 +16,7 @@ from common import benchmark, present
 from euroc_clips import run
 
 from vioframe.bench import Row
+from vioframe.cores import usable_cores
 from vioframe.parts import config as configuration
 from vioframe.parts import registry
 from vioframe.parts.config import Config, DatasetConfig, PartConfig
@@ -45,7 +45,7 @@ COLUMNS = {
 def main(data: Path, backend: str, assignments: tuple[str, ...], keep: bool, detectors: tuple[str, ...]) -> None:
     """Rendered EuRoC flights, from bag to trajectory."""
     installed = registry.load()
-    workers = os.cpu_count() or 1
+    workers = usable_cores()
 
     def rows() -> Iterator[Row]:
         with TemporaryDirectory() as temporary:

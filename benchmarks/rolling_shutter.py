@@ -8,7 +8,6 @@ initialises itself, is flown from starts four seconds apart. Pieces of one world
 independent flights.
 """
 
-import os
 from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import replace
@@ -21,6 +20,7 @@ import numpy as np
 from common import benchmark, present
 
 from vioframe.bench import Row, backend_row, run_backend
+from vioframe.cores import usable_cores
 from vioframe.frontend import Frontend, FrontendOptions
 from vioframe.incidents import Incidents
 from vioframe.io.synchronise import synchronise
@@ -122,7 +122,7 @@ def rendered(folder: Path, flight: str, world: int, duration_s: float, readout_m
             readout_ms=readout_ms,
             seed=world,
         )
-        record(SimulatedRecording(complete(config, installed), installed, os.cpu_count() or 1), [bag])
+        record(SimulatedRecording(complete(config, installed), installed, usable_cores()), [bag])
     return bag
 
 

@@ -26,7 +26,7 @@ from vioframe.estimation.factors.inertial import ImuFactors
 from vioframe.estimation.factors.landmarks import camera_poses, positions
 from vioframe.estimation.factors.problem import Prior, Problem, Variables, pose_columns, symmetric
 from vioframe.estimation.factors.reprojection import CALIBRATION_SIZE, READOUT, Poses, Sightings
-from vioframe.estimation.factors.solver import covariance_of_last
+from vioframe.estimation.factors.solver import covariance
 from vioframe.geometry import so3
 from vioframe.geometry.cameras import Camera
 from vioframe.geometry.kernels import intrinsics_of
@@ -288,7 +288,7 @@ def test_covariance_of_the_last_unknowns_is_their_part_of_the_whole():
     active = np.delete(np.arange(len(S)), [2, 15 * len(x.states) + READOUT])
     unit = natural(x)[active]
     expected = np.linalg.inv(symmetric(S)[np.ix_(active, active)] * np.outer(unit, unit))[1 - count :, 1 - count :]
-    cov = covariance_of_last(normal, active, count - 1) / np.outer(unit[1 - count :], unit[1 - count :])
+    cov = covariance(normal, active, count - 1) / np.outer(unit[1 - count :], unit[1 - count :])
     np.testing.assert_allclose(cov, expected, rtol=0.0, atol=1e-9 * np.abs(expected).max())
     np.testing.assert_array_equal(cov, cov.T)
 

@@ -19,12 +19,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from vioframe.cores import usable_cores
 from vioframe.errors import DatasetError
 from vioframe.estimation.lifecycle import LifeCycle
 from vioframe.estimation.options import EstimationOptions
 from vioframe.frontend import Frontend, FrontendOptions
 from vioframe.incidents import Incidents
 from vioframe.interfaces import Backend, Detector
+from vioframe.io.ahead import read_ahead
 from vioframe.io.synchronise import Packet, Synchroniser
 from vioframe.parts import registry
 from vioframe.parts.registry import Registry
@@ -150,11 +152,12 @@ class Odometry:
     def follow(self, measurements: Iterable[Measurement], *, pipelined: bool = False) -> Iterator[Step]:
         """The steps of a whole stream, to its end.
 
-        ``pipelined``, a frame's points are followed in a thread of their own while the one before it is estimated from:
-        the same bytes, sooner where there are two cores.
+        ``pipelined``, a thread reads ahead, and a frame's points are followed in another while the one before it is
+        estimated from: the same bytes, sooner where there are two cores.
         """
         if pipelined:
-            yield from self._follow_ahead(self._packets(measurements))
+            with limited_threads(opencv=usable_cores() - 1):
+                yield from self._follow_ahead(self._packets(read_ahead(measurements)))
         else:
             for imu, frames in self._packets(measurements):
                 yield self._step(imu, frames)
@@ -169,7 +172,7 @@ class Odometry:
 
         Only in flight: at a start the next frame depends on what was found.
         """
-        with limited_threads(), ThreadPoolExecutor(1, "frontend") as thread:
+        with ThreadPoolExecutor(1, "frontend") as thread:
             ahead: Future[_Seen] | None = None
             failure: Exception | None = None
             while True:
@@ -254,21 +257,21 @@ def _own(image: Image) -> Image:
 
 
 @contextmanager
-def limited_threads() -> Iterator[None]:
+def limited_threads(opencv: int = _MAX_OPENCV_THREADS) -> Iterator[None]:
     """One BLAS thread, and few of OpenCV's, as long as it lasts.
 
     numpy and scipy bring a BLAS each; on matrices this small their threads only wait for one another.
     """
     import cv2
 
-    before = cv2.getNumThreads()
-    if before > _MAX_OPENCV_THREADS:
-        cv2.setNumThreads(_MAX_OPENCV_THREADS)
+    before, most = cv2.getNumThreads(), min(max(opencv, 1), _MAX_OPENCV_THREADS)
+    if before > most:
+        cv2.setNumThreads(most)
     try:
         with _blas_libraries().limit(limits=1):
             yield
     finally:
-        if before > _MAX_OPENCV_THREADS:
+        if before > most:
             cv2.setNumThreads(before)
 
 

@@ -1,6 +1,6 @@
 """Compiled code that is there when it is needed: by a flight ahead of the flight, or by another process meanwhile.
 
-python -m vioframe.warming BACKEND
+That process is ``python -m vioframe.warming BACKEND``.
 """
 
 from __future__ import annotations

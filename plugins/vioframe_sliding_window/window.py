@@ -33,7 +33,7 @@ from vioframe.estimation.factors.reprojection import (
     pixels_by_residual,
     undistorted,
 )
-from vioframe.estimation.factors.solver import covariance_of_last, solve
+from vioframe.estimation.factors.solver import covariance, solve
 from vioframe.estimation.factors.tracks import LandmarkTable, TrackTable
 from vioframe.estimation.inertial.noise import noise_over
 from vioframe.estimation.inertial.preintegration import Preintegrated, join_segments, preintegrate
@@ -318,7 +318,7 @@ class Window:
 
     def _covariance(self, normal: Normal) -> tuple[Float, Float]:
         """Of the newest state (15, 15), and the standard deviations of the calibration, zero where it is fixed."""
-        end = covariance_of_last(normal, self._active(), STATE_SIZE + int(self._calibrated.sum()))
+        end = covariance(normal, self._active(), STATE_SIZE + int(self._calibrated.sum()))
         sigma = np.zeros(CALIBRATION_SIZE)
         sigma[self._calibrated] = np.sqrt(np.diag(end)[STATE_SIZE:])
         return end[:STATE_SIZE, :STATE_SIZE], sigma

@@ -48,7 +48,8 @@ _MOST_REASONS = 4
 @click.option(
     "--threads",
     type=click.IntRange(1, 2),
-    help="With 2, points are followed while the frame before is estimated from; the results are the same.  "
+    help="With 2, points are followed while the frame before is estimated from, and the next ones are read; the "
+    "results are the same.  "
     "[default: 2 where there are as many cores]",
 )
 @click.option("--out", type=FILE, help="Run folder.  [default: runs/DATASET_DETECTOR_BACKEND]")

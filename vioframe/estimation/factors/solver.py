@@ -77,13 +77,13 @@ def _step(normal: Normal, active: Int, damping: float) -> tuple[Float, Float]:
     return step, normal.landmark_step(step, eliminated)
 
 
-def covariance_of_last(normal: Normal, active: Int, count: int) -> Float:
-    """(count, count) of the last unknowns that are ``active``, all others being free."""
+def covariance(normal: Normal, active: Int, last: int) -> Float:
+    """(last, last) of the ``last`` of the unknowns that are ``active``, all of these being free."""
     S, g, _ = normal.reduced(0.0)
     L, _, scale = _factored(S, g, active)
     # The last rows of the factor are that of the equations which remain, all others being eliminated.
-    cov, _ = dpotri(L[-count:, -count:], lower=1)
-    return np.asarray(symmetric(cov.T) * np.outer(scale[-count:], scale[-count:]))
+    cov, _ = dpotri(L[-last:, -last:], lower=1)
+    return np.asarray(symmetric(cov.T) * np.outer(scale[-last:], scale[-last:]))
 
 
 def _factored(S: Float, g: Float, active: Int) -> tuple[Float, Float, Float]:
@@ -111,21 +111,6 @@ def _scaled(S: Float, g: Float, active: Int) -> tuple[Float, Float, Float]:
         for v in range(u, count):
             out[u, v] = scale[u] * scale[v] * row[active[v]]
     return out, right, scale
-
-
-def solve_positive(S: Float, g: Float) -> Float:
-    """S^-1 g for a positive definite S (n, n), g (n,) or (n, m); raises ``LinAlgError`` for any other.
-
-    Of S the upper half counts.
-    """
-    # Jacobi scaling: the entries of S differ by many orders of magnitude.
-    scale = 1.0 / np.sqrt(np.maximum(np.diag(S), 1e-12))
-    L, bad = dpotrf((S * scale[:, None] * scale).T, lower=1, overwrite_a=1)
-    if bad:
-        raise np.linalg.LinAlgError("the window's equations are not positive definite")
-    scaled = (scale * g.T).T
-    out, _ = dpotrs(L, scaled, lower=1)
-    return np.asarray((scale * out.T).T)
 
 
 def _finite(solution: Solution) -> Solution:

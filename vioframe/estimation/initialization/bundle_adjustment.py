@@ -11,6 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from vioframe.arrays import Float, Int
+from vioframe.estimation.factors import solver
 from vioframe.estimation.factors.inertial import ImuFactors, StateArrays
 from vioframe.estimation.factors.landmarks import image_velocities, in_images, motion_in_body
 from vioframe.estimation.factors.problem import STATE_SIZE, Prior, Problem, Variables, calibration_information
@@ -25,7 +26,7 @@ from vioframe.estimation.factors.reprojection import (
     pixels_by_intrinsics,
     pixels_by_residual,
 )
-from vioframe.estimation.factors.solver import Solution, solve, solve_positive
+from vioframe.estimation.factors.solver import Solution, solve
 from vioframe.estimation.inertial.preintegration import Preintegrated
 from vioframe.estimation.initialization.window import BIAS_ACCEL_SIGMA, BIAS_GYRO_SIGMA, PIXEL_SIGMA, Window
 from vioframe.geometry.kernels import intrinsics_of
@@ -82,11 +83,11 @@ def covariance(problem: Problem, x: Variables, known: Float) -> Float:
     Position and yaw are pinned at the *newest* state.
     """
     prior = _prior(x, len(x.states) - 1, _FIXED, problem.prior.camera, known)
-    S, _, _ = replace(problem, prior=prior).linearise(x).reduced(0.0)
+    normal = replace(problem, prior=prior).linearise(x)
     active = _active(x, known)
-    at, cov = np.ix_(active, active), np.zeros(S.shape)
-    cov[at] = solve_positive(S[at], np.eye(len(active)))
-    return 0.5 * (cov + cov.T)
+    cov = np.zeros(normal.H.shape)
+    cov[np.ix_(active, active)] = solver.covariance(normal, active, len(active))
+    return cov
 
 
 def _active(x: Variables, known: Float) -> Int:
