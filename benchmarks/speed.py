@@ -115,7 +115,9 @@ def _run(data: Path, run: str, checkout: Path | None, cores: int, out: Path) -> 
     detector, backend = run.split("+")
     command = [sys.executable, "-m", "vioframe", "run", str(data), "--detector", detector, "--backend", backend]
     command += ["--quiet", "--overwrite", "--out", str(out)]
-    code = {} if checkout is None else {"PYTHONPATH": f"{checkout}{os.pathsep}{checkout / 'plugins'}"}
+    code = {}
+    if checkout is not None:  # its own, though another vioframe may lie in the folder that this was begun in
+        code = {"PYTHONPATH": f"{checkout}{os.pathsep}{checkout / 'plugins'}", "PYTHONSAFEPATH": "1"}
     (out / "timings.csv").unlink(missing_ok=True)
     begin_s = monotonic()
     process = _on_cores(command, cores, code)
