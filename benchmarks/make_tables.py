@@ -234,6 +234,27 @@ def frontend() -> str:
     return markdown(shown) + source(rows)
 
 
+def whole_runs() -> str:
+    """Whole runs on one core and on two, beside the yardstick; medians over the rounds."""
+    rows = recorded("speed.json")
+    shown = [
+        {
+            "data": row.data,
+            "run": row.run,
+            "cores": f"{row.cores}",
+            "n": f"{row.rounds}",
+            "ms a frame": f"{row.frame_ms:.1f} ({row.lowest_ms:.1f} to {row.highest_ms:.1f})",
+            "of the yardstick": _number(row.by_yardstick, ".2f"),
+            "frames/s": _number(row.frames_s, ".0f"),
+            "times real time": _number(row.real_time, ".1f"),
+            "first frame, s": _number(row.first_s, ".2f"),
+            "ratio": _number(row.ratio, ".2f"),
+        }
+        for row in rows.itertuples()
+    ]
+    return markdown(shown) + source(rows)
+
+
 def consistency() -> str:
     """Monte Carlo: errors, and NEES a degree of freedom with the band of an honest filter and the verdict."""
     rows = recorded("montecarlo*.json")
@@ -385,7 +406,20 @@ def throughput() -> str:
 FIGURES: dict[str, Callable[[], str]] = {
     make.__name__: make
     for make in (
-        *(headline, real_images, stages, at_rest, landmarks, rendered, april, frontend, consistency, memory, push),
+        *(
+            headline,
+            real_images,
+            stages,
+            at_rest,
+            landmarks,
+            rendered,
+            april,
+            frontend,
+            whole_runs,
+            consistency,
+            memory,
+            push,
+        ),
         *(speed, quality, clean, comparison, stress, throughput, rolling_shutter, planted_faults, starts),
     )
 }
