@@ -11,23 +11,25 @@ from vioframe.geometry import so3
 from vioframe.io.calibration import packaged_calibration
 from vioframe.simulation import TrackSequence, simulated_sequence
 from vioframe.simulation.tracks import EUROC_NOISE
-from vioframe.types import Calibration, CalibrationEstimate, CameraSigma, Float, NavState
+from vioframe.types import Calibration, CalibrationEstimate, CameraSigma, Float, Int, NavState
 from vioframe_msckf.state import IMU, FilterState
 
 CALIBRATION = packaged_calibration("euroc", cameras=["cam0"])
+STEREO = packaged_calibration("euroc")
 START_COV = np.diag(np.repeat([0.005, 0.001, 0.02, 0.005, 0.05], 3) ** 2)
 """How well a drawn start is known: rad, m, m/s, rad/s, m/s^2."""
 
 
-def landmark_rows(state: FilterState, clone: int, blocks: Float) -> Float:
-    """H (2 M, n) of landmarks seen from one clone, with all the zeros that its ``blocks`` (M, 2, 25) leave out."""
-    calibrated, m = state.calibrated.stop - IMU, len(blocks)
-    H = np.zeros((2 * m, len(state.cov)))
-    H[:, state.calibrated] = blocks[:, :, :calibrated].reshape(-1, calibrated)
-    at = state.calibrated.stop + 6 * clone
-    H[:, at : at + 6] = blocks[:, :, 16:22].reshape(-1, 6)
-    rows, columns = np.arange(2 * m).reshape(-1, 2, 1), np.arange(3 * m).reshape(-1, 1, 3)
-    H[rows, state.landmarks_begin + columns] = blocks[:, :, 22:]
+def sighting_rows(state: FilterState, clone: int, landmarks: Int, cameras: Int, blocks: Float) -> Float:
+    """H (2 M, n) of sightings from one clone, with all the zeros that their ``blocks`` (M, 2, 25) leave out."""
+    H = np.zeros((2 * len(blocks), len(state.cov)))
+    at_clone = state.calibrated.stop + 6 * clone
+    for i, (landmark, camera, block) in enumerate(zip(landmarks, cameras, blocks, strict=True)):
+        at_camera, at_landmark = IMU + state.of_camera * camera, state.landmarks_begin + 3 * landmark
+        rows = H[2 * i : 2 * i + 2]
+        rows[:, at_camera : at_camera + state.of_camera] = block[:, : state.of_camera]
+        rows[:, at_clone : at_clone + 6] = block[:, 16:22]
+        rows[:, at_landmark : at_landmark + 3] = block[:, 22:]
     return H
 
 
@@ -35,7 +37,7 @@ def prior_of(calibration: Calibration) -> CalibrationEstimate:
     """``calibration`` as well known as the life cycle takes any to be."""
     intrinsics = np.repeat([1.0, 0.005], 4)
     sigma = CameraSigma(np.full(3, 0.005), np.full(3, 0.015), 0.01, intrinsics)
-    return CalibrationEstimate(calibration, (sigma,))
+    return CalibrationEstimate(calibration, (sigma,) * len(calibration.cameras))
 
 
 def random_covariance(rng: np.random.Generator, n: int) -> Float:
@@ -46,12 +48,18 @@ def random_covariance(rng: np.random.Generator, n: int) -> Float:
 
 
 def random_state(
-    seed: int = 0, clones: int = 4, landmarks: int = 3, *, calibrate: bool = True, scale: float = 1.0
+    seed: int = 0,
+    clones: int = 4,
+    landmarks: int = 3,
+    *,
+    calibrate: bool = True,
+    scale: float = 1.0,
+    calibration: Calibration = STEREO,
 ) -> FilterState:
     """A filter in the midst of a flight; ``scale`` is that of its standard deviations."""
     rng = np.random.default_rng(seed)
     nav = NavState(0, so3.exp(rng.normal(size=3)), *(rng.normal(size=3) for _ in range(4)), np.eye(15))
-    state = FilterState(nav, prior_of(CALIBRATION), extrinsics=calibrate, offset=calibrate, intrinsics=calibrate)
+    state = FilterState(nav, prior_of(calibration), extrinsics=calibrate, offset=calibrate, intrinsics=calibrate)
     for _ in range(clones):
         state.R_WB, state.p_WB = state.R_WB @ so3.exp(0.1 * rng.normal(size=3)), state.p_WB + 0.3 * rng.normal(size=3)
         state.augment_clone(rng.normal(size=3))
@@ -65,13 +73,19 @@ def random_state(
 
 
 def seeing_state(
-    seed: int = 0, clones: int = 6, *, readout_s: float = 0.0, exact: bool = False
+    seed: int = 0,
+    clones: int = 6,
+    *,
+    readout_s: float = 0.0,
+    exact: bool = False,
+    calibration: Calibration = CALIBRATION,
 ) -> tuple[FilterState, TrackTable]:
     """A filter that knows to a centimetre where it has been on a simulated flight, and what it saw from there.
 
     With a rolling shutter it estimates the readout. An ``exact`` one sees without noise.
     """
-    calibration = CALIBRATION.with_camera(0, readout_s=readout_s)
+    for c in range(len(calibration.cameras)):
+        calibration = calibration.with_camera(c, readout_s=readout_s)
     noise = None if exact else EUROC_NOISE
     sequence = simulated_sequence(
         "figure_eight", noise, 0.0 if exact else 1.0, seed, duration_s=2.0, calibration=calibration
@@ -85,7 +99,7 @@ def seeing_state(
         intrinsics=True,
         readout=readout_s != 0.0,
     )
-    observations = TrackTable()
+    observations = TrackTable(len(calibration.cameras))
     for k in range(1, 3 * clones, 3):
         true, (imu, tracks) = sequence.true_states[k], sequence.packets[k]
         state.R_WB, state.p_WB, state.v_WB = true.R_WB, true.p_WB, true.v_WB

@@ -66,6 +66,24 @@ def machine_hall(shared_data: Path, tmp_path_factory: pytest.TempPathFactory) ->
     return clip, bag
 
 
+def test_two_cameras_know_the_scale(shared_data, tmp_path):
+    """Until the right one falls silent, after 10 s."""
+    config = Config(
+        dataset=DatasetConfig(path=shared_data / "euroc/MH_01_easy_15s", options={"cameras": ["cam0", "cam1"]}),
+        detector=PartConfig(name="shi_tomasi"),
+        backend=PartConfig(name="msckf"),
+        duration_s=9.5,
+    )
+    record(prepare(config, installed()), tmp_path / "run")
+    done = RunFolder.open(tmp_path / "run")
+    errors = evaluate(done.trajectory(), done.ground_truth())
+    assert errors.ate_m.rmse < 0.012
+    assert abs(errors.scale - 1.0) < 0.01
+    tracks = done.tracks()
+    assert tracks is not None
+    assert set(tracks.camera) == {0, 1}
+
+
 @pytest.mark.parametrize(
     ("detector", "backend", "limit_m"),
     [

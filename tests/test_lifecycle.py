@@ -96,7 +96,7 @@ def test_it_begins_at_the_state_given_with_the_noise_of_a_flight():
 def test_a_start_needs_a_covariance_and_a_camera_whose_rotation_is_known(cov):
     start = replace(drawn_start(flight(), 0, 0), cov=cov)
     calibration = CALIBRATION if cov is None else CALIBRATION.with_camera(0, rotation_known=False)
-    with pytest.raises(ConfigError, match="needs a covariance, and a camera whose rotation on the body is known"):
+    with pytest.raises(ConfigError, match="needs a covariance, and cameras whose rotation on the body is known"):
         LifeCycle(Scripted(), calibration, None, start)
 
 

@@ -7,14 +7,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from msckf_helpers import CALIBRATION, drawn_start, pose_nees, since
+from msckf_helpers import CALIBRATION, STEREO, drawn_start, pose_nees, since
 from scipy.stats import chi2
 
 from vioframe.bench import BackendRun, run_backend
 from vioframe.estimation.options import EstimationOptions
 from vioframe.geometry import so3
 from vioframe.simulation import TrackSequence, simulated_sequence
-from vioframe.types import CameraOnBody, Float
+from vioframe.types import Calibration, CameraOnBody, Float
 from vioframe_msckf import backend as backend_module
 from vioframe_msckf import updates
 from vioframe_msckf.backend import Msckf
@@ -46,7 +46,7 @@ class GateCounts:
             return *rows, verdicts
 
         def updated(state, tracks, *arguments):
-            offered = int(np.isin(state.landmark_ids, tracks.ids).sum())
+            offered = int(np.isin(tracks.ids, state.landmark_ids).sum())
             used = update(state, tracks, *arguments)
             self.landmarks += used, offered
             return used
@@ -73,10 +73,14 @@ def spoilt(sequence: TrackSequence, ratio: float, seed: int) -> tuple[TrackSeque
     return replace(sequence, packets=tuple(packets)), frozenset(wrong)
 
 
-@pytest.mark.parametrize("flight", ["figure_eight", "aggressive"])
-def test_gates_accept_inliers_at_their_nominal_rate(flight, monkeypatch):
+@pytest.mark.parametrize(
+    ("flight", "calibration"),
+    [("figure_eight", CALIBRATION), ("aggressive", CALIBRATION), ("figure_eight", STEREO)],
+    ids=["figure_eight", "aggressive", "stereo"],
+)
+def test_gates_accept_inliers_at_their_nominal_rate(flight, calibration, monkeypatch):
     counts = GateCounts(monkeypatch)
-    fly(simulated_sequence(flight, seed=1, duration_s=20.0), CALIBRATED, 1)
+    fly(simulated_sequence(flight, seed=1, duration_s=20.0, calibration=calibration), CALIBRATED, 1)
     tracks, landmarks = counts.tracks, counts.landmarks
     assert tracks[ACCEPTED] + tracks[GATED] > 2000
     assert landmarks[1] > 5000
@@ -127,10 +131,12 @@ def test_landmarks_that_points_slide_off_are_not_believed_for_long():
     assert doubted < 0.7 * believed
 
 
-def mean_nees(flight: str, seeds: int, duration_s: float, options: MsckfOptions) -> tuple[float, float]:
+def mean_nees(
+    flight: str, seeds: int, duration_s: float, options: MsckfOptions, calibration: Calibration = CALIBRATION
+) -> tuple[float, float]:
     values = []
     for seed in range(seeds):
-        sequence = simulated_sequence(flight, seed=seed, duration_s=duration_s)
+        sequence = simulated_sequence(flight, seed=seed, duration_s=duration_s, calibration=calibration)
         run = fly(sequence, options, seed, EXACT)
         assert run.completion == 1.0
         values.append(pose_nees(run.states, {s.t_ns: s for s in sequence.true_states}))
@@ -139,14 +145,38 @@ def mean_nees(flight: str, seeds: int, duration_s: float, options: MsckfOptions)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("flight", ["figure_eight", pytest.param("aggressive", marks=pytest.mark.very_slow)])
-def test_errors_are_as_large_as_the_covariance_says(flight):
+@pytest.mark.parametrize(
+    ("flight", "calibration"),
+    [
+        ("figure_eight", CALIBRATION),
+        pytest.param("aggressive", CALIBRATION, marks=pytest.mark.very_slow),
+        ("figure_eight", STEREO),
+    ],
+    ids=["figure_eight", "aggressive", "stereo"],
+)
+def test_errors_are_as_large_as_the_covariance_says(flight, calibration):
     """Three degrees of freedom over twelve flights; errors within a flight hang together, so each counts as one."""
     flights = 12
     low, high = chi2.ppf([0.025, 0.975], 3 * flights) / flights
-    orientation, position = mean_nees(flight, flights, 15.0, WHITE)
+    orientation, position = mean_nees(flight, flights, 15.0, WHITE, calibration)
     assert low < orientation < high
     assert low < position < high
+
+
+@pytest.mark.parametrize(("options", "told_ms"), [(CALIBRATED, 12), (WHITE, 12), (WHITE, 10)])
+def test_a_camera_may_be_read_later_than_the_other(options, told_ms):
+    """By 12 ms, as its calibration states beyond the first one's offset, or nearly so."""
+    first_ns = STEREO.cameras[0].time_offset_ns
+    true, told = (STEREO.with_camera(1, time_offset_ns=first_ns + 1_000_000 * ms) for ms in (12, told_ms))
+    sequence = simulated_sequence("aggressive", seed=1, duration_s=8.0, calibration=true)
+    run = fly(replace(sequence, calibration=told), options, 1, EXACT)
+    errors = [np.linalg.norm(s.p_WB - t.p_WB) for s, t in zip(run.states, sequence.true_states[1:], strict=True)]
+    assert run.completion == 1.0
+    assert max(errors) < 0.06
+    learned = run.estimates[-1].calibration
+    assert learned is not None
+    first, second = learned.calibration.cameras
+    assert abs(second.time_offset_ns - first.time_offset_ns - 12e6) < 0.5e6
 
 
 def test_without_first_estimates_the_covariance_is_far_too_small():

@@ -4,7 +4,7 @@ import copy
 
 import numpy as np
 import pytest
-from msckf_helpers import landmark_rows, random_covariance, seeing_state
+from msckf_helpers import CALIBRATION, STEREO, random_covariance, seeing_state, sighting_rows
 from scipy.stats import chi2
 
 from vioframe.geometry import kernels, so3
@@ -29,13 +29,13 @@ def test_observation_jacobian_is_the_derivative_on_the_manifold(camera, readout_
     R_WB, p_WB = so3.exp(rng.normal(size=3)), rng.normal(size=3)
     p_WF = p_WB + R_WB @ (R_BC @ np.array([0.7, -0.4, 3.0]) + p_BC)
     rate_B, velocity_B, y = np.array([0.7, -1.1, 1.6]), np.array([1.2, 0.4, -0.9]), 40.0
-    row = (y + 0.5) / 480 - 0.5
+    row, offset_s = (y + 0.5) / 480 - 0.5, 0.004
 
     def predicted(d):
         """Pixel after perturbing [theta_BC p_BC offset k(8) readout | theta_WB p_WB | p_WF] by d (25,)."""
         R_C, p_C = R_BC @ so3.exp(d[0:3]), p_BC + d[3:6]
         R_B, p_B = R_WB @ so3.exp(d[16:19]), p_WB + d[19:22]
-        late_s = (readout_s + d[15]) * row
+        late_s = offset_s + d[6] + (readout_s + d[15]) * row
         R_row, p_row = R_B @ so3.exp(rate_B * late_s), p_B + R_B @ velocity_B * late_s
         point = R_C.T @ (R_row.T @ (p_WF + d[22:25] - p_row) - p_C)
         perturbed = k + d[7:15]
@@ -46,10 +46,14 @@ def test_observation_jacobian_is_the_derivative_on_the_manifold(camera, readout_
     exact = predicted(np.zeros(25))
     xy = np.array([exact[0] + 0.3, y])
     motion = rate_B[None], velocity_B[None]
+    # The second camera of two; the first is another one.
+    cameras = np.stack([np.eye(3), R_BC]), np.stack([np.zeros(3), p_BC]), np.array([1 - model, model])
+    late = np.array([0.1, offset_s]), np.array([0.1, readout_s])
     window = Window(
-        R_WB[None], p_WB[None], R_WB[None], p_WB[None], *motion, R_BC, p_BC, model, k, readout_s, 480, calibrated=16
-    )
-    blocks, residual = observations(window, 0, p_WF[None], p_WF[None], xy[None])
+        R_WB[None], p_WB[None], R_WB[None], p_WB[None], *motion, *cameras, np.stack([0.5 * k, k]), *late,
+        np.array([240, 480]), of_camera=16,
+    )  # fmt: skip
+    blocks, residual = observations(window, 0, np.array([1]), p_WF[None], p_WF[None], xy[None])
     eps = 1e-6
     numeric = np.stack([(predicted(eps * e) - predicted(-eps * e)) / (2 * eps) for e in np.eye(25)], axis=1)
     np.testing.assert_allclose(residual[0], [0.3, y - exact[1]], atol=1e-9)
@@ -61,28 +65,35 @@ def rows_of(table, row, window, pixel_sigma):
     return track_rows(window, table.xy[row], table.xy_normalised[row], table.seen[row], pixel_sigma)
 
 
+@pytest.mark.parametrize("calibration", [CALIBRATION, STEREO], ids=["mono", "stereo"])
 @pytest.mark.parametrize("readout_s", [0.0, 0.03], ids=["global", "rolling"])
-def test_rows_of_landmarks_predict_how_residuals_change_with_the_state(readout_s):
-    """Column by column, through the filter's own correction; only the offset acts through the clones alone."""
-    state, table = seeing_state(readout_s=readout_s)
+def test_rows_of_landmarks_predict_how_residuals_change_with_the_state(readout_s, calibration):
+    """Column by column, through the filter's own correction."""
+    state, table = seeing_state(readout_s=readout_s, calibration=calibration)
+    state.offset_s += 0.003
+    cameras_count = len(calibration.cameras)
     full = np.flatnonzero(table.seen.all(axis=1))[:4]
     for row in full:
         ok, p_WF, *_ = rows_of(table, row, Window.of(state, False), 1.0)
         assert ok
         state.add_landmark(row, p_WF, p_WF, np.zeros((3, len(state.cov))), np.eye(3))
-    clone, xy = 3, table.xy[full, 3]
+    landmarks, cameras = (index.ravel() for index in np.indices((len(full), cameras_count)))
+    clone = 3
+    xy = table.xy[full[landmarks], cameras_count * clone + cameras]
 
     def residual(dx):
         moved = copy.deepcopy(state)
         moved._correct(dx)
-        return landmark_blocks(moved, clone, xy, False)[1]
+        return landmark_blocks(moved, clone, landmarks, cameras, xy, False)[1]
 
-    H = landmark_rows(state, clone, landmark_blocks(state, clone, xy, False)[0])
+    blocks, _ = landmark_blocks(state, clone, landmarks, cameras, xy, False)
+    H = sighting_rows(state, clone, landmarks, cameras, blocks)
     eps, n = 1e-6, len(state.cov)
     numeric = np.stack([(residual(-eps * e) - residual(eps * e)) / (2 * eps) for e in np.eye(n)], axis=1)
     np.testing.assert_allclose(H, numeric, rtol=1e-6, atol=2e-4)
-    assert (H[:, OFFSET] == 0.0).all()
-    assert readout_s == 0.0 or np.abs(H[:, READOUT]).min() > 1.0
+    own = H[np.arange(len(H))[:, None], IMU + state.of_camera * np.repeat(cameras, 2)[:, None] + np.arange(16)]
+    assert np.abs(own[:, OFFSET]).max() > 50.0
+    assert readout_s == 0.0 or np.abs(own[:, READOUT]).max() > 10.0
 
 
 def test_exact_poses_explain_exact_rows():
@@ -98,8 +109,8 @@ def test_exact_poses_explain_exact_rows():
     window = Window.of(state, False)
     assert len(full) > 20
     assert largest(window) < 0.02
-    assert largest(window._replace(readout_s=0.0)) > 0.5
-    assert largest(window._replace(readout_s=-0.03)) > 1.0
+    assert largest(window._replace(readout_s=np.array([0.0]))) > 0.5
+    assert largest(window._replace(readout_s=np.array([-0.03]))) > 1.0
 
 
 def test_first_estimates_hold_the_jacobian_and_not_the_residual():
@@ -112,8 +123,9 @@ def test_first_estimates_hold_the_jacobian_and_not_the_residual():
     moved._correct(dx)
 
     def rows(of, first_estimates):
-        blocks, residual = landmark_blocks(of, 2, table.xy[[row], 2], first_estimates)
-        return landmark_rows(of, 2, blocks), residual
+        only = np.zeros(1, np.int64)
+        blocks, residual = landmark_blocks(of, 2, only, only, table.xy[[row], 2], first_estimates)
+        return sighting_rows(of, 2, only, only, blocks), residual
 
     H, residual = rows(state, True)
     np.testing.assert_array_equal(rows(moved, True)[0], H)

@@ -12,13 +12,13 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import pytest
-from msckf_helpers import CALIBRATION, drawn_start, landmark_rows, since
+from msckf_helpers import CALIBRATION, STEREO, drawn_start, sighting_rows, since
 
 import vioframe_msckf.updates as updates
 from vioframe.bench import run_backend
 from vioframe.estimation.options import EstimationOptions
 from vioframe.simulation import simulated_sequence
-from vioframe.types import DP, DTHETA, DV, Float, NavState
+from vioframe.types import DP, DTHETA, DV, Calibration, Float, NavState
 from vioframe_msckf.backend import Msckf
 from vioframe_msckf.options import MsckfOptions
 from vioframe_msckf.state import IMU, FilterState
@@ -28,7 +28,7 @@ FLIGHTS = ("figure_eight", "aggressive", "stop_and_go")
 
 
 def unobservable(state: FilterState) -> Float:
-    """(30 or 31, 4) of the body and the calibration: the world moved along its axes, and turned about gravity."""
+    """(15 + 15 N or 16 N, 4) of the body and the cameras: the world moved along its axes, and turned about gravity."""
     N = np.zeros((state.calibrated.stop, 4))
     N[DP, :3] = np.eye(3)
     R_WB, p_WB, v_WB = state.first
@@ -97,8 +97,8 @@ class Recorder:
         assert len(self.N) == len(state.cov)
         self._see(H, self.N[columns])
 
-    def _innovation(self, state, original, clone, blocks, variance) -> None:
-        self._see(landmark_rows(state, clone, blocks), self.N)
+    def _innovation(self, state, original, clone, landmarks, cameras, blocks, variance) -> None:
+        self._see(sighting_rows(state, clone, landmarks, cameras, blocks), self.N)
 
     def _see(self, H: Float, N: Float) -> None:
         self.seen.append(np.linalg.norm(H @ N, axis=0) / np.linalg.norm(H) / np.linalg.norm(N, axis=0))
@@ -112,8 +112,9 @@ def fly(
     *,
     at_rest: bool = True,
     readout_s: float = 0.0,
+    calibration: Calibration = CALIBRATION,
 ) -> Recorder:
-    calibration = CALIBRATION.with_camera(0, readout_s=readout_s)
+    calibration = calibration.with_camera(0, readout_s=readout_s)
     sequence = simulated_sequence(flight, seed=seed, duration_s=6.0, calibration=calibration)
     recorder = Recorder()
     recorder.attach(monkeypatch)
@@ -124,9 +125,10 @@ def fly(
     return recorder
 
 
+@pytest.mark.parametrize("calibration", [CALIBRATION, STEREO], ids=["mono", "stereo"])
 @pytest.mark.parametrize("flight", FLIGHTS)
-def test_first_estimates_keep_position_and_yaw_unobservable(flight, monkeypatch):
-    seen = np.array(fly(flight, MsckfOptions(), monkeypatch, at_rest=False).seen)
+def test_first_estimates_keep_position_and_yaw_unobservable(flight, calibration, monkeypatch):
+    seen = np.array(fly(flight, MsckfOptions(), monkeypatch, at_rest=False, calibration=calibration).seen)
     assert len(seen) > 200
     assert seen.max() < 1e-8
 

@@ -41,7 +41,8 @@ class Detector(Protocol):
 class Backend(Protocol):
     """Estimates motion from inertial segments and feature tracks, one frame at a time.
 
-    Its life is the core's (:mod:`vioframe.estimation.lifecycle`): when it begins, is lost and begins anew.
+    Its life is the core's (:mod:`vioframe.estimation.lifecycle`): when it begins, is lost and begins anew. One that has
+    ``takes_rigs = True`` is given the tracks of several cameras (``FrameTracks.camera``); others are refused such rigs.
     """
 
     def begin(self, start: Start) -> None:

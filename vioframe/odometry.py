@@ -90,7 +90,6 @@ class Odometry:
         incidents: Incidents | None = None,
         installed: Registry | None = None,
     ) -> None:
-        camera = calibration.single("the odometry")
         self._registry = registry.load() if installed is None else installed
         self.incidents = Incidents() if incidents is None else incidents
         if isinstance(detector, str):
@@ -104,9 +103,11 @@ class Odometry:
             backend = self._registry.create_backend(backend, backend_options)
         self._frontend = Frontend(detector, calibration, frontend or FrontendOptions(), self.incidents)
         self._life = LifeCycle(backend, calibration, estimation, initial_state, name)
-        self._synchroniser = Synchroniser(self.incidents, time_offset_ns=camera.time_offset_ns, wait_ms=wait_ms)
+        self._synchroniser = Synchroniser(
+            self.incidents, time_offset_ns=calibration.cameras[0].time_offset_ns, wait_ms=wait_ms
+        )
         self._waiting_tracks: dict[int, FrameTracks] = {}
-        self._given = camera.model
+        self._given = calibration.lenses
         self.calibration = calibration
         """What is known of the rig by now: as given at first, then as the back-end has learned it."""
         self._tracking = False
@@ -218,8 +219,8 @@ class Odometry:
             if tracks is None:
                 tracks = self._frontend.track(imu, frames, self._seen_with)
                 return _Seen(imu, frames, tracks, self._frontend.stage_seconds)
-            model = self._life.calibration.cameras[0].model
-            return _Seen(imu, frames, tracks if model == self._given else tracks.undistorted(model), {})
+            lenses = self._life.calibration.lenses
+            return _Seen(imu, frames, tracks if lenses == self._given else tracks.undistorted(*lenses), {})
 
     def _estimate(self, seen: _Seen) -> Step:
         """Estimate from one frame that was seen."""
@@ -247,7 +248,7 @@ class Odometry:
     def _recalibrate(self) -> None:
         """Follow points from now on with the calibration of the newest estimate."""
         self._seen_with = self.calibration
-        self._frontend.recalibrate(self._life.calibration.cameras[0].model)
+        self._frontend.recalibrate(self._life.calibration)
 
 
 def _own(image: Image) -> Image:

@@ -134,9 +134,16 @@ class FrameTracks:
         """The features ``keep`` (N,)."""
         return FrameTracks(self.t_ns, self.ids[keep], self.camera[keep], self.xy[keep], self.xy_normalised[keep])
 
-    def undistorted(self, camera: Camera) -> FrameTracks:
-        """The same pixels as ``camera`` has them on the z = 1 plane."""
-        return replace(self, xy_normalised=camera.undistort(self.xy))
+    def of_camera(self, camera: int) -> FrameTracks:
+        """What the one at this place in the rig sees."""
+        return self if not self.camera.any() and camera == 0 else self.only(self.camera == camera)
+
+    def undistorted(self, *lenses: Camera) -> FrameTracks:
+        """The same pixels as the ``lenses`` of the rig have them on the z = 1 plane."""
+        xy_normalised = np.empty_like(self.xy)
+        for c, lens in enumerate(lenses):
+            xy_normalised[self.camera == c] = lens.undistort(self.xy[self.camera == c])
+        return replace(self, xy_normalised=xy_normalised)
 
     def finite(self) -> FrameTracks:
         """Without the points that could not be undistorted."""
@@ -207,8 +214,28 @@ class Calibration:
         if len(self.cameras) > 1:
             names = ", ".join(camera.name for camera in self.cameras)
             choice = f"choose one, as by -o cameras={self.cameras[0].name}"
-            raise ConfigError(f"{user} takes one camera for now, the calibration has {names}; {choice}")
+            raise ConfigError(f"{user} takes one camera, the calibration has {names}; {choice}")
         return self.cameras[0]
+
+    @property
+    def lenses(self) -> tuple[Camera, ...]:
+        """The models of the cameras."""
+        return tuple(camera.model for camera in self.cameras)
+
+    def only(self, index: int) -> Calibration:
+        """The rig of one camera of this one."""
+        return replace(self, cameras=(self.cameras[index],))
+
+    def moved_with(self, first: CameraOnBody) -> Calibration:
+        """The rig with another first camera; the others sit on it as before, and are read at the same times."""
+        given = self.cameras[0]
+        turn = first.R_BC @ given.R_BC.T if given.rotation_known else np.eye(3)
+        late_ns = first.time_offset_ns - given.time_offset_ns
+        others = (
+            replace(other, R_BC=turn @ other.R_BC, time_offset_ns=other.time_offset_ns + late_ns)
+            for other in self.cameras[1:]
+        )
+        return replace(self, cameras=(first, *others))
 
     def with_camera(self, index: int, **changes: Any) -> Calibration:
         """The same rig with fields of one camera changed."""

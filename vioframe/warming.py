@@ -89,7 +89,7 @@ def _fly_along_a_wall(backend: Backend, calibration: Calibration) -> None:
         xy = camera.model.distort(xy_normalised)
         tracks = FrameTracks(int(t_ns[-1]), ids, np.zeros_like(ids), xy, xy_normalised)
         if k == 0:
-            known = CalibrationEstimate(calibration, (initialization.GIVEN,))
+            known = CalibrationEstimate(calibration, (initialization.GIVEN,) * len(calibration.cameras))
             backend.begin(Start(state, known, calibration.imu, imu, tracks))
         else:
             backend.process(imu, tracks, k == _FRAMES - 1)

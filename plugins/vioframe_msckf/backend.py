@@ -21,10 +21,10 @@ from vioframe_msckf.updates import hold_still, promote_tracks, select_tracks, up
 class Msckf:
     """One frame at a time; settings in :class:`MsckfOptions`."""
 
+    takes_rigs = True
+
     def __init__(self, options: MsckfOptions | None = None) -> None:
         self._options = options or MsckfOptions()
-        dof = np.arange(1, 2 * self._options.max_clones + 3)
-        self._gate = np.concatenate([[0.0], chi2_quantile(self._options.gate_quantile, dof)])
 
     def begin(self, start: Start) -> None:
         """A filter with ``start``'s state and no clones."""
@@ -38,7 +38,10 @@ class Msckf:
             readout=options.calibrate_readout,
         )
         self._noise, self._noise_at_rest = start.calibration.calibration.imu, start.noise_at_rest
-        self._observations = TrackTable()
+        cameras = len(start.calibration.calibration.cameras)
+        self._observations = TrackTable(cameras)
+        dof = np.arange(1, 2 * cameras * options.max_clones + 3)
+        self._gate = np.concatenate([[0.0], chi2_quantile(options.gate_quantile, dof)])
 
     def process(self, imu: ImuSegment, tracks: FrameTracks, still: bool) -> Estimate:
         """Filter one frame."""

@@ -80,30 +80,30 @@ def only(P: Float, keep: Int) -> Float:
 
 @kernel
 def landmark_innovation(
-    P: Float, blocks: Float, calibration: int, calibrated: int, clone: int, landmarks: int, variance: float
+    P: Float, blocks: Float, cameras: Int, of_camera: int, clone: int, landmarks: Int, variance: float
 ) -> tuple[Float, Float]:
-    """H P (2 M, n) and S (2 M, 2 M) of M landmarks of the state, each seen once from one clone.
+    """H P (2 M, n) and S (2 M, 2 M) of M sightings of landmarks of the state from one clone.
 
-    ``blocks`` (M, 2, 25) are their Jacobians over [calibration 16, clone 6, landmark 3], of which the calibration has
-    ``calibrated`` columns from ``calibration`` on; the others begin at ``clone`` and ``landmarks``.
+    ``blocks`` (M, 2, 25) are their Jacobians over [camera 16, clone 6, landmark 3], of which cameras have ``of_camera``
+    columns; these begin at ``cameras`` (M,), ``clone`` and ``landmarks`` (M,).
     """
     n, rows = len(P), 2 * len(blocks)
     HP = np.zeros((rows, n))
     for r in range(rows):
-        b, own, out = blocks[r // 2, r % 2], landmarks + 3 * (r // 2), HP[r]
-        for k in range(calibrated):
-            _add(out, b[k], P[calibration + k])
+        b, camera, own, out = blocks[r // 2, r % 2], cameras[r // 2], landmarks[r // 2], HP[r]
+        for k in range(of_camera):
+            _add(out, b[k], P[camera + k])
         for k in range(6):
             _add(out, b[16 + k], P[clone + k])
         for k in range(3):
             _add(out, b[22 + k], P[own + k])
     S = np.empty((rows, rows))
     for c in range(rows):
-        b, own = blocks[c // 2, c % 2], landmarks + 3 * (c // 2)
+        b, camera, own = blocks[c // 2, c % 2], cameras[c // 2], landmarks[c // 2]
         for r in range(c, rows):
             total = 0.0
-            for k in range(calibrated):
-                total += HP[r, calibration + k] * b[k]
+            for k in range(of_camera):
+                total += HP[r, camera + k] * b[k]
             for k in range(6):
                 total += HP[r, clone + k] * b[16 + k]
             for k in range(3):

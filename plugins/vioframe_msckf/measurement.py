@@ -1,9 +1,11 @@
 """Residuals and Jacobians of the image measurements, in pixels, with distortion.
 
 A landmark seen from a cloned body pose: ``p_B = R_WB^T (p_WF - p_WB)``, ``p_C = R_BC^T (p_B - p_BC)``, pixel =
-distort(p_C). With a rolling shutter the camera is where the body's motion at the clone has taken it by the time of the
-pixel's row (Li, Kim, Mourikis, "Real-time motion tracking on a cellphone", ICRA 2013). Residuals are evaluated at the
-estimate, Jacobians at the first estimates of pose and landmark. Derivation: ``docs/derivations/msckf.md``.
+distort(p_C). The camera is where the body's motion at the clone has taken it by the time of the pixel, which its time
+offset and the row of a rolling shutter make another than the stamp (Li, Kim, Mourikis, "Real-time motion tracking on a
+cellphone", ICRA 2013). Residuals are evaluated at the estimate, Jacobians at the first estimates of pose and landmark.
+A sighting is from one of C views: of K clones by N cameras, those of a clone together. Derivation:
+``docs/derivations/msckf.md``.
 """
 
 from __future__ import annotations
@@ -15,14 +17,14 @@ import numpy as np
 from vioframe.geometry.kernels import cross, distort, exp, hat, intrinsics_jacobian, product, turned, undistort
 from vioframe.geometry.triangulation import triangulate
 from vioframe.jit import kernel
-from vioframe.types import Float
+from vioframe.types import Float, Int
 from vioframe_msckf.state import FilterState
 
 ACCEPTED, NOT_TRIANGULATED, GATED = 0, 1, 2
 
 
 class Window(NamedTuple):
-    """What the kernels need of the filter: clones, where Jacobians are taken of them, and the camera."""
+    """What the kernels need of the filter: K clones, where Jacobians are taken of them, and N cameras."""
 
     R_WB: Float
     p_WB: Float
@@ -32,118 +34,126 @@ class Window(NamedTuple):
     velocity_B: Float
     R_BC: Float
     p_BC: Float
-    camera_model: int
+    camera_models: Int
     intrinsics: Float
-    readout_s: float
-    image_height: int
-    calibrated: int
-    """How many columns the calibration has."""
+    offset_s: Float
+    readout_s: Float
+    image_heights: Int
+    of_camera: int
+    """How many columns a camera has."""
 
     @staticmethod
     def of(state: FilterState, first_estimates: bool) -> Window:
         c = state.clones
         first = (c.R_WB_first, c.p_WB_first) if first_estimates else (c.R_WB, c.p_WB)
-        camera = state.R_BC, state.p_BC, state.camera_model, state.intrinsics, state.readout_s, state.image_height
-        calibrated = state.calibrated.stop - state.calibrated.start
-        return Window(c.R_WB, c.p_WB, *first, c.rate_B, c.velocity_B, *camera, calibrated)
+        cameras = state.camera_models, state.intrinsics, state.offset_s, state.readout_s, state.image_heights
+        return Window(c.R_WB, c.p_WB, *first, c.rate_B, c.velocity_B, state.R_BC, state.p_BC, *cameras, state.of_camera)
 
 
-def landmark_blocks(state: FilterState, clone: int, xy: Float, first_estimates: bool) -> tuple[Float, Float]:
-    """Measurements (M, 2) px of the state's landmarks from one clone: blocks (M, 2, 25) and residuals (2 M,)."""
+def landmark_blocks(
+    state: FilterState, clone: int, landmarks: Int, cameras: Int, xy: Float, first_estimates: bool
+) -> tuple[Float, Float]:
+    """Sightings (M, 2) px from a clone, of the state's ``landmarks`` (M,) by ``cameras`` (M,).
+
+    Blocks (M, 2, 25) over [camera 16, clone 6, landmark 3] and residuals (2 M,).
+    """
     p_first = state.p_WF_first if first_estimates else state.p_WF
-    blocks, residual = observations(Window.of(state, first_estimates), clone, state.p_WF, p_first, xy)
+    window = Window.of(state, first_estimates)
+    blocks, residual = observations(window, clone, cameras, state.p_WF[landmarks], p_first[landmarks], xy)
     return blocks, residual.ravel()
 
 
 @kernel
-def _row(w, y):
-    """Where the row ``y`` px is between the first and the last, from -1/2 to 1/2: its part of the readout."""
-    return (y + 0.5) / w.image_height - 0.5
+def _row(w, c, y):
+    """Where the row ``y`` px is between the first of camera ``c`` and its last, from -1/2 to 1/2."""
+    return (y + 0.5) / w.image_heights[c] - 0.5
 
 
 @kernel
-def _camera_at_row(w, c, y):
-    """The camera as seen from the body at a clone, (3, 3) and (3,), at the time of the row ``y`` px."""
-    if w.readout_s == 0.0:
-        return w.R_BC, w.p_BC
-    late_s = w.readout_s * _row(w, y)
-    turn = exp(late_s * w.rate_B[c])
-    return product(turn, w.R_BC), turned(turn, w.p_BC) + late_s * w.velocity_B[c]
+def _camera_at(w, k, c, y):
+    """Camera ``c`` as seen from the body at clone ``k``, (3, 3) and (3,), when it saw a pixel at the height ``y``."""
+    late_s = w.offset_s[c] + w.readout_s[c] * _row(w, c, y)
+    if late_s == 0.0:
+        return w.R_BC[c], w.p_BC[c]
+    turn = exp(late_s * w.rate_B[k])
+    return product(turn, w.R_BC[c]), turned(turn, w.p_BC[c]) + late_s * w.velocity_B[k]
 
 
 @kernel
-def _observe(w, c, p_WF, p_WF_first, xy, block, residual):
-    """One observation: ``block`` (2, 25) over [calibration 16, clone 6, landmark 3] and ``residual`` (2,)."""
-    R_rowC, p_rowC = _camera_at_row(w, c, xy[1])
-    p_C = turned(R_rowC.T, turned(w.R_WB[c].T, p_WF - w.p_WB[c]) - p_rowC)
-    drawn, _ = distort(w.camera_model, w.intrinsics, p_C[0] / p_C[2], p_C[1] / p_C[2])
+def _observe(w, k, c, p_WF, p_WF_first, xy, block, residual):
+    """One sighting: ``block`` (2, 25) over [camera 16, clone 6, landmark 3] and ``residual`` (2,)."""
+    model, intrinsics = w.camera_models[c], w.intrinsics[c]
+    R_lateC, p_lateC = _camera_at(w, k, c, xy[1])
+    p_C = turned(R_lateC.T, turned(w.R_WB[k].T, p_WF - w.p_WB[k]) - p_lateC)
+    drawn, _ = distort(model, intrinsics, p_C[0] / p_C[2], p_C[1] / p_C[2])
     residual[0], residual[1] = xy[0] - drawn[0], xy[1] - drawn[1]
 
-    R_first = w.R_WB_first[c]
-    p_B = turned(R_first.T, p_WF_first - w.p_WB_first[c])
-    p_C = turned(R_rowC.T, p_B - p_rowC)
+    R_first = w.R_WB_first[k]
+    p_B = turned(R_first.T, p_WF_first - w.p_WB_first[k])
+    p_C = turned(R_lateC.T, p_B - p_lateC)
     x, y = p_C[0] / p_C[2], p_C[1] / p_C[2]
-    _, D = distort(w.camera_model, w.intrinsics, x, y)
+    _, D = distort(model, intrinsics, x, y)
     J = np.empty((2, 3))
     for i in range(2):
         J[i, 0], J[i, 1] = D[i, 0] / p_C[2], D[i, 1] / p_C[2]
         J[i, 2] = -(D[i, 0] * x + D[i, 1] * y) / p_C[2]
-    J_B = product(J, R_rowC.T)
+    J_B = product(J, R_lateC.T)
     J_W = product(J_B, R_first.T)
-    # By the point as seen from the body at the time of the row.
-    J_row = J_B if w.readout_s == 0.0 else product(J, w.R_BC.T)
+    # By the point as seen from the body when the camera saw it.
+    J_late = product(J, w.R_BC[c].T)
+    p_late = turned(w.R_BC[c], p_C) + w.p_BC[c]
     block[:, 0:3] = product(J, hat(p_C))
-    block[:, 3:6] = -J_row
-    block[:, 6] = 0.0  # the time offset acts through the clone
-    block[:, 7:15] = intrinsics_jacobian(w.camera_model, w.intrinsics, x, y)
-    if w.calibrated > 15:
-        p_row = turned(w.R_BC, p_C) + w.p_BC
-        block[:, 15] = -_row(w, xy[1]) * (turned(J_row, cross(w.rate_B[c], p_row)) + turned(J_B, w.velocity_B[c]))
+    block[:, 3:6] = -J_late
+    block[:, 6] = -turned(J_late, cross(w.rate_B[k], p_late)) - turned(J_B, w.velocity_B[k])
+    block[:, 7:15] = intrinsics_jacobian(model, intrinsics, x, y)
+    block[:, 15] = _row(w, c, xy[1]) * block[:, 6]
     block[:, 16:19] = product(J_B, hat(p_B))
     block[:, 19:22] = -J_W
     block[:, 22:25] = J_W
 
 
 @kernel
-def observations(w, clone, p_WF, p_WF_first, xy):
-    """Landmarks (M, 3) seen at (M, 2) px from one clone: blocks (M, 2, 25) and residuals (M, 2)."""
+def observations(w, clone, cameras, p_WF, p_WF_first, xy):
+    """Landmarks (M, 3) seen by ``cameras`` (M,) at (M, 2) px from one clone: blocks (M, 2, 25), residuals (M, 2)."""
     m = len(xy)
     blocks = np.empty((m, 2, 25))
     residual = np.empty((m, 2))
     for i in range(m):
-        _observe(w, clone, p_WF[i], p_WF_first[i], xy[i], blocks[i], residual[i])
+        _observe(w, clone, cameras[i], p_WF[i], p_WF_first[i], xy[i], blocks[i], residual[i])
     return blocks, residual
 
 
 @kernel
 def track_rows(w, xy, xy_normalised, seen, pixel_sigma):
-    """One track (C,): whether it was triangulated, p_WF, H over [calibration, clones] and the landmark, residual."""
-    C = len(seen)
-    clones = np.flatnonzero(seen)
-    m = len(clones)
+    """One track (C,): whether it was triangulated, p_WF, H over [cameras, clones] and the landmark, residual."""
+    K, N = len(w.p_WB), len(w.p_BC)
+    views = np.flatnonzero(seen)
+    m = len(views)
     R_WC = np.empty((m, 3, 3))
     p_WC = np.empty((m, 3))
     points = np.empty((m, 2))
     for i in range(m):
-        c = clones[i]
-        R_rowC, p_rowC = _camera_at_row(w, c, xy[c, 1])
-        R_WC[i] = product(w.R_WB[c], R_rowC)
-        p_WC[i] = turned(w.R_WB[c], p_rowC) + w.p_WB[c]
+        v = views[i]
+        k, c = v // N, v % N
+        R_lateC, p_lateC = _camera_at(w, k, c, xy[v, 1])
+        R_WC[i] = product(w.R_WB[k], R_lateC)
+        p_WC[i] = turned(w.R_WB[k], p_lateC) + w.p_WB[k]
         points[i, 0], points[i, 1] = undistort(
-            w.camera_model, w.intrinsics, xy[c, 0], xy[c, 1], xy_normalised[c, 0], xy_normalised[c, 1]
+            w.camera_models[c], w.intrinsics[c], xy[v, 0], xy[v, 1], xy_normalised[v, 0], xy_normalised[v, 1]
         )
-    ok, p_WF = triangulate(R_WC, p_WC, points, pixel_sigma / w.intrinsics[0])
-    n = w.calibrated
-    H = np.zeros((2 * m, n + 6 * C))
+    ok, p_WF = triangulate(R_WC, p_WC, points, pixel_sigma / w.intrinsics[0, 0])
+    n = w.of_camera
+    H = np.zeros((2 * m, n * N + 6 * K))
     H_f = np.empty((2 * m, 3))
     residual = np.empty(2 * m)
     if ok:
         block = np.empty((2, 25))
         for i in range(m):
-            c = clones[i]
-            _observe(w, c, p_WF, p_WF, xy[c], block, residual[2 * i : 2 * i + 2])
-            H[2 * i : 2 * i + 2, 0:n] = block[:, 0:n]
-            H[2 * i : 2 * i + 2, n + 6 * c : n + 6 * c + 6] = block[:, 16:22]
+            v = views[i]
+            k, c = v // N, v % N
+            _observe(w, k, c, p_WF, p_WF, xy[v], block, residual[2 * i : 2 * i + 2])
+            H[2 * i : 2 * i + 2, n * c : n * c + n] = block[:, 0:n]
+            H[2 * i : 2 * i + 2, n * N + 6 * k : n * N + 6 * k + 6] = block[:, 16:22]
             H_f[2 * i : 2 * i + 2] = block[:, 22:25]
     return ok, p_WF, H, H_f, residual
 
@@ -200,11 +210,10 @@ def mahalanobis(H, residual, P, variance):
 def msckf_rows(w, xy, xy_normalised, seen, P, pixel_sigma, gate):
     """Triangulate (F, C) tracks, linearise them, project out the landmarks, and gate each at ``gate[dof]``.
 
-    The stacked H and residual over [calibration, clones], whose covariance is ``P``; p_WF (F, 3); each one's verdict.
+    The stacked H and residual over [cameras, clones], whose covariance is ``P``; p_WF (F, 3); each one's verdict.
     """
-    F, C = seen.shape
-    n = w.calibrated + 6 * C
-    H_all = np.empty((2 * seen.sum(), n))
+    F = len(seen)
+    H_all = np.empty((2 * seen.sum(), len(P)))
     r_all = np.empty(2 * seen.sum())
     p_WF = np.empty((F, 3))
     verdict = np.empty(F, dtype=np.int64)

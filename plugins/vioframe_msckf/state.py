@@ -1,20 +1,21 @@
 """The filter's mean and covariance. This module alone edits the covariance, by the algebra of :mod:`covariance`.
 
-Error state: [imu 15 | calibration 15 or 16 | clones 6 each | landmarks 3 each] with
-imu [dtheta dp dv dbg dba], calibration [dtheta_BC dp_BC d_offset d_intrinsics(8)], and d_readout last where it is
+Error state: [imu 15 | cameras 15 or 16 each | clones 6 each | landmarks 3 each] with
+imu [dtheta dp dv dbg dba], camera [dtheta_BC dp_BC d_offset d_intrinsics(8)], and d_readout last where one is
 estimated, clone [dtheta dp], landmark dp_WF. Other parts of the calibration that are not estimated have zero covariance
 and so are never corrected.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg.lapack import dgeqrf
 
 from vioframe.errors import DivergedError
+from vioframe.estimation import rig
 from vioframe.estimation.inertial.propagation import propagate, yaw_consistent_transition
 from vioframe.geometry import kernels
 from vioframe.types import (
@@ -30,12 +31,16 @@ from vioframe.types import (
     Float,
     ImuNoise,
     ImuSegment,
+    Int,
     NavState,
 )
 from vioframe_msckf.covariance import inserted, landmark_innovation, only, reduce
 
 IMU = 15
-EXTRINSICS, OFFSET, INTRINSICS, READOUT = slice(15, 21), slice(21, 22), slice(22, 30), slice(30, 31)
+EXTRINSICS, OFFSET, INTRINSICS, READOUT = slice(0, 6), 6, slice(7, 15), 15
+"""Where in a camera's block they are."""
+# In that order, those of :mod:`rig`: there the readout comes ahead of the intrinsics.
+_ORDER = np.array([*range(7), *range(8, 16), 7])
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,7 +48,7 @@ class Poses:
     """The cloned body poses, oldest first, as estimated and as first estimated: (C, 3, 3) and (C, 3).
 
     ``rate_B`` (C, 3) rad/s and ``velocity_B`` (C, 3) m/s are how the body moved there, in its own frame. They take a
-    pose to the rows of a rolling shutter before and after it.
+    pose to when a camera saw something: by its time offset, and the row of a rolling shutter.
     """
 
     R_WB: Float
@@ -109,29 +114,33 @@ class FilterState:
         """Orientation, position and velocity as propagated to the newest frame, before its updates."""
 
         self._given = prior.calibration
-        (camera,), (known,) = prior.calibration.cameras, prior.sigma
-        self.R_BC, self.p_BC = camera.R_BC.copy(), camera.p_BC.copy()
-        self.offset_s, self.readout_s = 0.0, camera.readout_s
-        self.camera_model, self.intrinsics = kernels.intrinsics_of(camera.model)
-        self.image_height = camera.model.resolution[1]
+        cameras = prior.calibration.cameras
+        self.R_BC, self.p_BC = np.stack([c.R_BC for c in cameras]), np.stack([c.p_BC for c in cameras])
+        # Beyond the first camera's time offset as given, which readings were cut by.
+        self.offset_s = np.array([(c.time_offset_ns - cameras[0].time_offset_ns) / NS_PER_S for c in cameras])
+        self.readout_s = np.array([c.readout_s for c in cameras])
+        models, intrinsics_of_each = zip(*(kernels.intrinsics_of(c.model) for c in cameras), strict=True)
+        self.camera_models, self.intrinsics = np.array(models), np.stack(intrinsics_of_each)
+        self.image_heights = np.array([c.model.resolution[1] for c in cameras])
         self.clones = Poses.none()
         self.landmark_ids: NDArray[np.int64] = np.empty(0, np.int64)
         self.p_WF: Float = np.empty((0, 3))
         self.p_WF_first: Float = np.empty((0, 3))
 
-        readout_sigma_s = known.readout_s or readout * UNKNOWN_READOUT_S
-        self.calibrated = slice(IMU, READOUT.stop if readout_sigma_s else INTRINSICS.stop)
-        """Columns of the calibration; the clones begin where it ends."""
-        sigma = np.zeros(self.calibrated.stop)
-        if extrinsics:
-            sigma[EXTRINSICS] = np.concatenate([known.rotation, known.position])
-        if offset:
-            sigma[OFFSET] = known.time_offset_s
-        if intrinsics:
-            sigma[INTRINSICS] = known.intrinsics
-        sigma[READOUT] = readout_sigma_s
-        self.cov: Float = np.diag(sigma**2)
+        known = [s if s.readout_s else replace(s, readout_s=readout * UNKNOWN_READOUT_S) for s in prior.sigma]
+        self.of_camera = 16 if any(sigma.readout_s for sigma in known) else 15
+        """Columns of a camera."""
+        self.calibrated = slice(IMU, IMU + len(cameras) * self.of_camera)
+        """Columns of all cameras; the clones begin where they end."""
+        estimated = np.zeros((len(cameras), 16), bool)
+        estimated[:, EXTRINSICS], estimated[:, OFFSET], estimated[:, INTRINSICS] = extrinsics, offset, intrinsics
+        estimated[:, READOUT] = True
+        order = (rig.SIZE * np.arange(len(cameras))[:, None] + _ORDER[: self.of_camera]).ravel()
+        cov = rig.covariance(replace(prior, sigma=tuple(known)))[np.ix_(order, order)]
+        free = estimated[:, : self.of_camera].ravel()
+        self.cov: Float = np.zeros((self.calibrated.stop, self.calibrated.stop))
         self.cov[:IMU, :IMU] = initial.cov
+        self.cov[IMU:, IMU:] = np.where(np.outer(free, free), cov, 0.0)
 
     @property
     def landmarks_begin(self) -> int:
@@ -152,19 +161,21 @@ class FilterState:
 
     def calibration(self) -> CalibrationEstimate:
         """What is believed of the calibration by now."""
-        camera = self._given.cameras[0]
-        offset_ns = camera.time_offset_ns + round(self.offset_s * NS_PER_S)
-        sigma = np.sqrt(np.diag(self.cov)[self.calibrated])
+        sigmas = np.sqrt(np.diag(self.cov)[self.calibrated]).reshape(-1, self.of_camera)
+        cameras = tuple(
+            replace(
+                camera,
+                model=camera.model.with_intrinsics(self.intrinsics[c]),
+                R_BC=self.R_BC[c].copy(),
+                p_BC=self.p_BC[c].copy(),
+                time_offset_ns=self._given.cameras[0].time_offset_ns + round(self.offset_s[c] * NS_PER_S),
+                readout_s=float(self.readout_s[c]),
+            )
+            for c, camera in enumerate(self._given.cameras)
+        )
         return CalibrationEstimate(
-            self._given.with_camera(
-                0,
-                model=camera.model.with_intrinsics(self.intrinsics),
-                R_BC=self.R_BC.copy(),
-                p_BC=self.p_BC.copy(),
-                time_offset_ns=offset_ns,
-                readout_s=self.readout_s,
-            ),
-            (CameraSigma(sigma[0:3], sigma[3:6], float(sigma[6]), sigma[7:15], float(sigma[15:].sum())),),
+            replace(self._given, cameras=cameras),
+            tuple(CameraSigma(s[0:3], s[3:6], float(s[6]), s[7:15], float(s[15:].sum())) for s in sigmas),
         )
 
     def propagate(self, imu: ImuSegment, noise: ImuNoise, first_estimates: bool) -> None:
@@ -190,21 +201,10 @@ class FilterState:
             self.cov[index, index] += density**2 * duration_s
 
     def augment_clone(self, gyro_B: Float) -> None:
-        """Clone the body's pose at the moment the image was taken, ``offset_s`` after its stamp.
-
-        ``gyro_B`` (3,) is the rate there, free of bias. The clone depends on the offset through the body's motion, as
-        in Li and Mourikis (2014), so the offset is estimated with no term of its own in the measurement.
-        """
-        turn = kernels.exp(gyro_B * self.offset_s)
-        R = self.R_WB @ turn
-        p = self.p_WB + self.v_WB * self.offset_s
-        J = np.zeros((6, OFFSET.stop))
-        J[0:3, DTHETA], J[0:3, OFFSET] = turn.T, gyro_B[:, None]
-        J[0:3, DBG] = -self.offset_s * kernels.right_jacobian(gyro_B * self.offset_s)
-        J[3:6, DP], J[3:6, DV], J[3:6, OFFSET] = np.eye(3), self.offset_s * np.eye(3), self.v_WB[:, None]
-        JP = J @ self.cov[: OFFSET.stop]
-        self.cov = inserted(self.cov, self.landmarks_begin, JP, JP[:, : OFFSET.stop] @ J.T)
-        self.clones = self.clones.append(R, p, gyro_B, R.T @ self.v_WB)
+        """Clone the body's pose; ``gyro_B`` (3,) rad/s is the rate there, free of bias."""
+        pose = slice(DTHETA.start, DP.stop)
+        self.cov = inserted(self.cov, self.landmarks_begin, self.cov[pose], self.cov[pose, pose])
+        self.clones = self.clones.append(self.R_WB, self.p_WB, gyro_B, self.R_WB.T @ self.v_WB)
 
     def drop_oldest_clone(self) -> None:
         """Marginalise the oldest clone."""
@@ -231,7 +231,7 @@ class FilterState:
 
     def slide_landmarks(self, drift_px: float) -> None:
         """Let each landmark be ``drift_px`` elsewhere: the patch that is followed slides over what it first showed."""
-        drift_m = drift_px / self.intrinsics[0] * np.linalg.norm(self.p_WF - self.p_WB, axis=1)
+        drift_m = drift_px / self.intrinsics[0, 0] * np.linalg.norm(self.p_WF - self.p_WB, axis=1)
         index = np.arange(self.landmarks_begin, len(self.cov))
         self.cov[index, index] += np.repeat(drift_m**2, 3)
 
@@ -246,14 +246,16 @@ class FilterState:
         S[np.diag_indices(len(S))] += R
         self.update_by(HP, S, residual)
 
-    def innovation(self, clone: int, blocks: Float, variance: float) -> tuple[Float, Float]:
-        """H P (2 M, n) and S (2 M, 2 M) of the landmarks, each seen from ``clone``.
+    def innovation(
+        self, clone: int, landmarks: Int, cameras: Int, blocks: Float, variance: float
+    ) -> tuple[Float, Float]:
+        """H P (2 M, n) and S (2 M, 2 M) of sightings from ``clone``: of ``landmarks`` (M,), by ``cameras`` (M,).
 
-        ``blocks`` (M, 2, 25) are their Jacobians over [calibration 16, clone 6, landmark 3].
+        ``blocks`` (M, 2, 25) are their Jacobians over [camera 16, clone 6, landmark 3].
         """
-        calibrated = self.calibrated.stop - IMU
-        at = self.calibrated.stop + 6 * clone
-        return landmark_innovation(self.cov, blocks, IMU, calibrated, at, self.landmarks_begin, variance)
+        at_camera, at_landmark = IMU + self.of_camera * cameras, self.landmarks_begin + 3 * landmarks
+        at_clone = self.calibrated.stop + 6 * clone
+        return landmark_innovation(self.cov, blocks, at_camera, self.of_camera, at_clone, at_landmark, variance)
 
     def update_by(self, HP: Float, S: Float, residual: Float) -> None:
         """The same by ``HP`` (m, n), the Jacobian times the covariance, and the innovation's covariance ``S`` (m, m).
@@ -282,12 +284,13 @@ class FilterState:
         self.v_WB = self.v_WB + dx[DV]
         self.bias_gyro_B = self.bias_gyro_B + dx[DBG]
         self.bias_accel_B = self.bias_accel_B + dx[DBA]
-        self.R_BC = self.R_BC @ kernels.exp(dx[15:18])
-        self.p_BC = self.p_BC + dx[18:21]
-        self.offset_s += float(dx[21])
-        self.intrinsics = self.intrinsics + dx[INTRINSICS]
+        of_cameras = dx[self.calibrated].reshape(-1, self.of_camera)
+        self.R_BC = kernels.turned_by(self.R_BC, of_cameras[:, 0:3])
+        self.p_BC = self.p_BC + of_cameras[:, 3:6]
+        self.offset_s = self.offset_s + of_cameras[:, OFFSET]
+        self.intrinsics = self.intrinsics + of_cameras[:, INTRINSICS]
+        self.readout_s = self.readout_s + of_cameras[:, READOUT:].sum(axis=1)
         begin, at = self.calibrated.stop, self.landmarks_begin
-        self.readout_s += float(dx[INTRINSICS.stop : begin].sum())
         self.clones = self.clones.corrected(dx[begin:at])
         self.p_WF = self.p_WF + dx[at:].reshape(-1, 3)
         if not (np.isfinite(dx).all() and (np.diag(self.cov)[:IMU] > 0.0).all()):

@@ -53,8 +53,8 @@ def select_tracks(observations: TrackTable, state: FilterState, options: MsckfOp
     Lost tracks too short to be used are dropped from the table. Full tracks fill the free landmark slots first.
     """
     lengths = observations.lengths()
-    lost = ~observations.seen[:, -1]
-    full = observations.seen[:, 0] & ~lost & (len(state.clones) >= options.max_clones)
+    lost = ~observations.in_sight()
+    full = observations.reach_back() & ~lost & (len(state.clones) >= options.max_clones)
     too_short = lost & (lengths < options.min_track_length)
     if too_short.any():
         observations.drop(np.flatnonzero(too_short))
@@ -98,16 +98,21 @@ def update_from_landmarks(state: FilterState, tracks: FrameTracks, options: Msck
     if not len(state.landmark_ids):
         return 0
     state.slide_landmarks(options.landmark_drift_px)
-    order = np.argsort(tracks.ids)
-    xy = tracks.xy[order[np.searchsorted(tracks.ids, state.landmark_ids, sorter=order)]]
-    newest = len(state.clones) - 1
-    blocks, residual = landmark_blocks(state, newest, xy, options.first_estimate_jacobians)
-    HP, S = state.innovation(newest, blocks, options.pixel_sigma**2)
+    rows = np.flatnonzero(np.isin(tracks.ids, state.landmark_ids))
+    order = np.argsort(state.landmark_ids)
+    landmarks = order[np.searchsorted(state.landmark_ids, tracks.ids[rows], sorter=order)]
+    by_landmark = np.lexsort((tracks.camera[rows], landmarks))
+    rows, landmarks = rows[by_landmark], landmarks[by_landmark]
+    cameras, newest = tracks.camera[rows], len(state.clones) - 1
+    blocks, residual = landmark_blocks(
+        state, newest, landmarks, cameras, tracks.xy[rows], options.first_estimate_jacobians
+    )
+    HP, S = state.innovation(newest, landmarks, cameras, blocks, options.pixel_sigma**2)
     accepted = distances(S, residual) < gate[2]
     if accepted.any():
         use = np.repeat(accepted, 2)
         state.update_by(HP[use], S[np.ix_(use, use)], residual[use])
-    state.keep_landmarks(accepted)
+    state.keep_landmarks(np.isin(np.arange(len(state.landmark_ids)), landmarks[accepted]))
     return int(accepted.sum())
 
 

@@ -149,8 +149,8 @@ class Window:
             tracks = replace(tracks, xy_normalised=xy_normalised).finite()
         self._undistorted_with = np.concatenate([self._undistorted_with, intrinsics[None]])
         to_px = pixels_by_residual(self._camera_model, intrinsics, tracks.xy_normalised, on_sphere)
-        rows = self.tracks.add_frame(tracks)
-        self.tracks.to_px[rows, -1] = to_px
+        at = self.tracks.add_frame(tracks)
+        self.tracks.to_px[at] = to_px
 
     @property
     def is_full(self) -> bool:

@@ -107,17 +107,16 @@ def run_backend(
 ) -> BackendRun:
     """Feed every packet of ``sequence`` to ``backend`` in order, until the readings end."""
     life = LifeCycle(backend, sequence.calibration, estimation, initial_state)
-    camera = sequence.calibration.cameras[0]
-    given, synchroniser = camera.model, Synchroniser(Incidents(), time_offset_ns=camera.time_offset_ns, wait_ms=0.0)
+    given, offset_ns = sequence.calibration.lenses, sequence.calibration.cameras[0].time_offset_ns
+    synchroniser = Synchroniser(Incidents(), time_offset_ns=offset_ns, wait_ms=0.0)
     tracks = {tracks.t_ns: tracks for _, tracks in sequence.packets}
     t_ns, estimates, seconds, cpu_seconds = [], [], [], []
     for measured in sequence.measurements():
         measurement = FrameSet(measured.t_ns, ()) if isinstance(measured, FrameTracks) else measured
         for imu, frame in synchroniser.add(measurement):
             begin, cpu_begin = perf_counter(), thread_time()
-            model = life.calibration.cameras[0].model
-            seen = tracks[frame.t_ns]
-            estimates.append(life.process(imu, seen if model == given else seen.undistorted(model)))
+            seen, lenses = tracks[frame.t_ns], life.calibration.lenses
+            estimates.append(life.process(imu, seen if lenses == given else seen.undistorted(*lenses)))
             seconds.append(perf_counter() - begin)
             cpu_seconds.append(thread_time() - cpu_begin)
             t_ns.append(frame.t_ns)

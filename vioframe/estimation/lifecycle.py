@@ -44,36 +44,39 @@ class LifeCycle:
         initial_state: NavState | None = None,
         name: str | None = None,
     ) -> None:
-        camera = calibration.single("the initialisation")
-        if initial_state is not None and (initial_state.cov is None or not camera.rotation_known):
-            raise ConfigError("an initial state needs a covariance, and a camera whose rotation on the body is known")
+        known = all(camera.rotation_known for camera in calibration.cameras)
+        if initial_state is not None and (initial_state.cov is None or not known):
+            raise ConfigError("an initial state needs a covariance, and cameras whose rotation on the body is known")
         self._options = options or EstimationOptions()
         self._backend, self._name = backend, name or f"the back-end {type(backend).__name__}"
-        self._initializer = Initializer(calibration, self._options.imu_noise_factor)
+        if not getattr(backend, "takes_rigs", False):
+            calibration.single(self._name)
+        self._given = calibration
+        self._initializer = Initializer(calibration.only(0), self._options.imu_noise_factor)
         self._standstill = StandstillDetector(self._options.standstill_disparity_px)
         self._initial_state = initial_state
         self._following = False
         self._last: NavState | None = None
         self._corrected_ns = 0
-        self._known = CalibrationEstimate(calibration, (GIVEN,))
-        self._imu_noise = calibration.imu
+        self._known = CalibrationEstimate(calibration, (GIVEN,) * len(calibration.cameras))
 
     @property
     def calibration(self) -> Calibration:
         """That which the next frame must come with: other than given, where something else was found while starting.
 
-        The readings count with its time offset, and reach back to where those of the frame before ended; its camera has
-        undistorted the points.
+        The readings count with its first camera's time offset, and reach back to where those of the frame before ended;
+        its cameras have undistorted the points.
         """
-        return self._initializer.calibration
+        return self._given.moved_with(self._initializer.calibration.cameras[0])
 
     def process(self, imu: ImuSegment, tracks: FrameTracks) -> Estimate:
         """Begin, or follow one frame; where that fails it says so, and begins anew from where it was."""
         tracks = tracks.finite()
-        still = self._standstill.sees_standstill(tracks) and self._options.zero_velocity_update
+        first = tracks.of_camera(0)
+        still = self._standstill.sees_standstill(first) and self._options.zero_velocity_update
         if not self._following:
             return self._begin(imu, tracks)
-        if self._initializer.in_doubt and self._initializer.follow(imu, tracks, still):
+        if self._initializer.in_doubt and self._initializer.follow(imu, first, still):
             self._following = False
             return Estimate(
                 Status.LOST, events=(f"lost: the camera is mounted differently; {self._initializer.found}",)
@@ -98,7 +101,7 @@ class LifeCycle:
                 raise ConfigError(f"the initial state is of {state.t_ns} ns, the first frame of {tracks.t_ns} ns")
             return self._begun(self._start(state, imu, tracks), Stopwatch(), "state given")
         watch = Stopwatch()
-        initial = self._initializer.add(imu, tracks)
+        initial = self._initializer.add(imu, tracks.of_camera(0))
         watch.lap("initialise")
         if initial is None:
             refusal = self._initializer.refusal
@@ -126,11 +129,12 @@ class LifeCycle:
 
     def _start(self, state: NavState, imu: ImuSegment, tracks: FrameTracks) -> Start:
         """From ``state``, with what was found of the calibration while starting."""
-        calibration = self._initializer.calibration
+        calibration = self.calibration
         # It may have been found at this very frame.
-        tracks = tracks.undistorted(calibration.cameras[0].model).finite()
+        tracks = tracks.undistorted(*calibration.lenses).finite()
         flying = replace(calibration, imu=calibration.imu.in_flight(self._options.imu_noise_factor))
-        prior = CalibrationEstimate(flying, (self._initializer.camera_sigma,))
+        sigma = (self._initializer.camera_sigma, *(GIVEN for _ in calibration.cameras[1:]))
+        prior = CalibrationEstimate(flying, sigma)
         return Start(state, prior, calibration.imu, imu, tracks)
 
     def _check(self, estimate: Estimate, t_ns: int) -> None:
@@ -145,7 +149,7 @@ class LifeCycle:
 
     def _learned(self, estimate: CalibrationEstimate) -> CalibrationEstimate:
         """``estimate`` with the IMU's noise as it was given: what is assumed in flight was not learned."""
-        return replace(estimate, calibration=replace(estimate.calibration, imu=self._imu_noise))
+        return replace(estimate, calibration=replace(estimate.calibration, imu=self._given.imu))
 
     def _lose(self, why: str) -> Estimate:
         self._begin_anew()

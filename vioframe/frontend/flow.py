@@ -26,16 +26,15 @@ def equalise(image: Image, method: Equalisation) -> Image:
     return image
 
 
-def camera_rotation(imu: ImuSegment, R_BC: Float) -> Float:
-    """R_C2C1 (3, 3) from the segment's first stamp (C1) to its last (C2): gyroscope by the midpoint rule, bias ignored.
+def body_rotation(imu: ImuSegment) -> Float:
+    """R_B1B2 (3, 3) from the segment's last stamp (B2) to its first (B1): gyroscope by the midpoint rule, bias ignored.
 
     An uncorrected bias of 0.1 rad/s is 5 mrad, two pixels, at 20 Hz: well within the reach of the tracker.
     """
     R_B1B2 = np.eye(3)
     for step in so3.exp(0.5 * (imu.gyro_B[1:] + imu.gyro_B[:-1]) * imu.dt[:, None]):
         R_B1B2 = R_B1B2 @ step
-    R_C2C1: Float = R_BC.T @ R_B1B2.T @ R_BC
-    return R_C2C1
+    return R_B1B2
 
 
 def predict(camera: Camera, xy: Float, xy_normalised: Float, R_C2C1: Float) -> Float:

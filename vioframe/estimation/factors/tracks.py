@@ -1,4 +1,4 @@
-"""The observation table: one row a track, one column a frame."""
+"""The observation table: one row a track, one column a view, which is what one camera sees in one frame."""
 
 from __future__ import annotations
 
@@ -11,17 +11,18 @@ from vioframe.types import FrameTracks
 
 
 class TrackTable:
-    """F tracks over K frames, the oldest frame first.
+    """F tracks over the V = K N views of K frames by N ``cameras``: the oldest frame first, those of a frame together.
 
-    ``ids`` (F,) ascending, ``seen`` (F, K); ``xy`` (F, K, 2) px and ``xy_normalised`` (F, K, 2) are zero where not
+    ``ids`` (F,) ascending, ``seen`` (F, V); ``xy`` (F, V, 2) px and ``xy_normalised`` (F, V, 2) are zero where not
     seen.
     """
 
-    # The arrays with a row a track, and those with a row a track and a column a frame.
+    # The arrays with a row a track, and those with a row a track and a column a view.
     _by_track: tuple[str, ...] = ("ids",)
     _by_sighting: tuple[str, ...] = ("seen", "xy", "xy_normalised")
 
-    def __init__(self) -> None:
+    def __init__(self, cameras: int = 1) -> None:
+        self.cameras = cameras
         self.ids: Int = np.empty(0, np.int64)
         self.seen: Bool = np.empty((0, 0), dtype=bool)
         self.xy: Float = np.empty((0, 0, 2))
@@ -29,27 +30,45 @@ class TrackTable:
 
     @property
     def hosts(self) -> Int:
-        """(F,) first frame that sees each track."""
+        """(F,) first view of each track."""
         return np.asarray(self.seen.argmax(axis=1))
 
     def lengths(self) -> Int:
-        """(F,) number of frames that see each track."""
+        """(F,) number of views of each track."""
         return np.asarray(self.seen.sum(axis=1))
 
-    def add_frame(self, tracks: FrameTracks) -> Int:
-        """Append a frame; returns the rows (N,) of its tracks."""
-        ids, frames = np.union1d(self.ids, tracks.ids), self.seen.shape[1]
+    def in_sight(self) -> Bool:
+        """(F,) which tracks are in the newest frame.
+
+        A camera that has no part in it, while others do, takes its turn in others: there the newest that it has counts.
+        """
+        newest = np.arange(-self.cameras, 0)
+        if self.cameras > 1 and len(self.ids):
+            by_camera = self.seen.any(axis=0).reshape(-1, self.cameras)
+            if by_camera[-1].any():
+                newest += self.cameras * -by_camera[::-1].argmax(axis=0)
+        return np.asarray(self.seen[:, newest].any(axis=1))
+
+    def reach_back(self) -> Bool:
+        """(F,) which tracks are in the oldest frame."""
+        return np.asarray(self.seen[:, : self.cameras].any(axis=1))
+
+    def add_frame(self, tracks: FrameTracks) -> tuple[Int, Int]:
+        """Append a frame; returns the rows and columns (N,) of its sightings."""
+        ids, views = np.union1d(self.ids, tracks.ids), self.seen.shape[1]
         old, new = np.searchsorted(ids, self.ids), np.searchsorted(ids, tracks.ids)
         for name in self._by_track:
             values = getattr(self, name)
             setattr(self, name, _placed(values, (len(ids), *values.shape[1:]), old))
         for name in self._by_sighting:
             values = getattr(self, name)
-            setattr(self, name, _placed(values, (len(ids), frames + 1, *values.shape[2:]), (old, slice(0, frames))))
+            shape = len(ids), views + self.cameras, *values.shape[2:]
+            setattr(self, name, _placed(values, shape, (old, slice(0, views))))
         self.ids = ids
-        self.seen[new, frames] = True
-        self.xy[new, frames], self.xy_normalised[new, frames] = tracks.xy, tracks.xy_normalised
-        return new
+        at = new, views + tracks.camera
+        self.seen[at] = True
+        self.xy[at], self.xy_normalised[at] = tracks.xy, tracks.xy_normalised
+        return at
 
     def drop(self, rows: Int) -> None:
         """Forget whole tracks."""
@@ -60,7 +79,8 @@ class TrackTable:
     def drop_frame(self, frame: int) -> None:
         """Forget a frame, and tracks that no other one sees."""
         for name in self._by_sighting:
-            setattr(self, name, np.delete(getattr(self, name), frame, axis=1))
+            views = self.cameras * frame + np.arange(self.cameras)
+            setattr(self, name, np.delete(getattr(self, name), views, axis=1))
         self.keep(np.asarray(self.seen.any(axis=1)))
 
     def keep(self, keep: Bool) -> None:
@@ -89,7 +109,7 @@ class LandmarkTable(TrackTable):
 
     def drop_frame(self, frame: int) -> None:
         """Forget a frame, and tracks that no other one sees. Landmarks it hosts become unknown."""
-        self.known &= self.hosts != frame
+        self.known &= self.hosts // self.cameras != frame
         super().drop_frame(frame)
 
 

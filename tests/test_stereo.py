@@ -1,0 +1,140 @@
+"""Two cameras before a wall: what both see has one id, and lies where geometry puts it."""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from test_frontend import CAMERA, PERIOD_NS, SKY, texture
+
+from vioframe.frontend import Frontend, FrontendOptions
+from vioframe.frontend.stereo import between, inverse_depths, overlapping, projected
+from vioframe.geometry import so3
+from vioframe.incidents import Incidents
+from vioframe.io.calibration import packaged_calibration
+from vioframe.types import CameraOnBody, FrameSet, FrameTracks, ImuSegment
+from vioframe_shi_tomasi import ShiTomasi
+
+WALL_M = 2.5
+LEFT = CameraOnBody("cam0", CAMERA, so3.exp([0.3, -1.2, 0.8]), np.array([0.1, -0.2, 0.05]))
+SMALLER = replace(CAMERA, fx=250.0, fy=251.0, cx=130.0, cy=100.0, resolution=(260, 200))
+
+
+def beside(turn=(0.01, -0.03, 0.02), model=CAMERA) -> CameraOnBody:
+    """A camera to the right of the left one, turned by so much, rad."""
+    return CameraOnBody("cam1", model, LEFT.R_BC @ so3.exp(turn), LEFT.p_BC + LEFT.R_BC @ [0.15, 0.01, -0.02])
+
+
+def rig(right: CameraOnBody):
+    return replace(packaged_calibration("euroc", cameras=["cam0"]), cameras=(LEFT, right))
+
+
+RIG = rig(beside())
+
+
+def shown(camera: CameraOnBody, moved_m: float = 0.0):
+    """The wall, which stands before the left camera and moves along its x axis."""
+    R_C2C1, p_C2C1 = between(LEFT, camera)
+    wall_to_ray = np.array([[1 / 300.0, 0.0, -699.5 / 300.0], [0.0, 1 / 300.0, -499.5 / 300.0], [0.0, 0.0, 1.0]])
+    wall_to_ray = np.array([[1.0, 0.0, moved_m / WALL_M], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]) @ wall_to_ray
+    plane = R_C2C1 + np.outer(p_C2C1, [0.0, 0.0, 1.0]) / WALL_M
+    return cv2.warpPerspective(SKY, camera.model.K @ plane @ wall_to_ray, camera.model.resolution)
+
+
+def play(calibration, sets, frontend=None, first: int = 1) -> list[FrameTracks]:
+    frontend = frontend or Frontend(ShiTomasi(), calibration, FrontendOptions(max_points=80), Incidents())
+    steps = []
+    for k, images in enumerate(sets, start=first):
+        t_ns = k * PERIOD_NS + np.linspace(-PERIOD_NS, 0, 11).astype(np.int64)
+        imu = ImuSegment(t_ns, np.zeros((11, 3)), np.zeros((11, 3)))
+        steps.append(frontend.track(imu, FrameSet(k * PERIOD_NS, images), calibration))
+    return steps
+
+
+def pairs(tracks: FrameTracks):
+    """Ids that both cameras see, and where each does on the z = 1 plane."""
+    left, right = tracks.of_camera(0), tracks.of_camera(1)
+    ids, i, j = np.intersect1d(left.ids, right.ids, assume_unique=True, return_indices=True)
+    return ids, left.xy_normalised[i], right.xy_normalised[j]
+
+
+def flown(count: int, calibration=RIG):
+    return [tuple(shown(camera, 0.02 * k) for camera in calibration.cameras) for k in range(count)]
+
+
+@pytest.mark.parametrize(("model", "median_px"), [(CAMERA, 0.1), (SMALLER, 0.5)], ids=["alike", "smaller"])
+def test_what_both_cameras_see_has_one_id_and_lies_on_the_wall(model, median_px):
+    calibration = rig(beside(model=model))
+    steps = play(calibration, flown(6, calibration))
+    R_C2C1, p_C2C1 = between(*calibration.cameras)
+    for tracks in steps:
+        ids, left, right = pairs(tracks)
+        _, in_view = projected(tracks.of_camera(0).xy_normalised, 1.0 / WALL_M, R_C2C1, p_C2C1, model)
+        assert len(ids) > 0.7 * in_view.sum() > 20
+        expected, _ = projected(left, 1.0 / WALL_M, R_C2C1, p_C2C1, model)
+        off_px = np.linalg.norm(model.distort(right) - expected, axis=1)
+        assert np.median(off_px) < median_px
+        assert np.percentile(off_px, 95) < 4.0 * median_px
+        np.testing.assert_allclose(np.median(inverse_depths(R_C2C1, p_C2C1, left, right)), 1.0 / WALL_M, rtol=0.02)
+        for camera in (0, 1):
+            seen = tracks.of_camera(camera).ids
+            assert len(np.unique(seen)) == len(seen)
+    assert len(np.intersect1d(pairs(steps[0])[0], pairs(steps[-1])[0])) > 20
+
+
+@pytest.mark.parametrize("off_px", [0, 8])
+def test_what_contradicts_the_calibration_is_not_paired(off_px):
+    """The right image is lower than it could be: texture alone would match."""
+    images = [(left, np.roll(right, off_px, axis=0)) for left, right in flown(3)]
+    counts = [len(pairs(tracks)[0]) for tracks in play(RIG, images)]
+    assert min(counts) > 20 if off_px == 0 else max(counts) < 5
+
+
+def test_a_pair_that_begins_to_contradict_the_calibration_is_parted():
+    images = flown(6)
+    images[3:] = [(left, np.roll(right, 8, axis=0)) for left, right in images[3:]]
+    steps = play(RIG, images)
+    before, after = pairs(steps[2])[0], pairs(steps[3])[0]
+    assert len(before) > 20
+    assert len(np.intersect1d(before, after)) < 5
+    assert np.isin(before, steps[3].of_camera(0).ids).mean() > 0.8
+
+
+def test_cameras_that_see_nothing_in_common_follow_points_of_their_own():
+    back = beside((0.0, np.pi, 0.0))
+    calibration = rig(back)
+    assert overlapping(calibration) == ()
+    images = (shown(LEFT), texture((240, 320), 7))
+    tracks = play(calibration, [images, images])[-1]
+    assert not len(pairs(tracks)[0])
+    assert min(len(tracks.of_camera(c).ids) for c in (0, 1)) > 30
+
+
+def test_a_camera_that_goes_black_takes_up_the_same_landmarks_again():
+    images = flown(9)
+    images[3:6] = [(left, np.zeros_like(right)) for left, right in images[3:6]]
+    steps = play(RIG, images)
+    black, again = steps[4], steps[6]
+    assert not len(black.of_camera(1).ids)
+    assert len(black.of_camera(0).ids) > 60
+    assert len(np.intersect1d(pairs(again)[0], pairs(steps[2])[0])) > 15
+
+
+def test_a_camera_that_brings_no_image_holds_up_no_other():
+    images = flown(6)
+    images[2] = (None, images[2][1])
+    images[4] = (images[4][0], None)
+    steps = play(RIG, images)
+    assert set(steps[2].camera) == {1}
+    assert set(steps[4].camera) == {0}
+    common = np.intersect1d(steps[1].of_camera(0).ids, steps[3].of_camera(0).ids)
+    assert len(common) > 0.8 * len(steps[1].of_camera(0).ids)
+    assert len(pairs(steps[5])[0]) > 20
+
+
+def test_what_one_camera_saw_alone_is_taken_over_by_the_other():
+    """The left camera is black at first: its points then are those that the right one has found."""
+    images = flown(3)
+    images[0] = (np.zeros_like(images[0][0]), images[0][1])
+    first, second, _ = play(RIG, images)
+    assert len(np.intersect1d(first.of_camera(1).ids, second.of_camera(0).ids)) > 20

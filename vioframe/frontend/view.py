@@ -1,0 +1,161 @@
+"""The points of one camera: followed from image to image, judged, and replaced where they are lost."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from vioframe.errors import DatasetError
+from vioframe.frontend.candidates import CandidateSource
+from vioframe.frontend.flow import equalise, follow, predict
+from vioframe.frontend.lucas_kanade import Pyramid
+from vioframe.frontend.options import FrontendOptions
+from vioframe.frontend.refill import spread, thin
+from vioframe.geometry import so3, two_view
+from vioframe.geometry.cameras import Camera
+from vioframe.incidents import Incidents
+from vioframe.interfaces import Detector
+from vioframe.stopwatch import Stopwatch
+from vioframe.types import Bool, Float, Image, Int
+
+# Standard deviation, in grey levels, below which an image (black, saturated, lens covered) shows nothing but noise.
+_FEATURELESS = 3.0
+# Turned by so much, a camera shows another image.
+_FROZEN_PX = 1.0
+# Points closer than this to the edge of the image are dropped: their patches reach beyond it.
+BORDER_PX = 5.0
+# A point followed there and back must return to within this of where it was.
+FORWARD_BACKWARD_PX = 1.0
+# Candidates asked of the detector, as a multiple of the points wanted; most fall near live tracks.
+_CANDIDATES_PER_POINT = 3
+# The 5-, 7- and 8-point solvers need more points than that before an odd one out can be told.
+_FEWEST_TO_JUDGE = 10
+
+
+class View:
+    """``ids`` (N,), ``xy`` (N, 2) px and ``xy_normalised`` (N, 2) of the points in the newest image of ``camera``."""
+
+    def __init__(self, detector: Detector, camera: Camera, options: FrontendOptions, incidents: Incidents) -> None:
+        self._candidates = CandidateSource(detector, camera, BORDER_PX, incidents)
+        self._options = options
+        self._incidents = incidents
+        self._image: Image | None = None
+        self._pyramid: Pyramid | None = None
+        self.camera = camera
+        self.is_featureless = True
+        """Whether the newest image shows nothing that could be followed."""
+        self.ids: Int = np.empty(0, np.int64)
+        self.xy: Float = np.empty((0, 2))
+        self.xy_normalised: Float = np.empty((0, 2))
+
+    @property
+    def pyramid(self) -> Pyramid:
+        """That of the newest image that shows anything."""
+        assert self._pyramid is not None
+        return self._pyramid
+
+    def advance(self, raw: Image, R_C2C1: Float | None, t_ns: int, watch: Stopwatch) -> None:
+        """Follow the points to the next image, ``R_C2C1`` (3, 3) being how the camera turned, where that is known.
+
+        Raises :class:`DatasetError` where the image does not fit the calibration.
+        """
+        self._check(raw)
+        image = equalise(raw, self._options.equalisation).view()
+        image.flags.writeable = False  # the detector is anybody's code
+        watch.lap("equalise")
+        self.is_featureless = bool(np.std(raw[::4, ::4]) < _FEATURELESS)
+        if self.is_featureless:
+            self._incidents.add("featureless_image", t_ns)
+            self.keep(np.zeros(len(self.ids), bool))
+        else:
+            self._watch_for_frozen(image, R_C2C1, t_ns)
+            pyramid = Pyramid.of(image, self._options.klt_levels, self._options.klt_window_px)
+            xy_normalised_before = self._follow(pyramid, R_C2C1)
+            self._pyramid = pyramid
+            watch.lap("klt")
+            self._reject(xy_normalised_before, R_C2C1)
+            watch.lap("reject")
+        self._image = image
+
+    def recalibrate(self, camera: Camera) -> None:
+        """Count with ``camera`` from the next image on."""
+        if camera != self.camera:
+            self.camera = camera
+            self.xy_normalised = camera.undistort(self.xy)
+
+    def refill(self, next_id: int, t_ns: int) -> int:
+        """Take new points where there are fewest, once enough tracks are lost; returns the id of the next one."""
+        options, camera, image = self._options, self.camera, self._image
+        assert image is not None
+        self.keep(thin(self.xy, self.ids, 0.5 * options.min_distance_px))
+        if len(self.ids) >= options.refill_below * options.max_points:
+            return next_id
+        candidates = self._candidates.ask(image, _CANDIDATES_PER_POINT * options.max_points, t_ns)
+        taken = spread(
+            candidates,
+            self.xy,
+            options.max_points - len(self.ids),
+            size=camera.resolution,
+            min_distance_px=options.min_distance_px,
+        )
+        xy = candidates[taken]
+        xy_normalised = camera.undistort(xy)
+        usable = np.isfinite(xy_normalised).all(axis=1) & camera.contains(xy, BORDER_PX)
+        ids = next_id + np.arange(np.sum(usable))
+        self.add(ids, xy[usable], xy_normalised[usable])
+        return next_id + len(ids)
+
+    def add(self, ids: Int, xy: Float, xy_normalised: Float) -> None:
+        """Points (N,) that were found in the newest image."""
+        self.ids = np.concatenate([self.ids, ids])
+        self.xy = np.concatenate([self.xy, xy])
+        self.xy_normalised = np.concatenate([self.xy_normalised, xy_normalised])
+
+    def keep(self, mask: Bool) -> None:
+        """Only the points ``mask`` (N,)."""
+        self.ids, self.xy, self.xy_normalised = self.ids[mask], self.xy[mask], self.xy_normalised[mask]
+
+    def _check(self, image: Image) -> None:
+        width, height = self.camera.resolution
+        if image.shape != (height, width) or image.dtype != np.uint8:
+            got = "x".join(str(n) for n in image.shape[1::-1]) + f" {image.dtype}"
+            raise DatasetError(
+                f"image is {got}, but the calibration is for {width}x{height} grey uint8; "
+                "use the calibration of this camera, or convert the images"
+            )
+
+    def _watch_for_frozen(self, image: Image, R_C2C1: Float | None, t_ns: int) -> None:
+        """Count an image that is the one before it to the last bit, though the camera turned: it was not taken anew."""
+        if R_C2C1 is None or self._image is None or not np.array_equal(image[::16, ::16], self._image[::16, ::16]):
+            return
+        turned_px = self.camera.focal_px * float(np.linalg.norm(so3.log(R_C2C1)))
+        if turned_px > _FROZEN_PX and np.array_equal(image, self._image):
+            self._incidents.add("frozen_image", t_ns)
+
+    def _follow(self, pyramid: Pyramid, R_C2C1: Float | None) -> Float:
+        """Move all tracks to ``pyramid``, dropping the lost; returns (N, 2) where the others were, normalised."""
+        before = self.xy_normalised
+        if self._pyramid is None or not len(self.ids):
+            return before
+        guess = self.xy if R_C2C1 is None else predict(self.camera, self.xy, before, R_C2C1)
+        xy, found = follow(self._pyramid, pyramid, self.xy, guess, FORWARD_BACKWARD_PX)
+        found &= self.camera.contains(xy, BORDER_PX)
+        self.xy = xy
+        self.xy_normalised = self.camera.undistort(xy)
+        found &= np.isfinite(self.xy_normalised).all(axis=1)
+        self.keep(found)
+        return before[found]
+
+    def _reject(self, xy_normalised_before: Float, R_C2C1: Float | None) -> None:
+        """Drop the tracks that moved as nothing fixed in the world could have."""
+        options = self._options
+        if options.rejection == "none" or len(self.ids) < _FEWEST_TO_JUDGE:
+            return
+        threshold = options.rejection_px / self.camera.focal_px
+        pair = xy_normalised_before, self.xy_normalised
+        if options.rejection == "two_point" and R_C2C1 is not None:
+            inliers = two_view.two_point_inliers(*pair, R_C2C1, threshold)
+        elif options.rejection == "fundamental":
+            inliers = two_view.fundamental_inliers(*pair, threshold)
+        else:
+            inliers = two_view.magsac_inliers(*pair, threshold)
+        self.keep(inliers)
