@@ -267,11 +267,13 @@ def test_threads_are_few_while_it_runs_and_as_before_afterwards():
 # What does not fit.
 
 
-def test_two_cameras_are_refused_in_one_line():
+@pytest.mark.parametrize("backend", ["loose_ekf", "sliding_window"])
+def test_two_cameras_are_refused_in_one_line_by_who_takes_one(backend):
     camera = CALIBRATION.cameras[0]
     pair = replace(CALIBRATION, cameras=(camera, replace(camera, name="cam1")))
     with pytest.raises(ConfigError) as refused:
-        Odometry(pair, backend="loose_ekf", installed=INSTALLED)
+        Odometry(pair, backend=backend, installed=INSTALLED)
+    assert f"backend '{backend}'" in str(refused.value)
     assert "the calibration has cam0, cam1; choose one, as by -o cameras=cam0" in str(refused.value)
     assert "\n" not in str(refused.value)
 

@@ -94,15 +94,16 @@ class Odometry:
         self.incidents = Incidents() if incidents is None else incidents
         if isinstance(detector, str):
             detector = self._registry.create_detector(detector, detector_options)
-        name = None
+        name, estimator = None, backend
         if isinstance(backend, str):
             name = str(self._registry.find(registry.BACKEND, backend))
-            if warm:
-                with self._registry.blaming(), limited_threads():
-                    warm_up(self._registry.create_backend(backend, backend_options), calibration)
-            backend = self._registry.create_backend(backend, backend_options)
+            estimator = self._registry.create_backend(backend, backend_options)
+        assert not isinstance(estimator, str)
         self._frontend = Frontend(detector, calibration, frontend or FrontendOptions(), self.incidents)
-        self._life = LifeCycle(backend, calibration, estimation, initial_state, name)
+        self._life = LifeCycle(estimator, calibration, estimation, initial_state, name)
+        if warm and isinstance(backend, str):
+            with self._registry.blaming(), limited_threads():
+                warm_up(self._registry.create_backend(backend, backend_options), calibration)
         self._synchroniser = Synchroniser(
             self.incidents, time_offset_ns=calibration.cameras[0].time_offset_ns, wait_ms=wait_ms
         )
