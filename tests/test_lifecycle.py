@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from msckf_helpers import CALIBRATION, drawn_start
+from msckf_helpers import CALIBRATION, STEREO, drawn_start
 from threadpoolctl import threadpool_limits
 
 from vioframe.errors import ConfigError, DivergedError, PluginError
@@ -104,6 +104,21 @@ def test_a_start_of_another_instant_than_the_first_frame_is_refused():
     life = LifeCycle(Scripted(), CALIBRATION, None, drawn_start(flight(), 0, 0))
     with pytest.raises(ConfigError, match=r"the initial state is of \d+ ns, the first frame of \d+ ns"):
         life.process(*flight().packets[1])
+
+
+def test_cameras_may_take_turns():
+    """Every other frame is of the right one alone; the left one finds the start, and both hold the scale."""
+    sequence = simulated_sequence("figure_eight", duration_s=8.0, seed=1, calibration=STEREO)
+    packets = [(imu, tracks.of_camera(k % 2)) for k, (imu, tracks) in enumerate(sequence.packets)]
+    life = LifeCycle(created("msckf"), STEREO)
+    estimates = [life.process(imu, tracks) for imu, tracks in packets]
+    states = {e.state.t_ns: e.state for e in estimates if e.state is not None}
+    assert len(states) > 60
+    assert not any(e.status is Status.LOST for e in estimates)
+    truth = {state.t_ns: state for state in sequence.true_states}
+    begin, end = (states[t_ns] for t_ns in (min(states), max(states)))
+    flown, expected = (np.linalg.norm(b.p_WB - a.p_WB) for a, b in ((begin, end), (truth[begin.t_ns], truth[end.t_ns])))
+    assert abs(flown - expected) < 0.02 * max(expected, 1.0)
 
 
 def test_two_cameras_are_refused_in_one_line():

@@ -131,6 +131,11 @@ class Initializer:
                 return estimate
         return None
 
+    def pass_by(self, imu: ImuSegment) -> None:
+        """Take the readings up to a frame that another camera took alone."""
+        self._begin_after_gap(imu)
+        self._readings.add(imu)
+
     def follow(self, imu: ImuSegment, tracks: FrameTracks, still: bool) -> bool:
         """Take one frame of a flight that began at rest; whether the camera turns out to be mounted quite differently.
 
@@ -156,15 +161,18 @@ class Initializer:
 
     def _take(self, imu: ImuSegment, tracks: FrameTracks) -> bool:
         """Take one frame; whether its readings are there, or still to come."""
-        if imu.largest_gap_s > LARGEST_IMU_GAP_S:
-            self.reset()
-            _log.info("no readings for %.2f s: begun anew", imu.largest_gap_s)
+        self._begin_after_gap(imu)
         tracks = unrolled(tracks.finite(), self._calibration.cameras[0], imu.gyro_B[-1])
         self._readings.add(imu)
         self._waiting.append(tracks)
         self._sensors.add(tracks, self._calibration.cameras[0].model)
         self._cut()
         return bool(self._packets) and self._packets[-1][1] is tracks
+
+    def _begin_after_gap(self, imu: ImuSegment) -> None:
+        if imu.largest_gap_s > LARGEST_IMU_GAP_S:
+            self.reset()
+            _log.info("no readings for %.2f s: begun anew", imu.largest_gap_s)
 
     def _cut(self) -> None:
         """Give the frames that wait for readings theirs, as far as they reach; let go of what is too old."""
