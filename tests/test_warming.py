@@ -2,7 +2,7 @@
 
 import subprocess
 import sys
-from time import perf_counter
+from time import perf_counter, thread_time
 
 import numpy as np
 import pytest
@@ -13,7 +13,7 @@ from vioframe.io.calibration import packaged_calibration
 from vioframe.jit import kernel, waited_s
 from vioframe.odometry import Odometry
 from vioframe.quantiles import chi2_quantile
-from vioframe.stopwatch import Stopwatch
+from vioframe.stopwatch import Stopwatch, working_s
 from vioframe.warming import helped
 
 CALIBRATION = packaged_calibration("euroc", cameras=["cam0"])
@@ -37,6 +37,17 @@ def test_a_stopwatch_stands_still_while_a_kernel_is_compiled():
     taken_s = perf_counter() - begin_s
     assert 0.5 * taken_s < waited_s() - waited < taken_s
     assert watch.seconds["all"] == pytest.approx(taken_s - (waited_s() - waited), abs=1e-3)
+
+
+def test_what_a_thread_computes_is_counted_without_compiling():
+    begin_s, working = thread_time(), working_s(thread_time)
+    compile_something()
+    taken_s = thread_time() - begin_s
+    assert working_s(thread_time) - working < 0.5 * taken_s
+    begin_s, working = thread_time(), working_s(thread_time)
+    while thread_time() - begin_s < 0.02:
+        pass
+    assert working_s(thread_time) - working >= 0.02
 
 
 @pytest.fixture

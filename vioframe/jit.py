@@ -17,7 +17,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from functools import cache, partial
 from pathlib import Path
-from time import perf_counter
+from time import perf_counter, thread_time
 from typing import Any, TypeVar, cast, overload
 
 import numba
@@ -72,8 +72,11 @@ def heard(tell: Callable[[str], None]) -> Iterator[None]:
         yield
 
 
+_CLOCKS = (perf_counter, thread_time)
+
+
 class _Waiting(event.Listener):
-    """Sums up how long each thread was held up, the outermost of what is nested alone.
+    """Sums up how long each thread was held up, by each of the clocks, the outermost of what is nested alone.
 
     It has no garbage collected meanwhile: a compiler makes objects by the million that all stay in use, and looking
     through them again and again is a tenth of its time.
@@ -86,29 +89,33 @@ class _Waiting(event.Listener):
         thread = self._thread
         thread.depth = getattr(thread, "depth", 0) + 1
         if thread.depth == 1:
-            thread.begin_s, thread.collected = perf_counter(), gc.isenabled()
+            thread.begin_s, thread.collected = [clock() for clock in _CLOCKS], gc.isenabled()
             gc.disable()
 
     def on_end(self, begun: Any) -> None:
         thread = self._thread
         thread.depth -= 1
         if thread.depth == 0:
-            thread.seconds = self.seconds + perf_counter() - thread.begin_s
+            ends_s = zip(_CLOCKS, thread.begin_s, strict=True)
+            thread.seconds = {clock: self.seconds(clock) + clock() - begin_s for clock, begin_s in ends_s}
             if thread.collected:
                 gc.enable()
 
-    @property
-    def seconds(self) -> float:
-        return getattr(self._thread, "seconds", 0.0)
+    def seconds(self, clock: Callable[[], float]) -> float:
+        waited: dict[Callable[[], float], float] = getattr(self._thread, "seconds", {})
+        return waited.get(clock, 0.0)
 
 
 _waiting = _Waiting()
 event.register("numba:compiler_lock", _waiting)  # type: ignore[no-untyped-call]
 
 
-def waited_s() -> float:
-    """How long this thread has waited by now for kernels to be compiled or loaded from the cache, s."""
-    return _waiting.seconds
+def waited_s(clock: Callable[[], float] = perf_counter) -> float:
+    """How long this thread has waited by now for kernels to be compiled or loaded from the cache, s.
+
+    By the ``clock``, or by ``thread_time``: what the thread itself has computed for it.
+    """
+    return _waiting.seconds(clock)
 
 
 class _Listener(event.Listener):

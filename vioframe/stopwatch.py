@@ -1,13 +1,17 @@
 """Seconds by stage, for the timing columns of a run."""
 
+from collections.abc import Callable
 from time import perf_counter
 
 from vioframe.jit import waited_s
 
 
-def working_s() -> float:
-    """A clock of this thread, s, that stands still while a kernel is compiled or loaded: that happens once."""
-    return perf_counter() - waited_s()
+def working_s(clock: Callable[[], float] = perf_counter) -> float:
+    """A clock of this thread, s, that stands still while a kernel is compiled or loaded: that happens once.
+
+    With ``thread_time`` it also does while others have the processor.
+    """
+    return clock() - waited_s(clock)
 
 
 class Stopwatch:

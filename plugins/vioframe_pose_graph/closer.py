@@ -9,12 +9,12 @@ from array import array
 from collections import deque
 from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from time import perf_counter
 
 import numpy as np
 
 from vioframe.geometry.so3 import rotation_z, yaw_of
 from vioframe.geometry.trajectory import Trajectory
+from vioframe.stopwatch import working_s
 from vioframe.types import Calibration, Float, Int, Loop, LoopClosure, Status, Step
 from vioframe_pose_graph.consistency import Odometry, agreed, measured, within_drift
 from vioframe_pose_graph.graph import solve_robustly, wrapped
@@ -64,7 +64,7 @@ class PoseGraph:
         self._waiting.extend(self._worker.submit(self._recogniser.add, keyframe) for keyframe in keyframes)
 
     def _close(self) -> LoopClosure:
-        begin = perf_counter()
+        begin = working_s()
         places, sightings = self._recogniser.places, self._recogniser.sightings
         t_ns = np.array([place.t_ns for place in places])
         segment = np.array([place.segment for place in places])
@@ -76,7 +76,7 @@ class PoseGraph:
         p, yaw, accepted[sound] = solve_robustly(odometry.p, odometry.edges(), said.select(sound), likely[sound])
         trajectory = self._corrected(t_ns, segment, odometry.p, p, yaw)
         loops = tuple(_loop(s, places, good) for s, good in zip(sightings, accepted.tolist(), strict=True))
-        return LoopClosure(trajectory, t_ns, loops, {**self._recogniser.seconds, "solve": perf_counter() - begin})
+        return LoopClosure(trajectory, t_ns, loops, {**self._recogniser.seconds, "solve": working_s() - begin})
 
     def _corrected(self, t_ns: Int, segment: Int, key_p: Float, p: Float, yaw: Float) -> Trajectory:
         stamps = np.array(self._t_ns, np.int64)

@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import groupby, pairwise
-from time import perf_counter, thread_time
+from time import thread_time
 from typing import Any
 
 import numpy as np
@@ -20,6 +20,7 @@ from vioframe.incidents import Incidents
 from vioframe.interfaces import Backend
 from vioframe.io.synchronise import Synchroniser
 from vioframe.simulation import TrackSequence
+from vioframe.stopwatch import working_s
 from vioframe.types import DP, Estimate, Float, FrameSet, FrameTracks, NavState, Status
 
 _POSE = DP.stop  # [dtheta dp] come first in the error state
@@ -30,7 +31,7 @@ class BackendRun:
     """What a back-end said after each packet: ``t_ns`` and ``estimates`` (N,), and how long each took it.
 
     ``seconds`` (N,) are those of the clock, ``cpu_seconds`` (N,) those the thread was computing: on a machine that is
-    busy with other things the first are longer.
+    busy with other things the first are longer. Neither counts the compiling and loading of kernels.
     """
 
     t_ns: tuple[int, ...]
@@ -114,11 +115,11 @@ def run_backend(
     for measured in sequence.measurements():
         measurement = FrameSet(measured.t_ns, ()) if isinstance(measured, FrameTracks) else measured
         for imu, frame in synchroniser.add(measurement):
-            begin, cpu_begin = perf_counter(), thread_time()
+            begin, cpu_begin = working_s(), working_s(thread_time)
             seen, lenses = tracks[frame.t_ns], life.calibration.lenses
             estimates.append(life.process(imu, seen if lenses == given else seen.undistorted(*lenses)))
-            seconds.append(perf_counter() - begin)
-            cpu_seconds.append(thread_time() - cpu_begin)
+            seconds.append(working_s() - begin)
+            cpu_seconds.append(working_s(thread_time) - cpu_begin)
             t_ns.append(frame.t_ns)
             synchroniser.retime(life.calibration.cameras[0].time_offset_ns)
     return BackendRun(tuple(t_ns), tuple(estimates), np.array(seconds), np.array(cpu_seconds))
