@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 from msckf_helpers import CALIBRATION, STEREO, prior_of
 
-from vioframe.estimation.rig import SIZE, covariance
+from vioframe.estimation.factors.reprojection import CALIBRATION_SIZE as SIZE
+from vioframe.estimation.rig import covariance
 from vioframe.geometry import so3
 
 

@@ -8,8 +8,9 @@ import pytest
 from test_frontend import CAMERA, PERIOD_NS, SKY, texture
 
 from vioframe.frontend import Frontend, FrontendOptions
-from vioframe.frontend.stereo import between, inverse_depths, overlapping, projected
-from vioframe.geometry import so3
+from vioframe.frontend.flow import projected
+from vioframe.frontend.stereo import between, overlapping
+from vioframe.geometry import so3, two_view
 from vioframe.incidents import Incidents
 from vioframe.io.calibration import packaged_calibration
 from vioframe.types import CameraOnBody, FrameSet, FrameTracks, ImuSegment
@@ -67,15 +68,21 @@ def test_what_both_cameras_see_has_one_id_and_lies_on_the_wall(model, median_px)
     calibration = rig(beside(model=model))
     steps = play(calibration, flown(6, calibration))
     R_C2C1, p_C2C1 = between(*calibration.cameras)
+
+    def on_wall(xy_normalised):
+        return WALL_M * two_view.rays(xy_normalised) @ R_C2C1.T + p_C2C1
+
     for tracks in steps:
         ids, left, right = pairs(tracks)
-        _, in_view = projected(tracks.of_camera(0).xy_normalised, 1.0 / WALL_M, R_C2C1, p_C2C1, model)
+        _, in_view = projected(model, on_wall(tracks.of_camera(0).xy_normalised))
         assert len(ids) > 0.7 * in_view.sum() > 20
-        expected, _ = projected(left, 1.0 / WALL_M, R_C2C1, p_C2C1, model)
+        expected, _ = projected(model, on_wall(left))
         off_px = np.linalg.norm(model.distort(right) - expected, axis=1)
         assert np.median(off_px) < median_px
         assert np.percentile(off_px, 95) < 4.0 * median_px
-        np.testing.assert_allclose(np.median(inverse_depths(R_C2C1, p_C2C1, left, right)), 1.0 / WALL_M, rtol=0.02)
+        np.testing.assert_allclose(
+            np.median(two_view.inverse_depths(left, right, R_C2C1, p_C2C1)), 1.0 / WALL_M, rtol=0.02
+        )
         for camera in (0, 1):
             seen = tracks.of_camera(camera).ids
             assert len(np.unique(seen)) == len(seen)

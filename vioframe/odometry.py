@@ -94,16 +94,17 @@ class Odometry:
         self.incidents = Incidents() if incidents is None else incidents
         if isinstance(detector, str):
             detector = self._registry.create_detector(detector, detector_options)
-        name, estimator = None, backend
+        name = None
+        to_warm: Backend | None = None
         if isinstance(backend, str):
             name = str(self._registry.find(registry.BACKEND, backend))
-            estimator = self._registry.create_backend(backend, backend_options)
-        assert not isinstance(estimator, str)
+            to_warm = self._registry.create_backend(backend, backend_options) if warm else None
+            backend = self._registry.create_backend(backend, backend_options)
         self._frontend = Frontend(detector, calibration, frontend or FrontendOptions(), self.incidents)
-        self._life = LifeCycle(estimator, calibration, estimation, initial_state, name)
-        if warm and isinstance(backend, str):
+        self._life = LifeCycle(backend, calibration, estimation, initial_state, name)
+        if to_warm is not None:
             with self._registry.blaming(), limited_threads():
-                warm_up(self._registry.create_backend(backend, backend_options), calibration)
+                warm_up(to_warm, calibration)
         self._synchroniser = Synchroniser(
             self.incidents, time_offset_ns=calibration.cameras[0].time_offset_ns, wait_ms=wait_ms
         )

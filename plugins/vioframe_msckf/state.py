@@ -39,7 +39,7 @@ from vioframe_msckf.covariance import inserted, landmark_innovation, only, reduc
 IMU = 15
 EXTRINSICS, OFFSET, INTRINSICS, READOUT = slice(0, 6), 6, slice(7, 15), 15
 """Where in a camera's block they are."""
-# In that order, those of :mod:`rig`: there the readout comes ahead of the intrinsics.
+# In that order, the places of :meth:`CameraSigma.stacked`: there the readout comes ahead of the intrinsics.
 _ORDER = np.array([*range(7), *range(8, 16), 7])
 
 
@@ -135,7 +135,7 @@ class FilterState:
         estimated = np.zeros((len(cameras), 16), bool)
         estimated[:, EXTRINSICS], estimated[:, OFFSET], estimated[:, INTRINSICS] = extrinsics, offset, intrinsics
         estimated[:, READOUT] = True
-        order = (rig.SIZE * np.arange(len(cameras))[:, None] + _ORDER[: self.of_camera]).ravel()
+        order = (len(_ORDER) * np.arange(len(cameras))[:, None] + _ORDER[: self.of_camera]).ravel()
         cov = rig.covariance(replace(prior, sigma=tuple(known)))[np.ix_(order, order)]
         free = estimated[:, : self.of_camera].ravel()
         self.cov: Float = np.zeros((self.calibrated.stop, self.calibrated.stop))

@@ -98,11 +98,7 @@ def update_from_landmarks(state: FilterState, tracks: FrameTracks, options: Msck
     if not len(state.landmark_ids):
         return 0
     state.slide_landmarks(options.landmark_drift_px)
-    rows = np.flatnonzero(np.isin(tracks.ids, state.landmark_ids))
-    order = np.argsort(state.landmark_ids)
-    landmarks = order[np.searchsorted(state.landmark_ids, tracks.ids[rows], sorter=order)]
-    by_landmark = np.lexsort((tracks.camera[rows], landmarks))
-    rows, landmarks = rows[by_landmark], landmarks[by_landmark]
+    landmarks, rows = np.nonzero(state.landmark_ids[:, None] == tracks.ids)
     cameras, newest = tracks.camera[rows], len(state.clones) - 1
     blocks, residual = landmark_blocks(
         state, newest, landmarks, cameras, tracks.xy[rows], options.first_estimate_jacobians
@@ -112,7 +108,7 @@ def update_from_landmarks(state: FilterState, tracks: FrameTracks, options: Msck
     if accepted.any():
         use = np.repeat(accepted, 2)
         state.update_by(HP[use], S[np.ix_(use, use)], residual[use])
-    state.keep_landmarks(np.isin(np.arange(len(state.landmark_ids)), landmarks[accepted]))
+    state.keep_landmarks(np.isin(state.landmark_ids, tracks.ids[rows[accepted]]))
     return int(accepted.sum())
 
 

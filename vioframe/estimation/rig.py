@@ -6,22 +6,23 @@ import numpy as np
 
 from vioframe.types import CalibrationEstimate, Float
 
-SIZE = 16
-"""Errors of a camera: rotation 3, position 3, time offset, readout, intrinsics 8, as :meth:`CameraSigma.stacked`."""
 # To this the cameras of a rig are known beside each other, rad, m and s: by what they saw together, while only motion
 # tells how all of them sit on the IMU. What the first one's standard deviations have beyond it is common to all.
 _BESIDE = np.repeat([0.002, 0.002, 0.001], [3, 3, 1])
 
 
 def covariance(prior: CalibrationEstimate) -> Float:
-    """(16 N, 16 N) of a rig's calibration. What is zero in the first camera's standard deviations is so in all."""
+    """(16 N, 16 N) of a rig's calibration, each camera's in the order of :meth:`CameraSigma.stacked`.
+
+    What is zero in the standard deviations of the first camera's pose and time offset is so in all.
+    """
     cameras, first = prior.calibration.cameras, prior.sigma[0].stacked()
     count, pose = len(cameras), slice(0, len(_BESIDE))
     if count == 1:
         return np.diag(first**2)
     own = np.stack([sigma.stacked() for sigma in prior.sigma])
     own[:, pose] = np.minimum(_BESIDE, first[pose])
-    common = np.zeros((count, SIZE, len(_BESIDE)))
+    common = np.zeros((count, len(first), len(_BESIDE)))
     for c, camera in enumerate(cameras):
         # A turn of the whole rig, in the axes of each camera, and one move and delay of all.
         common[c, 0:3, 0:3] = camera.R_BC.T @ cameras[0].R_BC

@@ -39,13 +39,16 @@ def body_rotation(imu: ImuSegment) -> Float:
 
 def predict(camera: Camera, xy: Float, xy_normalised: Float, R_C2C1: Float) -> Float:
     """(N, 2) px where infinitely far points go when the camera turns; those that leave the view stay at ``xy``."""
-    turned = rays(xy_normalised) @ R_C2C1.T
-    ahead = turned[:, 2] > 0.1
-    guess = xy.copy()
-    guess[ahead] = camera.project(turned[ahead])
-    seen = camera.contains(guess)
-    guess[~seen] = xy[~seen]
+    guess, in_view = projected(camera, rays(xy_normalised) @ R_C2C1.T)
+    guess[~in_view] = xy[~in_view]
     return guess
+
+
+def projected(camera: Camera, p_C: Float) -> tuple[Float, Mask]:
+    """(N, 2) px of points (N, 3), whose distance does not matter, and which of them are in the image (N,)."""
+    ahead = p_C[:, 2] > 0.1
+    xy = camera.project(np.where(ahead[:, None], p_C, [0.0, 0.0, 1.0]))
+    return xy, ahead & camera.contains(xy)
 
 
 def follow(before: Pyramid, after: Pyramid, xy: Float, guess: Float, tolerance_px: float) -> tuple[Float, Mask]:

@@ -8,10 +8,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from vioframe.frontend.flow import follow
-from vioframe.frontend.view import BORDER_PX, FORWARD_BACKWARD_PX, View
-from vioframe.geometry.cameras import Camera
-from vioframe.geometry.two_view import essential_matrix, rays, sampson_distance
+from vioframe.frontend.flow import follow, projected
+from vioframe.frontend.view import FORWARD_BACKWARD_PX, View
+from vioframe.geometry.two_view import essential_matrix, inverse_depths, rays, sampson_distance
 from vioframe.types import Bool, Calibration, CameraOnBody, Float, Int
 
 # Largest distance of a match from the epipolar geometry, px: the extrinsics are only known to so much.
@@ -42,11 +41,10 @@ class Pair:
         if self._images % _AGAIN_IMAGES == 0:
             self._not_found = self._not_found[:0]
         R_C2C1, p_C2C1 = between(calibration.cameras[self.first], calibration.cameras[self.second])
-        E, focal_px = essential_matrix(R_C2C1, p_C2C1), other.camera.focal_px
+        nearest = _EPIPOLAR_PX / other.camera.focal_px
         _, i, j = np.intersect1d(one.ids, other.ids, assume_unique=True, return_indices=True)
-        rho = inverse_depths(R_C2C1, p_C2C1, one.xy_normalised[i], other.xy_normalised[j])
-        wrong = ~_agree(E, focal_px, rho, one.xy_normalised[i], other.xy_normalised[j])
-        typical = float(np.median(rho[~wrong])) if not wrong.all() else 0.0
+        right, rho = _agreement(one.xy_normalised[i], other.xy_normalised[j], R_C2C1, p_C2C1, nearest)
+        wrong, typical = ~right, float(np.median(rho[right])) if right.any() else 0.0
         if self.first < self.second and wrong.any():  # of the two it is this one that lets go
             keep = np.ones(len(other.ids), bool)
             keep[j[wrong]] = False
@@ -54,15 +52,16 @@ class Pair:
             other.keep(keep)
 
         new = np.flatnonzero(~np.isin(one.ids, other.ids) & ~np.isin(one.ids, self._not_found))
-        guess, in_view = projected(one.xy_normalised[new], max(typical, 0.0), R_C2C1, p_C2C1, other.camera)
+        p_C2 = rays(one.xy_normalised[new]) @ R_C2C1.T + max(typical, 0.0) * p_C2C1
+        guess, in_view = projected(other.camera, p_C2)
         new, guess = new[in_view], guess[in_view]
         if not len(new):
             return
         xy, found = follow(one.pyramid, other.pyramid, one.xy[new], guess, FORWARD_BACKWARD_PX)
-        xy_normalised = other.camera.undistort(xy)
-        found &= other.camera.contains(xy, BORDER_PX) & np.isfinite(xy_normalised).all(axis=1)
-        here, there = one.xy_normalised[new], np.where(found[:, None], xy_normalised, 0.0)
-        found &= _agree(E, focal_px, inverse_depths(R_C2C1, p_C2C1, here, there), here, there)
+        xy_normalised, usable = other.undistorted(xy)
+        found &= usable
+        there = np.where(found[:, None], xy_normalised, 0.0)
+        found &= _agreement(one.xy_normalised[new], there, R_C2C1, p_C2C1, nearest)[0]
         other.add(one.ids[new[found]], xy[found], xy_normalised[found])
         self._not_found = np.append(self._not_found, one.ids[new[~found]])
 
@@ -78,28 +77,11 @@ def between(first: CameraOnBody, second: CameraOnBody) -> tuple[Float, Float]:
     return second.R_BC.T @ first.R_BC, second.R_BC.T @ (first.p_BC - second.p_BC)
 
 
-def inverse_depths(R_C2C1: Float, p_C2C1: Float, xy_1: Float, xy_2: Float) -> Float:
-    """(N,) 1/m in the first camera, of points seen at (N, 2) in both: where they are in the second, least squares."""
-    turned = rays(xy_1) @ R_C2C1.T
-    # x_2 (turned_z + rho p_z) = turned_xy + rho p_xy.
-    a = p_C2C1[:2] - xy_2 * p_C2C1[2]
-    b = xy_2 * turned[:, 2:] - turned[:, :2]
-    squared = (a * a).sum(axis=1)
-    return np.asarray((a * b).sum(axis=1) / np.maximum(squared, 1e-12))
-
-
-def projected(xy_1: Float, rho: float, R_C2C1: Float, p_C2C1: Float, camera: Camera) -> tuple[Float, Bool]:
-    """(N, 2) px in the second camera, at the inverse depth ``rho`` 1/m in the first; which are in its image (N,)."""
-    p_C2 = rays(xy_1) @ R_C2C1.T + rho * p_C2C1
-    ahead = p_C2[:, 2] > 0.1
-    p_C2[~ahead] = [0.0, 0.0, 1.0]
-    xy = camera.project(p_C2)
-    return xy, ahead & camera.contains(xy)
-
-
-def _agree(E: Float, focal_px: float, rho: Float, xy_1: Float, xy_2: Float) -> Bool:
-    near = np.abs(sampson_distance(E, xy_1, xy_2)) * focal_px < _EPIPOLAR_PX
-    return np.asarray(near & (rho > _FARTHEST) & (rho < _NEAREST))
+def _agreement(xy_1: Float, xy_2: Float, R_C2C1: Float, p_C2C1: Float, threshold: float) -> tuple[Bool, Float]:
+    """Which pairs (N, 2) may be of one point, as near to each other's epipolar lines; and inverse depths (N,) 1/m."""
+    rho = inverse_depths(xy_1, xy_2, R_C2C1, p_C2C1)
+    near = np.abs(sampson_distance(essential_matrix(R_C2C1, p_C2C1), xy_1, xy_2)) < threshold
+    return np.asarray(near & (rho > _FARTHEST) & (rho < _NEAREST)), rho
 
 
 def _overlap(calibration: Calibration, first: int, second: int) -> bool:
@@ -109,8 +91,6 @@ def _overlap(calibration: Calibration, first: int, second: int) -> bool:
     width, height = one.model.resolution
     grid = np.meshgrid(np.linspace(0.0, width - 1.0, _GRID), np.linspace(0.0, height - 1.0, _GRID))
     xy_normalised = one.model.undistort(np.column_stack([axis.ravel() for axis in grid]))
-    xy_normalised = xy_normalised[np.isfinite(xy_normalised).all(axis=1)]
-    return any(
-        projected(xy_normalised, 1.0 / distance, *between(one, other), other.model)[1].mean() > _LEAST_OVERLAP
-        for distance in _DISTANCES_M
-    )
+    R_C2C1, p_C2C1 = between(one, other)
+    turned = rays(xy_normalised[np.isfinite(xy_normalised).all(axis=1)]) @ R_C2C1.T
+    return any(projected(other.model, turned + p_C2C1 / m)[1].mean() > _LEAST_OVERLAP for m in _DISTANCES_M)

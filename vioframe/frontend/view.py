@@ -22,7 +22,7 @@ _FEATURELESS = 3.0
 # Turned by so much, a camera shows another image.
 _FROZEN_PX = 1.0
 # Points closer than this to the edge of the image are dropped: their patches reach beyond it.
-BORDER_PX = 5.0
+_BORDER_PX = 5.0
 # A point followed there and back must return to within this of where it was.
 FORWARD_BACKWARD_PX = 1.0
 # Candidates asked of the detector, as a multiple of the points wanted; most fall near live tracks.
@@ -35,7 +35,7 @@ class View:
     """``ids`` (N,), ``xy`` (N, 2) px and ``xy_normalised`` (N, 2) of the points in the newest image of ``camera``."""
 
     def __init__(self, detector: Detector, camera: Camera, options: FrontendOptions, incidents: Incidents) -> None:
-        self._candidates = CandidateSource(detector, camera, BORDER_PX, incidents)
+        self._candidates = CandidateSource(detector, camera, _BORDER_PX, incidents)
         self._options = options
         self._incidents = incidents
         self._image: Image | None = None
@@ -98,11 +98,15 @@ class View:
             min_distance_px=options.min_distance_px,
         )
         xy = candidates[taken]
-        xy_normalised = camera.undistort(xy)
-        usable = np.isfinite(xy_normalised).all(axis=1) & camera.contains(xy, BORDER_PX)
+        xy_normalised, usable = self.undistorted(xy)
         ids = next_id + np.arange(np.sum(usable))
         self.add(ids, xy[usable], xy_normalised[usable])
         return next_id + len(ids)
+
+    def undistorted(self, xy: Float) -> tuple[Float, Bool]:
+        """(N, 2) on the z = 1 plane of points (N, 2) px, and which can be followed (N,): they lie well in the image."""
+        xy_normalised = self.camera.undistort(xy)
+        return xy_normalised, np.isfinite(xy_normalised).all(axis=1) & self.camera.contains(xy, _BORDER_PX)
 
     def add(self, ids: Int, xy: Float, xy_normalised: Float) -> None:
         """Points (N,) that were found in the newest image."""
@@ -137,11 +141,9 @@ class View:
         if self._pyramid is None or not len(self.ids):
             return before
         guess = self.xy if R_C2C1 is None else predict(self.camera, self.xy, before, R_C2C1)
-        xy, found = follow(self._pyramid, pyramid, self.xy, guess, FORWARD_BACKWARD_PX)
-        found &= self.camera.contains(xy, BORDER_PX)
-        self.xy = xy
-        self.xy_normalised = self.camera.undistort(xy)
-        found &= np.isfinite(self.xy_normalised).all(axis=1)
+        self.xy, found = follow(self._pyramid, pyramid, self.xy, guess, FORWARD_BACKWARD_PX)
+        self.xy_normalised, usable = self.undistorted(self.xy)
+        found &= usable
         self.keep(found)
         return before[found]
 

@@ -40,6 +40,15 @@ def median_parallax(xy_1: Float, xy_2: Float, R_C1C2: Float) -> float:
     return float(np.median(np.linalg.norm(moved, axis=1)))
 
 
+def inverse_depths(xy_1: Float, xy_2: Float, R_C2C1: Float, p_C2C1: Float) -> Float:
+    """(N,) 1/m in the first view, by least squares on the z = 1 plane of the second; zero or less beyond infinity."""
+    turned = rays(xy_1) @ R_C2C1.T
+    # x_2 (turned_z + rho p_z) = turned_xy + rho p_xy.
+    a = p_C2C1[:2] - xy_2 * p_C2C1[2]
+    b = xy_2 * turned[:, 2:] - turned[:, :2]
+    return np.asarray((a * b).sum(axis=1) / np.maximum((a * a).sum(axis=1), 1e-12))
+
+
 def essential_matrix(R_C2C1: Float, p_C2C1: Float) -> Float:
     """E = [p]x R (9.12), (3, 3)."""
     E: Float = so3.hat(p_C2C1) @ R_C2C1
