@@ -76,7 +76,7 @@ class EurocDataset:
         file = self._mav0 / sensor / "data.csv"
         if not file.is_file():
             there = ", ".join(sorted(file.parent.name for file in self._mav0.glob("*/data.csv")))
-            choice = f"choose by -o cameras=NAME and -o imu=NAME among: {there}"
+            choice = f"choose by --cameras NAME and -o imu=NAME among: {there}"
             remedy = choice if there else "no sensor is there; copy it again"
             raise DatasetError(f"{file} is {'no ordinary file' if file.exists() else 'missing'}; {remedy}")
         return file

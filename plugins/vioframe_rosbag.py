@@ -129,7 +129,7 @@ class RosbagDataset:
     def _tell_choice(self, cameras: list[str], imus: list[str]) -> None:
         """Which topics are read, where there are others that nobody has decided against."""
         if others := [*cameras, *imus]:
-            hints = [f"-o cameras={topic}" for topic in cameras[:1]] + [f"-o imu_topic={topic}" for topic in imus[:1]]
+            hints = [f"--cameras {topic}" for topic in cameras[:1]] + [f"-o imu_topic={topic}" for topic in imus[:1]]
             _log.warning(
                 *("%s: %s and %s are read, %s left aside; to choose: %s", self._path.name, ", ".join(self._topics)),
                 *(self._imu_topic, ", ".join(others), " ".join(hints)),

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import re
+import shutil
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -178,7 +180,8 @@ def test_check_gives_all_of_it_as_json(in_g):
     tree = json.loads(done.stdout)
     assert done.exit_code == 1
     assert tree["wrong"]
-    assert tree["findings"][0]["kind"] == "accel_units"
+    assert (tree["findings"][0]["camera"], tree["findings"][0]["kind"]) == ("cam0", "accel_units")
+    assert "specific force 0.98" in tree["facts"]["cam0"]["IMU"]
     assert tree["findings"][0]["figures"]["usual_length"] == pytest.approx(1.0, abs=0.05)
 
 
@@ -190,6 +193,25 @@ def test_images_that_do_not_fit_the_calibration_are_a_finding_too(tmp_path):
     assert done.exit_code == 1
     assert "Images are 376x240, the calibration is for 752x480" in done.stdout
     assert "`intrinsics: [114.500, 114.500" in done.stdout
+
+
+def test_check_looks_at_the_cameras_asked_for_one_after_the_other(tmp_path):
+    """What the IMU does wrong is said once, and each camera is held against its own calibration."""
+    flight = rendered_flight().write(tmp_path / "flight", PLANTED["accel_units"]())
+    mav0 = flight / "mav0"
+    shutil.copytree(mav0 / "cam0", mav0 / "cam1")
+    calibration = mav0 / "cam1" / "sensor.yaml"
+    calibration.write_text(re.sub(r"timeshift_cam_imu: \S+", "timeshift_cam_imu: 0.06", calibration.read_text()))
+    settings = ("--json", "--duration", 6)
+    first, both = (
+        json.loads(vioframe_("check", flight, *settings, *more).stdout) for more in ((), ("--cameras", "cam1,cam0"))
+    )
+    assert (list(first["facts"]), first["cameras_left_aside"]) == (["cam0"], ["cam1"])
+    assert (list(both["facts"]), both["cameras_left_aside"]) == (["cam1", "cam0"], [])
+    found = [(each["camera"], each["kind"]) for each in both["findings"]]
+    assert [kind for _, kind in found].count("accel_units") == 1
+    assert ("cam1", "time_offset") in found
+    assert "time_offset" not in [each["kind"] for each in first["findings"]]
 
 
 def test_check_puts_a_plug_in_through_the_conformance_kit():

@@ -336,7 +336,11 @@ def test_cameras_left_aside_are_named(toy):
     )
     Path("site/toy_parts.py").write_text("from vioframe.parts.hooks import hookimpl\n" + pair)
     shown = run_toy(toy).stdout
-    assert "camera cam0 is used, cam1 left aside; -o cameras=cam1 takes another" in shown
+    assert "camera cam0 is used, cam1 left aside; --cameras cam1 takes another" in shown
+    for key, value in (("--cameras", "cam0"), ("-o", "cameras=[cam0]")):
+        assert "left aside" not in run_toy(toy, key, value, "--out", f"runs/{key}").stdout
+        said = YAML(typ="safe").load(Path(f"runs/{key}/config.yaml"))
+        assert said["dataset"]["options"]["cameras"] == ["cam0"]
 
 
 def test_plugins_lists_what_is_there_and_what_failed(toy, tmp_path, monkeypatch):

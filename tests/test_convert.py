@@ -292,10 +292,42 @@ def test_command_line_with_several_cameras(tmp_path: Path) -> None:
     assert result.exit_code == 0, result.output
     assert "ASL folder, as EuRoC's, 8 frames of 2 cameras, 71 IMU samples, 40 true poses" in result.output
     assert_equal(read(tmp_path / "both").measurements(), pair_measurements())
-    for option, name in (("cameras=[cam0,cam1]", "listed"), ("cameras=cam1", "second")):
-        assert run(tmp_path / "flight.bag", tmp_path / name, "-o", option).exit_code == 0
-    assert visible(tmp_path / "listed" / "mav0") == {"cam0", "cam1", "imu0", "state_groundtruth_estimate0"}
-    assert visible(tmp_path / "second" / "mav0") == {"cam1", "imu0", "state_groundtruth_estimate0"}
+    both = {"cam0", "cam1", "imu0", "state_groundtruth_estimate0"}
+    for name, option, value, expected in (
+        ("listed", "-o", "cameras=[cam0,cam1]", both),
+        ("one", "-o", "cameras=cam1", both - {"cam0"}),
+        ("named", "--cameras", "cam1,cam0", both),
+        ("topics", "--cameras", "cam0:/cam0/image_raw,cam1", both),
+        ("second", "--cameras", "cam1", both - {"cam0"}),
+    ):
+        assert run(tmp_path / "flight.bag", tmp_path / name, option, value).exit_code == 0
+        assert visible(tmp_path / name / "mav0") == expected
+
+
+@pytest.mark.parametrize("source", ["flight.bag", "flight"])
+@pytest.mark.parametrize("command", ["run", "check", "convert"])
+def test_a_camera_that_is_not_there_is_one_line_with_those_that_are(tmp_path: Path, source: str, command: str) -> None:
+    convert(pair_measurements(), PAIR, tmp_path / source)
+    more = [tmp_path / "copy"] if command == "convert" else []
+    for wanted, problem in (("cam0,cam9", "cam9"), ("cam0,,cam1", "cam0,cam1, each once"), ("cam1,cam1", "each once")):
+        words = [command, tmp_path / source, *more, "--cameras", wanted, "--quiet"]
+        result = CliRunner().invoke(main, [str(word) for word in words])
+        assert result.exit_code == 2
+        line = next(line for line in result.output.splitlines() if "rror" in line)
+        assert problem in line
+        assert "cam0" in line
+        assert "cam1" in line
+        assert "Traceback" not in result.output
+    assert visible(tmp_path) <= {source, f"{source}.calib"}
+
+
+@pytest.mark.parametrize(("begun", "found"), [("", ["cam0", "cam1"]), ("cam1,", ["cam1,cam0"]), ("x", [])])
+def test_the_shell_completes_the_cameras_of_the_recording(tmp_path: Path, begun: str, found: list[str]) -> None:
+    convert(pair_measurements(), PAIR, tmp_path / "flight")
+    words = f"vioframe run {tmp_path / 'flight'} --cameras {begun}"
+    asked = {"COMP_WORDS": words, "COMP_CWORD": "4", "_VIOFRAME_COMPLETE": "bash_complete"}
+    result = CliRunner().invoke(main, env=asked, prog_name="vioframe")
+    assert [line.partition(",")[2] for line in result.output.split()] == found
 
 
 def test_a_real_recording(shared_data: Path, tmp_path: Path) -> None:

@@ -126,7 +126,7 @@ def test_two_cameras_are_refused_in_one_line():
     pair = replace(CALIBRATION, cameras=(camera, replace(camera, name="cam1")))
     with pytest.raises(ConfigError) as refused:
         LifeCycle(Scripted(), pair)
-    assert "the calibration has cam0, cam1; choose one, as by -o cameras=cam0" in str(refused.value)
+    assert "the calibration has cam0, cam1; choose one, as by --cameras cam0" in str(refused.value)
     assert "\n" not in str(refused.value)
 
 

@@ -274,7 +274,7 @@ def test_two_cameras_are_refused_in_one_line_by_who_takes_one(backend):
     with pytest.raises(ConfigError) as refused:
         Odometry(pair, backend=backend, installed=INSTALLED)
     assert f"backend '{backend}'" in str(refused.value)
-    assert "the calibration has cam0, cam1; choose one, as by -o cameras=cam0" in str(refused.value)
+    assert "the calibration has cam0, cam1; choose one, as by --cameras cam0" in str(refused.value)
     assert "\n" not in str(refused.value)
 
 

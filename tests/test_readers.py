@@ -604,7 +604,7 @@ class TestCalibrationOfABag:
         RosbagDataset(path)
         assert [record.getMessage() for record in caplog.records] == [
             "test.bag: /cam0/image_raw and /imu0 are read, /thermal/image, /imu1 left aside; to choose: "
-            "-o cameras=/thermal/image -o imu_topic=/imu1"
+            "--cameras /thermal/image -o imu_topic=/imu1"
         ]
 
     def test_a_bare_sqlite_file_has_the_calibration_beside_its_folder(self, tmp_path: Path) -> None:

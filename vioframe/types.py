@@ -213,7 +213,7 @@ class Calibration:
         """The only camera; raises :class:`ConfigError` naming ``user``, who takes one, where there are more."""
         if len(self.cameras) > 1:
             names = ", ".join(camera.name for camera in self.cameras)
-            choice = f"choose one, as by -o cameras={self.cameras[0].name}"
+            choice = f"choose one, as by --cameras {self.cameras[0].name}"
             raise ConfigError(f"{user} takes one camera, the calibration has {names}; {choice}")
         return self.cameras[0]
 

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator
-from dataclasses import asdict
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,7 @@ from rich.table import Table
 from rich.text import Text
 
 from vioframe.cli import EXIT_FAILED
-from vioframe.cli.common import FILE, Bar, PartName, calibration_option, print_table
+from vioframe.cli.common import FILE, Bar, PartName, calibration_option, cameras_option, print_table
 from vioframe.diagnosis import Certainty, Diagnosis, Finding, Severity, diagnose, gather
 from vioframe.diagnosis.images import wrong_size
 from vioframe.errors import ConfigError, DatasetError, ImageSizeError
@@ -33,7 +33,7 @@ _COLOURS = {Severity.WRONG: "bold red", Severity.WORTH_KNOWING: "yellow"}
 @click.argument("target", metavar="DATA|NAME")
 @calibration_option
 @click.option("--reader", type=PartName("DATASET"), help="Data-set reader, where several accept DATA.")
-@click.option("--camera", metavar="NAME", help="Camera to look at.  [default: the first]")
+@cameras_option("target", "look at", "the first")
 @click.option("--start", "start_s", type=float, default=0.0, metavar="S", help="Skip the first S seconds.")
 @click.option("--duration", "duration_s", type=float, metavar="S", help="Stop after S seconds.")
 @click.option("--data", type=FILE, help="For a reader: a recording to try it on.")
@@ -65,31 +65,43 @@ def _check_recording(
     quiet: bool,
     calibration: tuple[Path, ...],
     reader: str | None,
-    camera: str | None,
+    cameras: list[str] | None,
     start_s: float,
     duration_s: float | None,
 ) -> bool:
     part = installed.find_reader(path, reader)
     options: dict[str, Any] = {"calibration": list(calibration)} if calibration else {}
+    looked: dict[str, Diagnosis] = {}
+    aside: list[str] = []
     try:
         dataset = installed.open_dataset(path, part.name, options)
-        aside = [other.name for other in dataset.calibration.cameras]
-        chosen = camera or aside[0]
-        if camera or (len(aside) > 1 and any(option.name == "cameras" for option in part.options)):
-            dataset = installed.open_dataset(path, part.name, {**options, "cameras": [chosen]})
-        aside.remove(dataset.calibration.cameras[0].name)
-        with Bar(dataset.frame_count, quiet=quiet, late=True) as bar, limited_threads(), installed.blaming():
-            found = diagnose(gather(_watched(dataset, start_s, duration_s, bar), dataset.calibration))
+        rig = [camera.name for camera in dataset.calibration.cameras]
+        for chosen in cameras or rig[:1]:
+            if cameras or (len(rig) > 1 and any(option.name == "cameras" for option in part.options)):
+                dataset = installed.open_dataset(path, part.name, {**options, "cameras": [chosen]})
+            with Bar(dataset.frame_count, quiet=quiet, late=True) as bar, limited_threads(), installed.blaming():
+                found = diagnose(gather(_watched(dataset, start_s, duration_s, bar), dataset.calibration))
+            looked[dataset.calibration.cameras[0].name] = _without_what_was_said(found, looked.values())
+        aside = [name for name in rig if name not in looked]
     except ImageSizeError as error:
         # Some readers look at an image as they open a recording.
-        found, aside = Diagnosis((wrong_size(error),), {}), []
+        looked[", ".join(cameras or ())] = Diagnosis((wrong_size(error),), {})
+    wrong = any(found.wrong for found in looked.values())
     if as_json:
-        findings = [asdict(finding) for finding in found.findings]
-        tree = {"data": str(path), "reader": part.name, "wrong": bool(found.wrong), "facts": found.facts}
+        findings = [{"camera": name, **asdict(each)} for name, found in looked.items() for each in found.findings]
+        facts = {name: found.facts for name, found in looked.items()}
+        tree = {"data": str(path), "reader": part.name, "wrong": wrong, "facts": facts}
         click.echo(json.dumps({**tree, "cameras_left_aside": aside, "findings": findings}, indent=2))
     else:
-        _show(path, part, found, aside)
-    return bool(found.wrong)
+        for found in looked.values():
+            _show(path, part, found, aside)
+    return wrong
+
+
+def _without_what_was_said(found: Diagnosis, before: Iterable[Diagnosis]) -> Diagnosis:
+    """What is wrong with the IMU is found again with each camera, and said once."""
+    said = [finding for other in before for finding in other.findings]
+    return replace(found, findings=tuple(finding for finding in found.findings if finding not in said))
 
 
 def _watched(dataset: Dataset, start_s: float, duration_s: float | None, bar: Bar) -> Iterator[Measurement]:
@@ -108,7 +120,7 @@ def _show(path: Path, part: Part, found: Diagnosis, aside: list[str]) -> None:
     for name, fact in found.facts.items():
         facts.add_row(name, Text(fact))
     if aside:
-        facts.add_row("left aside", Text(f"{', '.join(aside)}; look at one with --camera NAME"))
+        facts.add_row("left aside", Text(f"{', '.join(aside)}; look at them with --cameras {','.join(aside)}"))
     console.print(Text(f"{path} (reader {part.name})", style="bold"))
     console.print(facts) if console.is_terminal else print_table(facts)
     if not found.findings:

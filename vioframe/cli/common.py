@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING, Any, Self, TypeVar
 
 import click
 from click.shell_completion import CompletionItem
@@ -22,8 +22,12 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
+from vioframe.errors import VioframeError
+
 if TYPE_CHECKING:
     from rich.table import Table
+
+_Command = TypeVar("_Command", bound=Callable[..., Any])
 
 FILE = click.Path(path_type=Path)
 
@@ -46,6 +50,50 @@ class PartName(click.types.StringParamType):
         asked = [getattr(registry, kind) for kind in self._kinds] or registry.KINDS
         known = sorted({name for kind in asked for name in installed.names(kind)})
         return [CompletionItem(name) for name in known if name.startswith(incomplete)]
+
+
+class _CameraNames(click.types.StringParamType):
+    """``cam0,cam1``; the shell completes the cameras of the recording that the argument ``recording`` names."""
+
+    name = "cameras"
+
+    def __init__(self, recording: str) -> None:
+        self._recording = recording
+
+    def shell_complete(self, ctx: click.Context, param: click.Parameter, incomplete: str) -> list[CompletionItem]:
+        from vioframe.parts import registry
+
+        # While the option has no value yet, click leaves arguments unnamed; the recording is the first of any command.
+        path = ctx.params.get(self._recording) or next(iter(ctx.args), None)
+        if path is None:
+            return []
+        logging.getLogger("vioframe").addHandler(logging.NullHandler())
+        options = {"calibration": list(given)} if (given := ctx.params.get("calibration")) else {}
+        try:
+            rig = registry.load().open_dataset(Path(path), ctx.params.get("reader"), options).calibration
+        except VioframeError:  # what is wrong with it is for the command itself to say
+            return []
+        before, comma, begun = incomplete.rpartition(",")
+        free = (camera.name for camera in rig.cameras if camera.name not in before.split(","))
+        return [CompletionItem(before + comma + name) for name in free if name.startswith(begun)]
+
+
+def _each_once(context: click.Context, parameter: click.Parameter, names: str | None) -> list[str] | None:
+    chosen = None if names is None else names.split(",")
+    if chosen is not None and (not all(chosen) or len(set(chosen)) < len(chosen)):
+        raise click.BadParameter(f"expected names such as cam0,cam1, each once, got {names!r}", context, parameter)
+    return chosen
+
+
+def cameras_option(recording: str, use: str, default: str) -> Callable[[_Command], _Command]:
+    """``--cameras`` of a command whose argument ``recording`` names what is read; ``use`` says what cameras are for."""
+    return click.option(
+        "--cameras",
+        type=_CameraNames(recording),
+        callback=_each_once,
+        metavar="NAME,...",
+        help=f"Cameras to {use}, in this order.  [default: {default}]",
+    )
 
 
 def _without_other_folders(context: click.Context, parameter: click.Parameter, paths: tuple[Path, ...]) -> list[Path]:

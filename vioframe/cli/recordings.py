@@ -10,7 +10,7 @@ from typing import Any
 
 import click
 
-from vioframe.cli.common import FILE, Bar, PartName, calibration_option, print_notes, quiet_option
+from vioframe.cli.common import FILE, Bar, PartName, calibration_option, cameras_option, print_notes, quiet_option
 from vioframe.cores import usable_cores
 from vioframe.errors import DatasetError
 from vioframe.io.convert import FORMATS, format_of
@@ -159,6 +159,7 @@ def _list_simulations(installed: registry.Registry) -> None:
 )
 @click.option("-o", "--option", "options", metavar="KEY=VALUE", multiple=True, help="Set an option of the reader.")
 @calibration_option
+@cameras_option("source", "write", "all")
 @click.option("--reader", type=PartName("DATASET"), help="Data-set reader, where several accept SRC.")
 @quiet_option
 def convert(
@@ -168,6 +169,7 @@ def convert(
     compression: str | None,
     options: tuple[str, ...],
     calibration: tuple[Path, ...],
+    cameras: list[str] | None,
     reader: str | None,
     quiet: bool,
 ) -> None:
@@ -179,8 +181,8 @@ def convert(
                            NAME.mcap   MCAP file
                            NAME        ASL folder, as EuRoC's
 
-    Every camera is written (or those of `-o cameras=[cam0,cam1]`), the IMU, and the ground truth that SRC itself
-    brings; the calibration goes to the folder DST.calib, or into the ASL folder.
+    Every camera is written (or those of `--cameras`), the IMU, and the ground truth that SRC itself brings; the
+    calibration goes to the folder DST.calib, or into the ASL folder.
     """
     format = format or format_of(destination)
     installed = registry.load()
@@ -188,6 +190,8 @@ def convert(
     chosen = {name: value for _, name, value in parse_assignments(options, {part.name: part.options})}
     if calibration:
         chosen["calibration"] = list(calibration)
+    if cameras:
+        chosen["cameras"] = cameras
     dataset = installed.open_dataset(source, part.name, chosen)
     with Bar(dataset.frame_count, dataset.name, quiet=quiet, late=True) as bar:
 
@@ -204,8 +208,8 @@ def convert(
         print_notes([f"left out: {done.unreadable} frames or samples of {source} that could not be read"])
     if quiet:
         return
-    cameras = len(dataset.calibration.cameras)
-    of_cameras = f" of {cameras} cameras" if cameras > 1 else ""
+    count = len(dataset.calibration.cameras)
+    of_cameras = f" of {count} cameras" if count > 1 else ""
     click.echo(
         f"{destination}: {FORMATS[format].description}, {done.frames} frames{of_cameras}, "
         f"{done.imu_samples} IMU samples, {done.true_poses or 'no'} true poses"

@@ -10,7 +10,7 @@ from typing import Any
 import click
 
 from vioframe.cli import EXIT_FAILED
-from vioframe.cli.common import FILE, Bar, PartName, calibration_option, print_notes, quiet_option
+from vioframe.cli.common import FILE, Bar, PartName, calibration_option, cameras_option, print_notes, quiet_option
 from vioframe.cores import usable_cores
 from vioframe.diagnosis import Severity
 from vioframe.errors import DatasetError, TrajectoryError
@@ -42,6 +42,7 @@ _MOST_REASONS = 4
 @click.option("--config", "file", type=FILE, help="Configuration file; the other options override it.")
 @click.option("--ground-truth", type=FILE, help="Trajectory to compare with: TUM or EuRoC csv.")
 @calibration_option
+@cameras_option("data", "estimate from", "the first")
 @click.option("--reader", type=PartName("DATASET"), help="Data-set reader, where several accept DATA.")
 @click.option("--start", "start_s", type=float, metavar="S", help="Skip the first S seconds.")
 @click.option("--duration", "duration_s", type=float, metavar="S", help="Stop after S seconds.")
@@ -81,7 +82,7 @@ def run(threads: int | None, out: Path | None, overwrite: bool, quiet: bool, **c
     if not quiet:
         if others := experiment.left_aside:
             used = experiment.dataset.calibration.cameras[0].name
-            click.echo(f"camera {used} is used, {', '.join(others)} left aside; -o cameras={others[0]} takes another")
+            click.echo(f"camera {used} is used, {', '.join(others)} left aside; --cameras {others[0]} takes another")
         _report(folder, summary)
     if summary["initialised_t_ns"] is None:
         click.echo(f"vioframe: {summary['name']} never initialised; {_likeliest_cause(summary)}", err=True)
@@ -98,6 +99,8 @@ def _configure(
             tree[section] = {"name": name}  # the options in the file are those of another part
     if chosen["calibration"]:
         tree["dataset"]["options"]["calibration"] = list(chosen["calibration"])
+    if chosen["cameras"]:
+        tree["dataset"]["options"]["cameras"] = chosen["cameras"]
     tree["dataset"] |= {
         key: value for key, value in (("path", data), ("reader", chosen["reader"])) if value is not None
     }
