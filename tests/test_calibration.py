@@ -1,7 +1,11 @@
 """Calibration files: cameras and IMU written in every format read back as the same rig."""
 
+import json
+import re
+from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from recordings import assert_same_rig
@@ -258,6 +262,276 @@ def test_an_unknown_camera_is_an_error_unless_there_is_no_choice(tmp_path: Path)
         load_calibration(tmp_path, cameras=["cam1", "/right/image"])
 
 
+T_BC1 = np.block([[so3.exp([0.2, 0.1, -0.4]), np.array([[0.1], [0.2], [-0.3]])], [np.zeros((1, 3)), np.ones((1, 1))]])
+
+VINS_FUSION = f"""
+imu: 1
+num_of_cam: 2
+imu_topic: "/imu0"
+image0_topic: "/left/image"
+image1_topic: "/right/image"
+cam0_calib: "left.yaml"
+cam1_calib: "lenses/right.yaml"
+image_width: 752
+image_height: 480
+estimate_extrinsic: 1   # 1: a first guess
+body_T_cam0: {opencv_matrix(T_BC)}
+body_T_cam1: {opencv_matrix(T_BC1)}
+acc_n: 0.08
+gyr_n: 0.004
+acc_w: 4.0e-05
+gyr_w: 2.0e-6
+td: 0.00525
+"""
+
+
+# A pinhole with the numbers of CAMERA, and a fisheye.
+LEFT_LENS = VINS_MONO[VINS_MONO.index("model_type") : VINS_MONO.index("estimate_extrinsic")]
+RIGHT_LENS = """
+model_type: KANNALA_BRANDT
+image_width: 640
+image_height: 400
+projection_parameters: {k2: 0.1, k3: -0.02, k4: 0.003, k5: -0.0004, mu: 300., mv: 301., u0: 320., v0: 200.}
+"""
+
+
+def vins_fusion(folder: Path, header: str = "", main: str = VINS_FUSION) -> Path:
+    """The main file, with its two lenses beside and below it."""
+    (folder / "left.yaml").write_text(header + LEFT_LENS)
+    (folder / "lenses").mkdir()
+    (folder / "lenses" / "right.yaml").write_text(header + RIGHT_LENS)
+    (folder / "stereo_imu.yaml").write_text(header + main)
+    return folder / "stereo_imu.yaml"
+
+
+@HEADERS
+def test_vins_fusion(tmp_path: Path, header: str) -> None:
+    main = vins_fusion(tmp_path, header)
+    scale = 200.0**-0.5
+    noise = ImuNoise(0.004 * scale, 0.08 * scale, 2e-6 * scale, 4e-5 * scale, 200.0)
+    fisheye = Camera(300.0, 301.0, 320.0, 200.0, (0.1, -0.02, 0.003, -0.0004), (640, 400), "equidistant")
+    for given in (main, tmp_path):
+        calibration = load_calibration(given)
+        assert_equal(calibration.only(0), noise=noise)
+        (_, second) = calibration.cameras
+        assert (second.name, second.model, second.time_offset_ns) == ("cam1", fisheye, OFFSET_NS)
+        np.testing.assert_allclose(second.R_BC, T_BC1[:3, :3], rtol=0.0, atol=1e-14)
+        np.testing.assert_allclose(second.p_BC, T_BC1[:3, 3], rtol=0.0, atol=1e-14)
+    assert [camera.name for camera in load_calibration(main, cameras=["/right/image"]).cameras] == ["cam1"]
+    main.write_text(header + VINS_FUSION.replace("num_of_cam: 2", "num_of_cam: 1"))
+    assert_equal(load_calibration(main), noise=noise)
+    main.write_text(header + VINS_FUSION.replace("estimate_extrinsic: 1", "estimate_extrinsic: 2"))
+    assert [camera.rotation_known for camera in load_calibration(main).cameras] == [False, False]
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ('cam1_calib: "lenses/right.yaml"', "", "'cam1_calib' is missing"),
+        ("lenses/right.yaml", "right.yaml", "cannot read the calibration"),
+        ("body_T_cam1", "T_cam1", "'body_T_cam1' is missing"),
+        ("num_of_cam: 2", "num_of_cam: 3", "'num_of_cam' should be 1 or 2, not 3"),
+        ("gyr_n: 0.004", "", "'gyr_n' is missing"),
+    ],
+)
+def test_mistakes_in_vins_fusions_files_are_named(tmp_path: Path, old: str, new: str, message: str) -> None:
+    assert old in VINS_FUSION
+    main = vins_fusion(tmp_path, main=VINS_FUSION.replace(old, new))
+    with pytest.raises(CalibrationError) as caught:
+        load_calibration(main)
+    assert message in str(caught.value)
+    with pytest.raises(CalibrationError, match="the main file of VINS-Fusion"):
+        load_calibration(tmp_path / "left.yaml")
+
+
+def basalt(**changes: object) -> dict[str, object]:
+    """Two cameras in Basalt's format, the first with the pose of ``T_BC``."""
+
+    def pose(T: np.ndarray) -> dict[str, float]:
+        # Independent of the reader: Shepperd's formula where the trace is positive.
+        R, w = T[:3, :3], 0.5 * np.sqrt(1.0 + np.trace(T[:3, :3]))
+        x, y, z = (R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]) / (4.0 * w)
+        return dict(zip(("px", "py", "pz", "qx", "qy", "qz", "qw"), (*T[:3, 3], x, y, z, w), strict=True))
+
+    lens = {"fx": 190.5, "fy": 191.25, "cx": 254.5, "cy": 256.5, "k1": 0.0034, "k2": 7e-4, "k3": -2e-3, "k4": 1e-05}
+    told = {
+        "T_imu_cam": [pose(T_BC), pose(T_BC1)],
+        "intrinsics": [{"camera_type": "kb4", "intrinsics": lens}] * 2,
+        "resolution": [[512, 512], [640, 480]],
+        "vignette": [],
+        "calib_accel_bias": [0.1, -0.2, 0.3] + 6 * [0.0],
+        "calib_gyro_bias": 12 * [0.0],
+        "imu_update_rate": 200.0,
+        "accel_noise_std": [0.0028, 0.0028, 0.0028],
+        "gyro_noise_std": [1.6e-4, 1.5e-4, 1.6e-4],
+        "accel_bias_std": [8.6e-4, 8.6e-4, 8.6e-4],
+        "gyro_bias_std": [2.2e-05, 2.2e-05, 2.2e-05],
+        "cam_time_offset_ns": OFFSET_NS,
+    }
+    return told | changes
+
+
+def write_basalt(folder: Path, **changes: object) -> Path:
+    file = folder / "calibration.json"
+    file.write_text(json.dumps({"value0": basalt(**changes)}, indent=4))
+    return file
+
+
+def test_basalt(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    file = write_basalt(tmp_path)
+    model = Camera(190.5, 191.25, 254.5, 256.5, (0.0034, 7e-4, -2e-3, 1e-5), (512, 512), "equidistant")
+    for given in (file, tmp_path):
+        calibration = load_calibration(given)
+        assert [camera.name for camera in calibration.cameras] == ["cam0", "cam1"]
+        assert calibration.lenses == (model, replace(model, resolution=(640, 480)))
+        assert [camera.time_offset_ns for camera in calibration.cameras] == [OFFSET_NS, OFFSET_NS]
+        for camera, T in zip(calibration.cameras, (T_BC, T_BC1), strict=True):
+            np.testing.assert_allclose(camera.R_BC, T[:3, :3], rtol=0.0, atol=1e-12)
+            np.testing.assert_allclose(camera.p_BC, T[:3, 3], rtol=0.0, atol=1e-14)
+        assert calibration.imu == ImuNoise(1.6e-4, 0.0028, 2.2e-5, 8.6e-4, 200.0)
+    assert not caplog.records
+    write_basalt(tmp_path, calib_gyro_bias=[0.0, 0.0, 0.0, 0.01, *(8 * [0.0])], accel_noise_std=0.0028)
+    assert load_calibration(file).imu.accel_density == 0.0028
+    assert [record.args[1] for record in caplog.records] == ["calib_gyro_bias"]
+
+
+def rays(most_deg: float) -> np.ndarray:
+    """(N, 3) points all round the axis, up to ``most_deg`` from it."""
+    angle, around = np.meshgrid(np.deg2rad(np.linspace(0.0, most_deg, 60)), np.linspace(0.0, 6.2, 24))
+    columns = np.sin(angle) * np.cos(around), np.sin(angle) * np.sin(around), np.cos(angle)
+    return 3.0 * np.column_stack([column.ravel() for column in columns])
+
+
+def test_basalts_kannala_brandt_is_opencvs_fisheye(tmp_path: Path) -> None:
+    model = load_calibration(write_basalt(tmp_path)).cameras[0].model
+    K, k = np.array([[190.5, 0.0, 254.5], [0.0, 191.25, 256.5], [0.0, 0.0, 1.0]]), np.array([0.0034, 7e-4, -2e-3, 1e-5])
+    p_C = rays(80.0)
+    expected, _ = cv2.fisheye.projectPoints(p_C[:, None], np.zeros(3), np.zeros(3), K, k)
+    np.testing.assert_allclose(model.project(p_C), expected[:, 0], rtol=0.0, atol=1e-9)
+
+
+def double_sphere(p_C: np.ndarray, *, xi: float, alpha: float) -> np.ndarray:
+    """Usenko, Demmel, Cremers 2018, equations 40 to 43, of fx = fy = 1."""
+    x, y, z = p_C.T
+    d1 = np.sqrt(x * x + y * y + z * z)
+    d2 = np.sqrt(x * x + y * y + (xi * d1 + z) ** 2)
+    return p_C[:, :2] / (alpha * d2 + (1.0 - alpha) * (xi * d1 + z))[:, None]
+
+
+def extended_unified(p_C: np.ndarray, *, alpha: float, beta: float = 1.0) -> np.ndarray:
+    """Khomutenko, Garcia, Martinet 2016."""
+    x, y, z = p_C.T
+    d = np.sqrt(beta * (x * x + y * y) + z * z)
+    return p_C[:, :2] / (alpha * d + (1.0 - alpha) * z)[:, None]
+
+
+# fx, the model's own numbers, how far out the image goes: a lens of 195 degrees, EuRoC's, a long one, a pinhole.
+@pytest.mark.parametrize(
+    ("kind", "focal", "own", "most_deg"),
+    [
+        ("ds", 158.0, {"xi": -0.172, "alpha": 0.593}, 89.5),
+        ("ds", 350.0, {"xi": -0.237, "alpha": 0.566}, 45.0),
+        ("ds", 900.0, {"xi": 0.1, "alpha": 0.3}, 15.0),
+        ("eucm", 460.0, {"alpha": 0.59, "beta": 1.13}, 40.0),
+        ("ucm", 190.0, {"alpha": 0.65}, 70.0),
+        ("ds", 420.0, {"xi": 0.0, "alpha": 0.0}, 35.0),
+    ],
+)
+@pytest.mark.parametrize("format", ["basalt", "kalibr"])
+def test_lenses_of_other_models_are_told_to_a_hundredth_of_a_pixel(
+    tmp_path: Path, format: str, kind: str, focal: float, own: dict[str, float], most_deg: float
+) -> None:
+    p_C = rays(most_deg)
+    project = double_sphere if kind == "ds" else extended_unified
+    f, c = np.array([focal, 1.01 * focal]), np.array([255.0, 257.0])
+    expected = project(p_C, **own) * f + c
+    if format == "basalt":
+        told = {"fx": f[0], "fy": f[1], "cx": c[0], "cy": c[1], **own}
+        file = write_basalt(tmp_path, intrinsics=[{"camera_type": kind, "intrinsics": told}] * 2)
+        camera = load_calibration(file).cameras[0].model
+    else:
+        # The unified model is Kalibr's eucm with beta = 1.
+        model, numbers = ("ds", [*own.values()]) if kind == "ds" else ("eucm", [own["alpha"], own.get("beta", 1.0)])
+        text = kalibr_camera(f"T_imu_cam: {rows(T_BC)}", model="none").replace("pinhole", model)
+        text = re.sub(r"intrinsics: .*", f"intrinsics: {[*numbers, *f.tolist(), *c.tolist()]}", text)
+        text = re.sub(r"resolution: .*", "resolution: [512, 512]", re.sub(r"distortion_coeffs: .*", "", text))
+        (tmp_path / "chain.yaml").write_text("cam0:" + text)
+        (tmp_path / "imu.yaml").write_text(KALIBR_IMU)
+        camera = load_calibration(tmp_path).cameras[0].model
+    within = camera.contains(expected)
+    assert within.sum() > 300
+    np.testing.assert_allclose(camera.project(p_C[within]), expected[within], rtol=0.0, atol=0.02)
+    # And back: what lies beyond 90 degrees has no point with z = 1.
+    back = camera.undistort(expected[within])
+    np.testing.assert_allclose(back, p_C[within, :2] / p_C[within, 2:], rtol=2e-3, atol=1e-4)
+
+
+def test_rays_beyond_90_degrees_are_none(tmp_path: Path) -> None:
+    own = {"xi": -0.172, "alpha": 0.593}
+    told = {"fx": 158.0, "fy": 158.0, "cx": 255.0, "cy": 257.0, **own}
+    camera = load_calibration(write_basalt(tmp_path, intrinsics=[{"camera_type": "ds", "intrinsics": told}] * 2))
+    beyond = rays(97.0)
+    beyond = beyond[beyond[:, 2] < -0.05]
+    pixels = 158.0 * double_sphere(beyond, **own) + [255.0, 257.0]
+    assert np.isnan(camera.lenses[0].undistort(pixels)).all()
+
+
+def lenses_of(kind: str, keys: str, *values: float) -> dict[str, object]:
+    """Both cameras with the same lens, in Basalt's format."""
+    numbers = dict(zip(keys.split(), values, strict=True))
+    return {"intrinsics": [{"camera_type": kind, "intrinsics": numbers}] * 2}
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        (lenses_of("kb4", "fx", 1.0), "[cam0]: 'fy' is missing"),
+        (lenses_of("fov", "fx", 1.0), "'camera_type' should be 'pinhole', "),
+        ({"resolution": [[512, 512]]}, "should be of as many cameras"),
+        ({"T_imu_cam": [dict.fromkeys(("px", "py", "pz", "qx", "qy", "qz", "qw"), 0.0)] * 2}, "their norm is not 1"),
+        ({"gyro_noise_std": [0.0, 0.0, 0.0]}, "'gyro_noise_std' should be greater than 0"),
+        ({"imu_update_rate": None}, "'imu_update_rate' should be a valid number"),
+        (
+            lenses_of("ds", "fx fy cx cy xi alpha", 9, 9, 9, 9, -5.0, 0.5),
+            "calibrate again with Basalt's 'kb4' or Kalibr's 'pinhole-equi'",
+        ),
+        (
+            lenses_of("pinhole-radtan8", "fx fy cx cy k1 k2 p1 p2 k4", 9, 9, 9, 9, 0, 0, 0, 0, 0.1),
+            "no k3 to k6; calibrate again with 'kb4'",
+        ),
+    ],
+)
+def test_mistakes_in_basalts_file_are_named(tmp_path: Path, changes: dict[str, object], message: str) -> None:
+    with pytest.raises(CalibrationError) as caught:
+        load_calibration(write_basalt(tmp_path, **changes))
+    assert message in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_basalts_pinholes(tmp_path: Path) -> None:
+    keys, numbers = "fx fy cx cy k1 k2 p1 p2 k3 k4 k5 k6", (458.5, 457.25, 367.0, 248.5, *CAMERA.distortion, 0, 0, 0, 0)
+    kinds = [
+        {"camera_type": kind, "intrinsics": dict(zip(keys.split()[:count], numbers, strict=False))}
+        for kind, count in (("pinhole-radtan8", 12), ("pinhole", 4))
+    ]
+    lenses = load_calibration(write_basalt(tmp_path, intrinsics=kinds, resolution=[[752, 480]] * 2)).lenses
+    assert lenses == (CAMERA, replace(CAMERA, distortion=(0.0, 0.0, 0.0, 0.0)))
+
+
+@pytest.mark.parametrize("transform", ["T_imu_cam", "T_cam_imu"])
+def test_both_cameras_of_a_chain_come_with_poses_of_their_own(tmp_path: Path, transform: str) -> None:
+    """Kalibr's and OpenVINS': ``T_cn_cnm1`` beside them is not needed."""
+    poses = {"cam0": T_BC, "cam1": T_BC1}
+    chain = ""
+    for name, T in poses.items():
+        chain += f"{name}:" + kalibr_camera(f"{transform}: {rows(T if transform == 'T_imu_cam' else np.linalg.inv(T))}")
+    (tmp_path / "chain.yaml").write_text(chain + f"  T_cn_cnm1: {rows(np.linalg.inv(T_BC1) @ T_BC)}\n")
+    (tmp_path / "imu.yaml").write_text(KALIBR_IMU)
+    for camera in load_calibration(tmp_path).cameras:
+        np.testing.assert_allclose(camera.R_BC, poses[camera.name][:3, :3], rtol=0.0, atol=1e-12)
+        np.testing.assert_allclose(camera.p_BC, poses[camera.name][:3, 3], rtol=0.0, atol=1e-12)
+
+
 def test_cameras_are_matched_with_the_images_of_a_recording(tmp_path: Path) -> None:
     chain, imu = tmp_path / "chain.yaml", tmp_path / "imu.yaml"
     imu.write_text(KALIBR_IMU)
@@ -275,7 +549,7 @@ def test_cameras_are_matched_with_the_images_of_a_recording(tmp_path: Path) -> N
     assert matched("/a", "/b", cameras=["cam1:/a", "cam0:/b"]) == [("cam1", "/a"), ("cam0", "/b")]
     assert matched("/only", cameras=["cam1"]) == [("cam1", "/only")]
     for sources, wanted in ((("/a", "/b"), None), (("/a", "/b"), ["cam0"]), (("/cam1/a",), ["cam0"])):
-        with pytest.raises(CalibrationError, match=rf"which images are those of cam0: .* cameras=cam0:{sources[0]}"):
+        with pytest.raises(CalibrationError, match=rf"which images are those of cam0: .* --cameras cam0:{sources[0]}"):
             matched(*sources, cameras=wanted)
     chain.write_text("cam0:" + kalibr_camera(f"T_imu_cam: {rows(T_BC)}"))
     assert matched("/a", "/b") == matched("/a", "/b", cameras=["cam0"]) == [("cam0", "/a")]
@@ -341,10 +615,14 @@ def test_distortion_models(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ("camera_model: pinhole", "camera_model: omni", "'camera_model' should be 'pinhole', not 'omni'"),
+        (
+            "camera_model: pinhole",
+            "camera_model: omni",
+            "should be 'pinhole', 'ds' or 'eucm', not 'omni'",
+        ),
         ("distortion_model: radtan", "distortion_model: fov", "'distortion_model' should be 'radtan', "),
-        ("intrinsics: [458.5, ", "intrinsics: [", "'intrinsics' should be 4 finite numbers"),
-        ("intrinsics: [458.5, ", "intrinsics: [.nan, ", "'intrinsics' should be 4 finite numbers"),
+        ("intrinsics: [458.5, ", "intrinsics: [", "'intrinsics' should be 4 or 6 finite numbers"),
+        ("intrinsics: [458.5, ", "intrinsics: [.nan, ", "'intrinsics' should be 4 or 6 finite numbers"),
         ("intrinsics: [458.5, ", "intrinsics: [-458.5, ", "fx, fy > 0"),
         ("resolution: [752, 480]", "resolution: wide", "'resolution' should be 2 numbers, not 'wide'"),
         ("resolution: [752, 480]", "", "'resolution' is missing"),

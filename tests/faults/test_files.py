@@ -167,7 +167,7 @@ REFUSED = {
     "calibration of nothing": (
         written("c.yaml", "a: 1\n"),
         (*RUN_GOOD, "--calibration", "c.yaml"),
-        "not a calibration of a known format (EuRoC, Kalibr, OpenVINS, VINS-Mono)",
+        "not a calibration of a known format (EuRoC, Kalibr, OpenVINS, VINS-Mono, the main file of VINS-Fusion",
     ),
     "unknown detector": (nothing, (*RUN_GOOD, "--detector", "shi_tomassi"), "did you mean 'shi_tomasi'?"),
     "unknown back-end": (nothing, (*RUN_GOOD, "--backend", "mskcf"), "did you mean 'msckf'?"),

@@ -1,14 +1,26 @@
-"""Calibration files of all four formats, misshapen in every way."""
+"""Calibration files of all formats, misshapen in every way."""
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from tempfile import mkdtemp
 
 import numpy as np
 import pytest
 from ruamel.yaml import YAML
-from test_calibration import KALIBR_IMU, T_BC, VINS_MONO, kalibr_camera, rows
+from test_calibration import (
+    KALIBR_IMU,
+    LEFT_LENS,
+    RIGHT_LENS,
+    T_BC,
+    VINS_FUSION,
+    VINS_MONO,
+    basalt,
+    kalibr_camera,
+    lenses_of,
+    rows,
+)
 
 from faults.fuzzing import YAML_BOMBS, bounded, budgets, damaged, fuzz, misshapen, written
 from vioframe.errors import CalibrationError
@@ -26,6 +38,13 @@ FORMATS = {
         "imu.yaml": f"imu0: {{Tw: [[1, 0, 0], [0, 1, 0], [0, 0, 1]], {', '.join(KALIBR_IMU.splitlines()[1:])}}}\n",
     },
     "vins_mono": {"config.yaml": VINS_MONO},
+    "vins_fusion": {"config.yaml": VINS_FUSION, "left.yaml": LEFT_LENS, "lenses/right.yaml": RIGHT_LENS},
+    "basalt": {"calibration.json": json.dumps({"value0": basalt()})},
+    "basalt_ds": {
+        "calibration.json": json.dumps(
+            {"value0": basalt(**lenses_of("ds", "fx fy cx cy xi alpha", 158.0, 158.0, 255.0, 257.0, -0.2, 0.6))}
+        )
+    },
 }
 
 

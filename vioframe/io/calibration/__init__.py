@@ -1,4 +1,4 @@
-"""Calibration files in the formats people have: EuRoC, Kalibr, OpenVINS and VINS-Mono, told apart by their content."""
+"""Calibration files in the formats people have, told apart by their content: EuRoC, Kalibr, OpenVINS, VINS, Basalt."""
 
 from __future__ import annotations
 
@@ -28,12 +28,15 @@ __all__ = [
 
 PACKAGED = Path(__file__).parent / "data"
 
+_FORMATS = "EuRoC, Kalibr, OpenVINS, VINS-Mono, the main file of VINS-Fusion, Basalt"
+
 
 def load_calibration(*paths: str | Path, cameras: Sequence[str] | None = None) -> Calibration:
     """A rig from calibration files, or from folders holding them.
 
     Understood are EuRoC's ``sensor.yaml`` (of each sensor, a sequence or its ``mav0``), Kalibr's camchain-imucam with
-    its imu file, OpenVINS' ``estimator_config.yaml`` or the two chains it names, and VINS-Mono's single file.
+    its imu file, OpenVINS' ``estimator_config.yaml`` or the two chains it names, VINS-Mono's single file, VINS-Fusion's
+    main file, which names those of the lenses, and Basalt's ``calibration.json``.
 
     ``cameras`` are names such as ``cam1`` or image topics such as ``/cam1/image_raw``, in the order wanted; without it
     there are all, in the order of their names. Raises :class:`~vioframe.errors.CalibrationError`.
@@ -111,7 +114,7 @@ def _read(paths: Iterable[str | Path], where: str) -> tuple[list[CameraPart], Im
 
 
 def _documents(paths: Iterable[Path]) -> Iterator[tuple[Document, Path]]:
-    """The YAML files behind ``paths``; in a folder those that are no calibration are passed over."""
+    """The files behind ``paths``; in a folder those that are no calibration are passed over."""
     for path in paths:
         if path.is_dir():
             for file in _files_in(path):
@@ -130,15 +133,15 @@ def _documents(paths: Iterable[Path]) -> Iterator[tuple[Document, Path]]:
         elif is_calibration(document):
             yield document, path
         else:
-            raise CalibrationError(f"{path}: not a calibration of a known format (EuRoC, Kalibr, OpenVINS, VINS-Mono)")
+            raise CalibrationError(f"{path}: not a calibration of a known format ({_FORMATS})")
 
 
 def _files_in(folder: Path) -> list[Path]:
-    for pattern in ("mav0/*/sensor.yaml", "*/sensor.yaml", "*.y*ml"):
+    for pattern in ("mav0/*/sensor.yaml", "*/sensor.yaml", "*.y*ml", "*.json"):
         # A pipe that nobody writes to would be waited for without end.
         if files := sorted(file for file in folder.glob(pattern) if file.is_file()):
             return files
-    raise CalibrationError(f"there is no calibration file (sensor.yaml, *.yaml) in the folder {folder}")
+    raise CalibrationError(f"there is no calibration file (sensor.yaml, *.yaml, *.json) in the folder {folder}")
 
 
 def _select(cameras: list[CameraPart], wanted: str, where: str) -> CameraPart:
@@ -161,5 +164,5 @@ def _source_of(part: CameraPart, sources: Sequence[str]) -> str | None:
 def _no_images(camera: str, sources: Sequence[str]) -> CalibrationError:
     return CalibrationError(
         f"it is not clear which images are those of {camera}: there are {', '.join(sources)}; "
-        f"say so, as in -o cameras={camera}:{sources[0]}"
+        f"say so, as in --cameras {camera}:{sources[0]}"
     )
