@@ -36,5 +36,5 @@ def small_simulation(
     """A recording of 188 x 120 px, by one camera unless a ``rig`` is given; its calibration is kept in ``folder``."""
     files = folder / f"calibration_{len(list(folder.iterdir()))}"
     write_calibration(rig or small_calibration(divisor), files)
-    config = SimulationConfig.model_validate({"duration_s": 1.0, "calibration": [files], **settings})
+    config = SimulationConfig.model_validate({"duration_s": 1.0, "rig": [str(files)], **settings})
     return SimulatedRecording(complete(config, INSTALLED), INSTALLED, workers)

@@ -79,7 +79,7 @@ def record_toy(folder: Path, name: str = "TOY", **settings: object) -> Path:
     )
     files = folder / "calibration"
     write_calibration(replace(calibration, cameras=(replace(camera, model=small),)), files)
-    config = SimulationConfig(duration_s=3.0, frame_rate_hz=10.0, calibration=(files,), **settings)
+    config = SimulationConfig(duration_s=3.0, frame_rate_hz=10.0, rig=(str(files),), **settings)
     installed = registry.load()
     path = folder / name
     record(SimulatedRecording(complete(config, installed), installed), [path])

@@ -34,6 +34,7 @@ from recordings import (
     write_bag,
 )
 from rosbags.rosbag2.storage_mcap import zstd
+from test_calibration import write_basalt
 
 from vioframe.errors import CalibrationError, DatasetError
 from vioframe.incidents import Incidents
@@ -194,6 +195,21 @@ class TestAsl:
         )
         with pytest.raises(DatasetError, match="bit_depth must lie between 8 and 16, not 7"):
             EurocDataset(asl, bit_depth=7)
+
+    def test_as_tum_vi_is_given(self, tmp_path: Path) -> None:
+        """Two cameras of 16 bits in EuRoC's layout, nothing but the tables beside them, and Basalt's calibration."""
+        convert(pair_measurements(), PAIR, tmp_path / "room")
+        for file in (tmp_path / "room").rglob("sensor.yaml"):
+            file.unlink()
+        for file in (tmp_path / "room").rglob("*.png"):
+            cv2.imwrite(str(file), 257 * cv2.imread(str(file), cv2.IMREAD_UNCHANGED).astype(np.uint16))
+        calibration = write_basalt(tmp_path, resolution=[camera.model.resolution for camera in PAIR.cameras])
+        dataset = EurocDataset(tmp_path / "room", calibration=calibration, bit_depth=16)
+        assert [camera.name for camera in dataset.calibration.cameras] == ["cam0", "cam1"]
+        assert {lens.distortion_model for lens in dataset.calibration.lenses} == {"equidistant"}
+        assert_equal(dataset.measurements(), pair_measurements())
+        with pytest.raises(CalibrationError, match=r"sensor\.yaml: No such file"):
+            EurocDataset(tmp_path / "room")
 
     def test_images_of_another_size_than_calibrated(self, asl: Path) -> None:
         for image in (asl / "mav0" / "cam0" / "data").iterdir():

@@ -167,7 +167,7 @@ def shots(count: int, instants: int = 1) -> list[Shot]:
 
 
 def test_the_number_of_threads_makes_no_difference():
-    studio = Studio((SMALL,), board(), conditions=Conditions(noise=0.6))
+    studio = Studio((SMALL,), board(), conditions=(Conditions(noise=0.6),))
     alone, together = (list(take_pictures(studio, shots(11), workers)) for workers in (1, 2))
     assert len(alone) == len(together) == 11
     assert all(np.array_equal(a, b) for a, b in zip(alone, together, strict=True))
@@ -180,7 +180,7 @@ def test_noise_is_as_strong_as_asked_and_gain_saturates():
     (shot,) = shots(1)
     inside = np.s_[40:80, 60:130]
     clean = Photographer(studio).take(shot)[inside].astype(float)
-    noisy = Photographer(replace(studio, conditions=Conditions(noise=0.6))).take(shot)[inside].astype(float)
+    noisy = Photographer(replace(studio, conditions=(Conditions(noise=0.6),))).take(shot)[inside].astype(float)
     assert (noisy - clean).std() == pytest.approx(0.048 * 255, rel=0.1)
     assert abs((noisy - clean).mean()) < 1.0
     dark = Photographer(replace(studio, conditions=Conditions(low_light=1.0))).take(shot)[inside].astype(float)

@@ -10,17 +10,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from recordings import assert_same_rig
 from rosbags.highlevel import AnyReader
 from simulation_helpers import INSTALLED, small_calibration, small_simulation
 
 from vioframe.cli import main
 from vioframe.errors import ConfigError, DatasetError, TrajectoryError
 from vioframe.geometry import so3
-from vioframe.io.calibration import sidecar_folder, write_calibration
+from vioframe.io.calibration import packaged_calibration, sidecar_folder, write_calibration
 from vioframe.io.trajectories import load_trajectory, true_values
 from vioframe.io.writers import TRUE_VECTOR_TOPICS, AslWriter, McapWriter, Ros1Writer, Ros2Writer
-from vioframe.simulation.conditions import CONDITIONS, Conditions
-from vioframe.simulation.config import MANIFEST, MESH, TRUTH, simulation_folder
+from vioframe.simulation.conditions import CONDITIONS, OF_THE_FLIGHT, Conditions
+from vioframe.simulation.config import MANIFEST, MESH, TRUTH, SimulationConfig, rig_of, simulation_folder
 from vioframe.simulation.record import record
 from vioframe.simulation.renderer import Renderer
 from vioframe.simulation.world import MeshBuilder, write_mesh
@@ -34,7 +35,7 @@ def content(recording) -> list[tuple]:
     rows = []
     for m in recording.measurements():
         if isinstance(m, FrameSet):
-            rows.append((m.t_ns, *(image.tobytes() for image in m.images)))
+            rows.append((m.t_ns, *(None if image is None else image.tobytes() for image in m.images)))
         else:
             rows.append((m.t_ns, m.gyro_B.tobytes(), m.accel_B.tobytes()))
     return rows
@@ -165,9 +166,9 @@ def test_the_imu_is_exact_or_as_wrong_as_asked(tmp_path, clear):
 
 
 def test_a_known_time_offset_is_in_the_stamps_and_in_the_calibration(tmp_path):
-    offset = small_calibration().with_camera(0, time_offset_ns=7_000_000)
-    write_calibration(offset, tmp_path / "offset")
-    recording = small_simulation(tmp_path, duration_s=0.2, calibration=[tmp_path / "offset"])
+    recording = small_simulation(
+        tmp_path, duration_s=0.2, rig=small_calibration().with_camera(0, time_offset_ns=7_000_000)
+    )
     assert recording.calibration.cameras[0].time_offset_ns == 7_000_000
     assert readings(recording)[0][0] == recording.ground_truth.t_ns[0] + 7_000_000
 
@@ -228,6 +229,118 @@ def test_conditions_are_the_same_for_all_cameras_and_the_noise_is_not(tmp_path):
     assert [camera.R_BC is right.R_BC for camera in told] == [False, False]
 
 
+@pytest.fixture
+def twins() -> Calibration:
+    """Two cameras in one place."""
+    left = small_calibration(8).cameras[0]
+    return Calibration((left, replace(left, name="cam1")), small_calibration().imu)
+
+
+def taken(recording) -> list[list[tuple[int, bytes]]]:
+    """Of each camera the stamp and the image of all that it took."""
+    sets = [m for m in recording.measurements() if isinstance(m, FrameSet)]
+    cameras = range(len(recording.calibration.cameras))
+    return [[(m.t_ns, m.images[c].tobytes()) for m in sets if m.images[c] is not None] for c in cameras]
+
+
+def test_conditions_of_one_camera_are_those_of_all_for_it_and_none_for_the_others(tmp_path, twins):
+    levels = {name: 0.3 for name in CONDITIONS if name not in (*OF_THE_FLIGHT, "time_offset", "dropped_frames")}
+    levels |= {"exposure": 0.8, "blackout": 0.01}  # 0.1 s are black
+    recordings = [
+        small_simulation(tmp_path, rig=twins, duration_s=0.4, conditions=conditions)
+        for conditions in (
+            {},
+            {f"cam1.{name}": level for name, level in levels.items()},
+            levels,
+            levels | {f"cam0.{name}": 0.0 for name in levels},
+        )
+    ]
+    none, one, both, but = map(taken, recordings)
+    assert one[0] == but[0] == none[0]
+    assert one[1] == but[1] == both[1]
+    assert not {image for _, image in one[1]} & {image for _, image in none[1]}
+    dropped = taken(small_simulation(tmp_path, rig=twins, duration_s=0.4, conditions={"cam1.dropped_frames": 1.0}))
+    assert dropped[0] == none[0]
+    assert set(dropped[1]) < set(none[1])
+    told = [recording.calibration.lenses for recording in recordings]
+    assert told[1] == told[3] == (told[0][0], told[2][1]) != told[0]
+
+
+def test_a_camera_may_be_late_alone(tmp_path, twins):
+    """Then another instant is exposed than its calibration says; of all cameras it is the IMU that is late."""
+    late, first, clear = (
+        small_simulation(tmp_path, rig=twins, conditions=levels, frame_rate_hz=40.0, duration_s=0.2)
+        for levels in ({"cam1.time_offset": 0.5}, {"cam0.time_offset": 0.5}, {})
+    )
+    assert [c.time_offset_ns for c in late.calibration.cameras] == [0, 0]
+    assert [c.time_offset_ns for c in late.true_calibration.cameras] == [0, 25_000_000]
+    # 25 ms are a frame.
+    (left, right), (expected_left, expected_right) = taken(late), taken(clear)
+    assert [image for _, image in right][:-1] == [image for _, image in expected_right][1:]
+    assert left == expected_left
+    assert readings(first)[0][0] - readings(clear)[0][0] == 25_000_000
+    assert [c.time_offset_ns for c in first.true_calibration.cameras] == [0, -25_000_000]
+
+
+def test_behind_a_cover_it_is_black_in_the_middle(tmp_path):
+    covered = under(tmp_path, "blackout", 0.2, duration_s=4.0, frame_rate_hz=4.0)
+    black = (images(covered) == 0.0).all(axis=(1, 2))
+    at_s = np.arange(17) / 4.0
+    np.testing.assert_array_equal(black, np.abs(at_s - 2.0) < 1.0)
+
+
+def test_a_camera_with_stamps_of_its_own_comes_in_sets_of_one(tmp_path):
+    rig = small_calibration(8, ("cam0", "cam1"))
+    settings = {"rig": rig, "duration_s": 0.3, "conditions": {"cam0.noise": 0.1, "dropped_frames": 0.5}}
+    together, apart = (small_simulation(tmp_path, **settings, delay_ms=delay) for delay in ({}, {"cam1": 20.0}))
+    sets = [m for m in apart.measurements() if isinstance(m, FrameSet)]
+    assert apart.frame_count == len(sets)
+    assert [m.t_ns for m in sets] == sorted(m.t_ns for m in sets)
+    assert {sum(image is not None for image in m.images) for m in sets} == {1}
+    (left, right), (synchronised, triggered) = taken(apart), taken(together)
+    assert left == synchronised
+    # The last would come after the last frame, and perhaps after the last reading.
+    stamps = [t_ns for t_ns, _ in right]
+    assert stamps == [t_ns + 20_000_000 for t_ns, _ in triggered[:-1]]
+    # Each image shows the world at the stamp that it bears.
+    second = apart.calibration.cameras[1]
+    R_WB, p_WB, _ = apart._scenario.motion(np.array([stamps[2]]))
+    light = Renderer(second.model, apart.world).render(R_WB[0] @ second.R_BC, R_WB[0] @ second.p_BC + p_WB[0])
+    expected = np.clip(np.round(255.0 * light), 0.0, 255.0).astype(np.uint8)
+    assert right[2] == (stamps[2], expected.tobytes())
+    for name in ("flight.bag", "flight"):
+        record(apart, [tmp_path / name])
+        assert taken(INSTALLED.open_dataset(tmp_path / name)) == [left, right]
+
+
+def test_eurocs_rigs_by_name(tmp_path):
+    assert SimulationConfig() == SimulationConfig(rig=["mono"])
+    assert_same_rig(rig_of(SimulationConfig()), packaged_calibration("euroc", cameras=["cam0"]))
+    assert_same_rig(rig_of(SimulationConfig(rig=["stereo"])), packaged_calibration("euroc"))
+    done = simulate(tmp_path / "pair", "--rig", "stereo", "--duration", 0.1, "--workers", 1)
+    assert done.exit_code == 0, done.output
+    read = INSTALLED.open_dataset(tmp_path / "pair")
+    assert_same_rig(read.calibration, packaged_calibration("euroc"))
+    sets = [m for m in read.measurements() if isinstance(m, FrameSet)]
+    assert [[image.shape for image in m.images] for m in sets] == 3 * [[(480, 752), (480, 752)]]
+
+
+def test_a_real_sequence_is_seen_by_both_cameras(shared_data, tmp_path):
+    """At the recorded stamps, which both of EuRoC's cameras share, each from where it is."""
+    folder = shared_data / "euroc_imu_gt" / "MH_05_difficult"
+    rig = small_calibration(8, ("cam0", "cam1"))
+    recording = small_simulation(tmp_path, rig=rig, recorded=folder, start_s=20.0, duration_s=0.3)
+    sets = [m for m in recording.measurements() if isinstance(m, FrameSet)]
+    stamps = np.loadtxt(folder / "cam0" / "timestamps_ns.txt.gz", dtype=np.int64)
+    assert len(sets) == 7
+    assert np.isin([m.t_ns for m in sets], stamps).all()
+    second = rig.cameras[1]
+    R_WB, p_WB, _ = recording._scenario.motion(np.array([sets[3].t_ns]))
+    light = Renderer(second.model, recording.world).render(R_WB[0] @ second.R_BC, R_WB[0] @ second.p_BC + p_WB[0])
+    expected = np.clip(np.round(255.0 * light), 0.0, 255.0).astype(np.uint8)
+    np.testing.assert_array_equal(sets[3].images[1], expected)
+
+
 @pytest.mark.parametrize("name", ["flight.bag", "flight.ros2", "flight.mcap", "flight"])
 def test_a_recording_holds_every_camera_of_its_rig_and_the_truth(tmp_path, name):
     recording = rig(tmp_path)
@@ -285,7 +398,7 @@ def small(tmp_path) -> Path:
 
 def test_a_manifest_makes_the_same_recording_again(tmp_path, small):
     chosen = ["--flight", "hover", "--duration", 0.5, "--seed", 7, "-c", "noise=0.3", "-c", "fog", "-o", "speed=1.5"]
-    done = simulate(tmp_path / "one.bag", *chosen, "--calibration", small, "--workers", 1)
+    done = simulate(tmp_path / "one.bag", *chosen, "--rig", small, "--workers", 1)
     assert done.exit_code == 0, done.output
     assert "conditions: noise 0.3, fog 1" in done.output
     manifest = simulation_folder(tmp_path / "one.bag") / MANIFEST
@@ -295,9 +408,23 @@ def test_a_manifest_makes_the_same_recording_again(tmp_path, small):
     assert manifest.read_text() == (simulation_folder(tmp_path / "two.bag") / MANIFEST).read_text()
 
 
+def test_a_manifest_makes_the_same_recording_of_a_rig_again(tmp_path):
+    write_calibration(small_calibration(8, ("cam0", "cam1")), tmp_path / "pair")
+    chosen = ["--rig", tmp_path / "pair", "--duration", 0.4, "-c", "cam1.blackout=0.02", "-c", "noise=0.1"]
+    chosen += ["-c", "cam0.noise=0", "-c", "cam1.dropped_frames=0.8", "-o", "cam1.delay_ms=12.5", "--workers", 1]
+    done = simulate(tmp_path / "one.bag", *chosen)
+    assert done.exit_code == 0, done.output
+    assert "conditions: cam1.blackout 0.02, noise 0.1, cam1.dropped_frames 0.8" in done.output
+    manifest = simulation_folder(tmp_path / "one.bag") / MANIFEST
+    again = simulate(tmp_path / "two.bag", "--config", manifest, "--workers", 2)
+    assert again.exit_code == 0, again.output
+    assert (tmp_path / "one.bag").read_bytes() == (tmp_path / "two.bag").read_bytes()
+    assert manifest.read_text() == (simulation_folder(tmp_path / "two.bag") / MANIFEST).read_text()
+
+
 def test_the_list_shows_flights_worlds_and_conditions():
     listed = simulate("--list").output
-    for name in ("figure_eight", "inspection", "hall", "mesh", *CONDITIONS):
+    for name in ("figure_eight", "inspection", "hall", "mesh", "mono", "stereo", *CONDITIONS):
         assert name in listed
 
 
@@ -310,7 +437,7 @@ def box_world(tmp_path: Path, half_m: float) -> Path:
 
 def test_ones_own_mesh_is_a_world_and_its_walls_are_solid(tmp_path, small):
     room = box_world(tmp_path, 20.0)
-    settings = ["--calibration", small, "--duration", 3, "--rate", 2, "--workers", 1, "--world", "mesh"]
+    settings = ["--rig", small, "--duration", 3, "--rate", 2, "--workers", 1, "--world", "mesh"]
     done = simulate(tmp_path / "room", *settings, "-o", f"world.file={room}")
     assert done.exit_code == 0, done.output
     closet = box_world(tmp_path, 1.0)
@@ -339,6 +466,14 @@ def repeating_file(tmp_path: Path) -> Path:
         (["-c", "fog=1.5"], "conditions: fog: Input should be less than or equal to 1, got"),
         (["-c", "fog=nan"], "should be a finite number"),
         (["-c", "fog=much"], "should be a valid number"),
+        (["--rig", "stereo", "-c", "cam1.fogg=0.5"], "did you mean 'fog'"),
+        (["--rig", "stereo", "-c", "cam1.fog=1.5"], "conditions: fog: Input should be less than or equal to 1, got"),
+        (["--rig", "stereo", "-c", "cam2.fog=0.5"], "the rig has no camera 'cam2'; its cameras: cam0, cam1"),
+        (["-c", "cam1.fog"], "the rig has no camera 'cam1'; its cameras: cam0"),
+        (["--rig", "stereo", "-c", "cam1.vibration"], "vibration is the same for all cameras; leave 'cam1' out"),
+        (["--rig", "stereo", "-o", "delay_ms=5"], "write one of cam0.delay_ms, cam1.delay_ms"),
+        (["--rig", "stereo", "-o", "cam2.delay_ms=5"], "there is no section 'cam2'"),
+        (["--rig", "stereo", "-o", "cam1.delay_ms=-5"], "delay_ms.cam1: Input should be greater than or equal to 0"),
         (["--flight", "figure_ate"], "did you mean 'figure_eight'"),
         (["--flight", "missing.tum"], "no such trajectory file"),
         (["--flight", jumping_file], "jump"),
@@ -350,7 +485,7 @@ def repeating_file(tmp_path: Path) -> Path:
         (["--start", "3"], "a flight begins at its beginning"),
         (["-o", "colour=red"], "no part has such an option"),
         (["-o", "world.images=nowhere"], "is not a folder"),
-        (["--calibration", "nowhere"], "nowhere"),
+        (["--rig", "nowhere"], "nowhere"),
         (["--config", "nowhere.yaml"], "cannot read the configuration"),
     ],
 )
@@ -394,7 +529,7 @@ def test_a_full_disk_leaves_no_half_written_recording(tmp_path, small, monkeypat
             raise problem
 
     monkeypatch.setattr(writer, "write_frame", write_frame)
-    done = simulate(tmp_path / name, "--calibration", small, "--duration", 1, "--workers", 1, "--quiet")
+    done = simulate(tmp_path / name, "--rig", small, "--duration", 1, "--workers", 1, "--quiet")
     assert done.exit_code == 2
     reason = getattr(problem, "strerror", None) or problem
     assert done.output == (
@@ -404,7 +539,7 @@ def test_a_full_disk_leaves_no_half_written_recording(tmp_path, small, monkeypat
 
 
 def test_a_simulated_recording_is_replaced_only_by_a_complete_one(tmp_path, small, monkeypatch):
-    settings = [tmp_path / "a.bag", "--calibration", small, "--duration", 0.3, "--workers", 1]
+    settings = [tmp_path / "a.bag", "--rig", small, "--duration", 0.3, "--workers", 1]
     assert simulate(*settings).exit_code == 0
     first = (tmp_path / "a.bag").read_bytes()
     assert "exists already" in simulate(*settings).output
@@ -421,7 +556,7 @@ def test_a_simulated_recording_is_replaced_only_by_a_complete_one(tmp_path, smal
 
 @pytest.mark.parametrize("name", ["a", "a.ros2"])
 def test_what_others_put_into_a_recording_stays(tmp_path, small, name):
-    settings = [tmp_path / name, "--calibration", small, "--duration", 0.3, "--workers", 1, "--quiet"]
+    settings = [tmp_path / name, "--rig", small, "--duration", 0.3, "--workers", 1, "--quiet"]
     assert simulate(*settings).exit_code == 0
     first = {path.relative_to(tmp_path) for path in tmp_path.rglob("*")}
     theirs = [tmp_path / name / "notes.txt", simulation_folder(tmp_path / name) / "notes.txt"]

@@ -9,6 +9,7 @@ from time import perf_counter
 from typing import Any
 
 import click
+from click.shell_completion import CompletionItem
 
 from vioframe.cli.common import FILE, Bar, PartName, calibration_option, cameras_option, print_notes, quiet_option
 from vioframe.cores import usable_cores
@@ -19,8 +20,8 @@ from vioframe.parts import registry
 from vioframe.parts.config import parse_assignments, validate
 from vioframe.parts.options import summary_of
 from vioframe.simulation import config as configuration
-from vioframe.simulation.conditions import CONDITIONS, Conditions
-from vioframe.simulation.config import SimulationConfig
+from vioframe.simulation.conditions import CONDITIONS, OF_THE_FLIGHT, parse_levels
+from vioframe.simulation.config import RIGS, SimulationConfig
 from vioframe.simulation.record import check_destinations, record
 from vioframe.simulation.recording import DEFAULT_DURATION_S, SimulatedRecording
 from vioframe.types import FrameSet, Measurement
@@ -28,9 +29,14 @@ from vioframe.types import FrameSet, Measurement
 _COMPRESSIONS = sorted({name for format in FORMATS.values() for name in format.compressions})
 
 
+def _complete_rig(ctx: click.Context, param: click.Parameter, incomplete: str) -> list[CompletionItem]:
+    named = [CompletionItem(name) for name in RIGS if name.startswith(incomplete)]
+    return named or [CompletionItem(incomplete, type="file")]
+
+
 @click.command("simulate")
 @click.argument("destinations", metavar="DST...", type=FILE, nargs=-1)
-@click.option("--list", "only_list", is_flag=True, help="List flights, worlds and conditions.")
+@click.option("--list", "only_list", is_flag=True, help="List flights, worlds, rigs and conditions.")
 @click.option(
     "--flight",
     metavar="NAME|FILE",
@@ -41,8 +47,18 @@ _COMPRESSIONS = sorted({name for format in FORMATS.values() for name in format.c
     "--imu", "recorded", type=FILE, metavar="SEQ", help="EuRoC sequence, or its imu0/data.csv: its real IMU, motion."
 )
 @click.option("--world", type=PartName("WORLD"), help="World to fly through.  [default: hall]")
-@click.option("-c", "--condition", "conditions", metavar="NAME=LEVEL", multiple=True, help="Hard condition, 0 to 1.")
-@click.option("-o", "--option", "options", metavar="KEY=VALUE", multiple=True, help="Option of flight, world or IMU.")
+@click.option(
+    *("-c", "--condition", "conditions"),
+    metavar="[CAMERA.]NAME=LEVEL",
+    multiple=True,
+    help="Hard condition, 0 to 1, for all cameras or for one.",
+)
+@click.option(
+    *("-o", "--option", "options"),
+    metavar="KEY=VALUE",
+    multiple=True,
+    help="Option of flight, world or IMU; `CAMERA.delay_ms`: exposed so much later, with stamps of its own.",
+)
 @click.option("--start", "start_s", type=float, metavar="S", help="Skip the first S seconds of a file or sequence.")
 @click.option(
     "--duration",
@@ -62,7 +78,12 @@ _COMPRESSIONS = sorted({name for format in FORMATS.values() for name in format.c
 )
 @click.option("--exact-imu", is_flag=True, default=None, help="An IMU without noise and biases.")
 @click.option(
-    "--calibration", type=FILE, multiple=True, help="Of a rig: file or folder.  [default: EuRoC's left camera]"
+    "--rig",
+    metavar="mono|stereo|PATH",
+    multiple=True,
+    shell_complete=_complete_rig,
+    help="EuRoC's left camera, both of them, or every camera of a calibration: file or folder; repeat where it is in "
+    "several files.  [default: mono]",
 )
 @click.option("--config", "file", type=FILE, help="Configuration, or manifest of a recording to make again.")
 @click.option("--compression", type=click.Choice(["bz2", "lz4", "zstd"]), help="Compress bags.  [default: no]")
@@ -103,7 +124,7 @@ def simulate(
         record(recording, destinations, compression=compression, overwrite=overwrite, on_frame=lambda _: bar())
     if quiet:
         return
-    truth, levels = recording.ground_truth, recording.conditions.levels
+    truth, levels = recording.ground_truth, {name: level for name, level in config.conditions.items() if level}
     click.echo(
         f"{recording.name}: {recording.frame_count} frames and {recording.imu_count} IMU samples of "
         f"{truth.duration_s:.1f} s along {truth.path_length_m:.1f} m, in {perf_counter() - begin_s:.0f} s"
@@ -134,7 +155,7 @@ def _configure(
         tree |= {"flight": {"name": flight}} if named else {"trajectory": path}
     if world is not None and world != tree["world"]["name"]:
         tree["world"] = {"name": world}
-    tree["conditions"] |= Conditions.parse(conditions).levels
+    tree["conditions"] |= parse_levels(conditions)
     tree |= {name: value for name, value in values.items() if value not in (None, ())}
     return configuration.override(validate(SimulationConfig, tree, "command line"), installed, options)
 
@@ -145,7 +166,9 @@ def _list_simulations(installed: registry.Registry) -> None:
         with formatter.section(f"{kind.name}s"):
             names = installed.names(kind)
             formatter.write_dl([(name, summary_of(installed.find(kind, name).factory)) for name in names])
-    with formatter.section("conditions (level 0 to 1)"):
+    with formatter.section("rigs"):
+        formatter.write_dl([(name, f"EuRoC's {', '.join(cameras)}") for name, cameras in RIGS.items()])
+    with formatter.section(f"conditions (level 0 to 1; of one camera: CAMERA.NAME, but {', '.join(OF_THE_FLIGHT)})"):
         formatter.write_dl(list(CONDITIONS.items()))
     click.echo(f"{formatter.getvalue()}\nOptions of a flight or world: `vioframe plugins NAME`.")
 

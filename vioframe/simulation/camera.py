@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -42,27 +42,27 @@ class Shot:
 
 @dataclass(frozen=True)
 class Studio:
-    """All that is the same for every picture: world, optics and sensors."""
+    """All that is the same for every picture: world, optics, sensors, and the ``conditions`` that each camera meets."""
 
     cameras: tuple[Camera, ...]
     world: World
     movers: Movers | None = None
-    conditions: Conditions = field(default_factory=Conditions)
+    conditions: tuple[Conditions, ...] = (Conditions(),)
 
 
 class Photographer:
     """Takes the pictures of a studio, the same ones for the same shots."""
 
     def __init__(self, studio: Studio) -> None:
-        self._conditions = conditions = studio.conditions
+        self._conditions = studio.conditions
         self._renderers = [
-            Renderer(camera, studio.world, studio.movers, contrast=conditions.contrast, fog_per_m=conditions.fog_per_m)
-            for camera in studio.cameras
+            Renderer(camera, studio.world, studio.movers, contrast=met.contrast, fog_per_m=met.fog_per_m)
+            for camera, met in zip(studio.cameras, studio.conditions, strict=True)
         ]
 
     def take(self, shot: Shot) -> Image:
         """(height, width) uint8."""
-        conditions, renderer = self._conditions, self._renderers[shot.camera]
+        conditions, renderer = self._conditions[shot.camera], self._renderers[shot.camera]
         movers = [None] * len(shot.p_WC) if shot.p_WM is None else shot.p_WM
         light = np.mean([renderer.render(*at) for at in zip(shot.R_WC, shot.p_WC, movers, strict=True)], axis=0)
         if conditions.dynamic_range != 1.0:

@@ -1,8 +1,11 @@
-"""Hard conditions, each with a level from 0 (none of it) to 1, and what a level means in physical units."""
+"""Hard conditions, each with a level from 0 (none of it) to 1, and what a level means in physical units.
+
+``fog=0.5`` is a condition for all cameras of a rig, ``cam1.fog=0.5`` for one of them in its place.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Annotated
 
@@ -10,6 +13,7 @@ import numpy as np
 from pydantic import ConfigDict, Field
 
 from vioframe.arrays import Float
+from vioframe.errors import ConfigError
 from vioframe.geometry import so3
 from vioframe.parts.config import Section, validate
 from vioframe.types import Calibration, CameraOnBody
@@ -18,7 +22,7 @@ Level = Annotated[float, Field(ge=0.0, le=1.0, allow_inf_nan=False)]
 
 
 class Conditions(Section):
-    """The level of each condition; properties say what that amounts to."""
+    """The level of each condition, as one camera meets it; properties say what that amounts to."""
 
     model_config = ConfigDict(use_attribute_docstrings=True)
 
@@ -48,22 +52,13 @@ class Conditions(Section):
     camera's pose"""
     rolling_shutter: Level = 0.0
     """readout of a rolling shutter that nobody is told of: 1 is 30 ms from the first row to the last"""
+    blackout: Level = 0.0
+    """black images in the middle of the recording, as behind a cover: 1 is 10 s of them"""
 
     @classmethod
     def of(cls, levels: Mapping[str, float | str]) -> Conditions:
         """From levels by name; raises :class:`ConfigError` for what is no condition or no level."""
         return validate(cls, levels, "conditions")
-
-    @classmethod
-    def parse(cls, texts: Iterable[str]) -> Conditions:
-        """From texts such as ``fog=0.5``; a name alone is the condition at its full level."""
-        pairs = (text.partition("=") for text in texts)
-        return cls.of({name.strip(): level if equals else 1.0 for name, equals, level in pairs})
-
-    @property
-    def levels(self) -> dict[str, float]:
-        """The conditions there are, by name: those above zero."""
-        return {name: level for name, level in self.model_dump().items() if level > 0.0}
 
     @property
     def exposure_s(self) -> float:
@@ -113,25 +108,71 @@ class Conditions(Section):
     def late_ns(self) -> int:
         return round(0.050 * self.time_offset * 1e9)
 
-    def mislead(self, calibration: Calibration, rng: np.random.Generator) -> Calibration:
-        """What the estimator is told of ``calibration``: each camera off by the amount asked for."""
-        if not self.wrong_calibration:
-            return calibration
-        return replace(calibration, cameras=tuple(self._misplaced(camera, rng) for camera in calibration.cameras))
-
-    def _misplaced(self, camera: CameraOnBody, rng: np.random.Generator) -> CameraOnBody:
-        level, model = self.wrong_calibration, camera.model
-        (d_fx, d_fy), (d_cx, d_cy) = ((level * 10.0 * _direction(rng, 2)).tolist() for _ in range(2))
-        return replace(
-            camera,
-            model=replace(model, fx=model.fx + d_fx, fy=model.fy + d_fy, cx=model.cx + d_cx, cy=model.cy + d_cy),
-            R_BC=camera.R_BC @ so3.exp(np.deg2rad(level * 1.0) * _direction(rng, 3)),
-            p_BC=camera.p_BC + level * 0.02 * _direction(rng, 3),
-        )
+    @property
+    def black_s(self) -> float:
+        return 10.0 * self.blackout
 
 
 CONDITIONS = {name: " ".join((field.description or "").split()) for name, field in Conditions.model_fields.items()}
 """What each condition does, by name."""
+
+OF_THE_FLIGHT = ("moving_objects", "vibration")
+"""Those of the world and of the IMU, which are the same for all cameras."""
+
+
+def parse_levels(texts: Iterable[str]) -> dict[str, float]:
+    """Levels by name from texts such as ``fog=0.5`` or ``cam1.fog=0.5``; a name alone is the condition at full level.
+
+    Raises :class:`ConfigError` for what is no condition or no level.
+    """
+    pairs = (text.partition("=") for text in texts)
+    return check_levels({name.strip(): level if equals else 1.0 for name, equals, level in pairs})
+
+
+def check_levels(levels: Mapping[str, float | str]) -> dict[str, float]:
+    """The ``levels`` as numbers; raises :class:`ConfigError` for what is no condition, or none of one camera's own."""
+    checked = {}
+    for name, level in levels.items():
+        camera, _, condition = name.rpartition(".")
+        checked[name] = float(getattr(Conditions.of({condition: level}), condition))
+        if camera and condition in OF_THE_FLIGHT:
+            raise ConfigError(f"conditions: {condition} is the same for all cameras; leave {camera!r} out")
+    return checked
+
+
+def of_cameras(levels: Mapping[str, float], cameras: Sequence[str]) -> tuple[Conditions, ...]:
+    """What each of the ``cameras``, given by name, meets; raises :class:`ConfigError` for one that is not there."""
+    check_known("conditions", [name.rpartition(".")[0] for name in levels if "." in name], cameras)
+    shared = {name: level for name, level in levels.items() if "." not in name}
+    own = [{key: levels[f"{camera}.{key}"] for key in CONDITIONS if f"{camera}.{key}" in levels} for camera in cameras]
+    return tuple(Conditions.of(shared | mine) for mine in own)
+
+
+def check_known(what: str, wanted: Iterable[str], cameras: Sequence[str]) -> None:
+    """Raise :class:`ConfigError` where ``what`` speaks of a camera that is none of the rig's."""
+    for name in wanted:
+        if name not in cameras:
+            raise ConfigError(f"{what}: the rig has no camera {name!r}; its cameras: {', '.join(cameras)}")
+
+
+def misled(calibration: Calibration, conditions: Sequence[Conditions], rng: np.random.Generator) -> Calibration:
+    """What the estimator is told of ``calibration``: each camera off by the amount that its ``conditions`` ask for."""
+    levels = [each.wrong_calibration for each in conditions]
+    if not any(levels):
+        return calibration
+    cameras = zip(calibration.cameras, levels, strict=True)
+    return replace(calibration, cameras=tuple(_misplaced(camera, level, rng) for camera, level in cameras))
+
+
+def _misplaced(camera: CameraOnBody, level: float, rng: np.random.Generator) -> CameraOnBody:
+    model = camera.model
+    (d_fx, d_fy), (d_cx, d_cy) = ((level * 10.0 * _direction(rng, 2)).tolist() for _ in range(2))
+    return replace(
+        camera,
+        model=replace(model, fx=model.fx + d_fx, fy=model.fy + d_fy, cx=model.cx + d_cx, cy=model.cy + d_cy),
+        R_BC=camera.R_BC @ so3.exp(np.deg2rad(level * 1.0) * _direction(rng, 3)),
+        p_BC=camera.p_BC + level * 0.02 * _direction(rng, 3),
+    )
 
 
 def _direction(rng: np.random.Generator, size: int) -> Float:

@@ -12,22 +12,32 @@ from typing import Annotated, Any, Self
 
 from pydantic import Field, model_validator
 
+from vioframe.io.calibration import load_calibration, packaged_calibration
 from vioframe.parts.config import PartConfig, Section, parse_assignments, read_tree, validate
-from vioframe.parts.options import options_of, validate_options
+from vioframe.parts.options import Option, options_of, validate_options
 from vioframe.parts.registry import FLIGHT, WORLD, Kind, Registry
-from vioframe.simulation.conditions import Conditions
+from vioframe.simulation.conditions import check_levels
 from vioframe.simulation.imu import ImuErrors
+from vioframe.types import Calibration
 
 MANIFEST, TRUTH, MESH = SIMULATION_FILES = "manifest.yaml", "ground_truth.csv", "world.ply"
 """Files of a simulation's folder: all settings, the exact states in EuRoC's format, and the mesh of the world in W."""
+
+
+RIGS = {"mono": ("cam0",), "stereo": ("cam0", "cam1")}
+"""EuRoC's cameras by the name of a rig of them."""
+
+_DELAY = Option("delay_ms", float, 0.0, "later than the frame's time, with a stamp of its own")
 
 
 class SimulationConfig(Section):
     """Everything that determines a simulated recording.
 
     The motion is a ``flight`` by name, the file ``trajectory``, or that of the EuRoC sequence ``recorded``, whose
-    readings of the IMU are then taken as they are. ``readout_ms`` is that of a rolling shutter, which the estimator is
-    told of, in place of the calibration's. ``made`` is what came of it, in a manifest; nothing reads it.
+    readings of the IMU are then taken as they are. ``rig`` is one of :data:`RIGS`, or the files of a calibration.
+    ``delay_ms`` says how much later than the frame's time a camera of the rig, by its name, takes its image: with a
+    stamp of its own. ``readout_ms`` is that of a rolling shutter, which the estimator is told of, in place of the
+    calibration's. ``made`` is what came of it, in a manifest; nothing reads it.
     """
 
     flight: PartConfig = PartConfig(name="figure_eight")
@@ -43,7 +53,8 @@ class SimulationConfig(Section):
     imu: dict[str, Any] = Field(default_factory=dict)
     world: PartConfig = PartConfig(name="hall")
     conditions: dict[str, float] = Field(default_factory=dict)
-    calibration: tuple[Path, ...] = ()
+    rig: Annotated[tuple[str, ...], Field(min_length=1)] = ("mono",)
+    delay_ms: dict[str, Annotated[float, Field(ge=0.0, le=1000.0)]] = Field(default_factory=dict)
     made: dict[str, Any] = Field(default_factory=dict)
 
     @model_validator(mode="after")
@@ -63,15 +74,32 @@ def read(path: Path) -> SimulationConfig:
 
 
 def override(config: SimulationConfig, registry: Registry, assignments: Iterable[str]) -> SimulationConfig:
-    """``config`` with options of the flight, the world or the IMU set from ``key=value`` texts."""
-    options = {"world": registry.find(WORLD, config.world.name).options, "imu": options_of(ImuErrors)}
+    """``config`` with options of the flight, the world, the IMU or a camera set from ``key=value`` texts."""
+    options = {camera.name: [_DELAY] for camera in rig_of(config).cameras}
+    options |= {"world": registry.find(WORLD, config.world.name).options, "imu": options_of(ImuErrors)}
     if config.trajectory is None and config.recorded is None:
         options["flight"] = registry.find(FLIGHT, config.flight.name).options
     tree = config.model_dump()
     for section, name, value in parse_assignments(assignments, options):
-        values = tree["imu"] if section == "imu" else tree[section]["options"]
-        values[name] = value
+        if section in ("world", "flight"):
+            tree[section]["options"][name] = value
+        elif section == "imu":
+            tree["imu"][name] = value
+        else:
+            tree[name][section] = value
     return validate(SimulationConfig, tree, "command line")
+
+
+def is_named(rig: tuple[str, ...]) -> bool:
+    """Whether it is one of :data:`RIGS`, which come before files of the same name."""
+    return len(rig) == 1 and rig[0] in RIGS
+
+
+def rig_of(config: SimulationConfig) -> Calibration:
+    """The cameras and the IMU that are simulated; raises :class:`CalibrationError`."""
+    if is_named(config.rig):
+        return packaged_calibration("euroc", cameras=RIGS[config.rig[0]])
+    return load_calibration(*config.rig)
 
 
 def complete(config: SimulationConfig, registry: Registry) -> SimulationConfig:
@@ -80,12 +108,12 @@ def complete(config: SimulationConfig, registry: Registry) -> SimulationConfig:
     def completed(part: PartConfig, kind: Kind) -> PartConfig:
         return PartConfig(name=part.name, options=registry.find(kind, part.name).validate(part.options))
 
-    Conditions.of(config.conditions)
+    check_levels(config.conditions)
     parts: dict[str, Any] = {
         "world": completed(config.world, WORLD),
         "trajectory": config.trajectory and config.trajectory.absolute(),
         "recorded": config.recorded and config.recorded.absolute(),
-        "calibration": tuple(path.absolute() for path in config.calibration),
+        "rig": config.rig if is_named(config.rig) else tuple(str(Path(path).absolute()) for path in config.rig),
     }
     if config.recorded is None:
         parts["imu"] = validate_options("the IMU", ImuErrors, config.imu)

@@ -8,15 +8,14 @@ from heapq import merge
 
 import numpy as np
 
-from vioframe.arrays import Float, Int
+from vioframe.arrays import Bool, Float, Int
 from vioframe.errors import ConfigError
 from vioframe.interfaces import Flight
-from vioframe.io.calibration import load_calibration, packaged_calibration
 from vioframe.io.trajectories import load_trajectory
 from vioframe.parts.registry import Registry
 from vioframe.simulation.camera import Shot, Studio, take_pictures
-from vioframe.simulation.conditions import Conditions
-from vioframe.simulation.config import SimulationConfig
+from vioframe.simulation.conditions import check_known, misled, of_cameras
+from vioframe.simulation.config import SimulationConfig, rig_of
 from vioframe.simulation.flights import fit_flight, levelled
 from vioframe.simulation.imu import ImuErrors, vibration
 from vioframe.simulation.scenario import Scenario, fly, load_euroc
@@ -38,41 +37,41 @@ class SimulatedRecording:
     """A data set that is made as it is read, by ``workers`` threads; the same whatever their number.
 
     ``config`` is complete. ``true_calibration`` is that of the rig which the images are rendered with, all its cameras
-    triggered together; ``calibration`` is what an estimator is told. ``ground_truth`` holds a state for every reading
-    of the IMU. Raises :class:`ConfigError` where the flight leads through a wall.
+    triggered together unless ``delay_ms`` says otherwise; ``calibration`` is what an estimator is told. ``conditions``
+    are those that each camera meets. ``ground_truth`` holds a state for every reading of the IMU. Raises
+    :class:`ConfigError` where the flight leads through a wall.
     """
 
     def __init__(self, config: SimulationConfig, registry: Registry, workers: int = 1) -> None:
         self.config = config
-        self.conditions = Conditions.of(config.conditions)
         self._workers = workers
         seeds = np.random.SeedSequence(config.seed).spawn(7)
         imu_rng, world_rng, movers_rng, light_rng, drops_rng, misled_rng, shaken_rng = map(np.random.default_rng, seeds)
-        known = (
-            load_calibration(*config.calibration)
-            if config.calibration
-            else packaged_calibration("euroc", cameras=["cam0"])
-        )
+        known = rig_of(config)
+        names = [camera.name for camera in known.cameras]
+        self.conditions = of_cameras(config.conditions, names)
+        check_known("delay_ms", config.delay_ms, names)
         if config.readout_ms is not None:
             known = _with_readout(known, [1e-3 * config.readout_ms] * len(known.cameras))
-        self.true_calibration = known
-        if self.conditions.readout_s:
-            self.true_calibration = _with_readout(
-                known, [camera.readout_s + self.conditions.readout_s for camera in known.cameras]
-            )
+        met = list(zip(known.cameras, self.conditions, strict=True))
+        self.true_calibration = _with_readout(known, [camera.readout_s + own.readout_s for camera, own in met])
+        # The IMU is late by the first camera; another that is not late by as much has a clock of its own.
+        late_ns = [own.late_ns - self.conditions[0].late_ns for own in self.conditions]
+        for index, more_ns in enumerate(late_ns):
+            offset_ns = known.cameras[index].time_offset_ns + more_ns
+            self.true_calibration = self.true_calibration.with_camera(index, time_offset_ns=offset_ns)
         self._cameras = range(len(self.true_calibration.cameras))
         for camera in self.true_calibration.cameras:
             if not camera.rotation_known:
                 raise ConfigError(f"rendering must know how {camera.name} is turned, and the calibration does not say")
-        self.calibration = self.conditions.mislead(known, misled_rng)
+        self.calibration = misled(known, self.conditions, misled_rng)
         self._scenario = self._fly(registry, imu_rng)
         self.name = self._scenario.name
         self.ground_truth = self._scenario.truth
         self._imu = self._read(shaken_rng)
-        self._frames_ns = self._kept(drops_rng)
-        self._gains = np.ones(len(self._frames_ns))
-        if self.conditions.stops:
-            self._gains = _wandering_gain(self._frames_ns / NS_PER_S, self.conditions.stops, light_rng)
+        frames_ns, taken = self._kept(drops_rng)
+        self._gains = self._brightness(frames_ns, light_rng)
+        self._sets = self._gathered(frames_ns, taken)
 
         t_ns = self.ground_truth.t_ns
         t_s = (t_ns - t_ns[0]) / NS_PER_S
@@ -81,7 +80,7 @@ class SimulatedRecording:
         p_WC = np.array([self._camera_poses(camera, t_ns)[1] for camera in self._cameras])
         for path in p_WC:
             check_clear(self.world, t_s, path)
-        count = self.conditions.object_count
+        count = self.conditions[0].object_count
         self._movers = draw_movers(count, t_s, p_WC, len(self.world.textures), movers_rng) if count else None
 
     def _fly(self, registry: Registry, rng: np.random.Generator) -> Scenario:
@@ -117,21 +116,51 @@ class SimulatedRecording:
     def _read(self, rng: np.random.Generator) -> list[ImuSample]:
         """The readings, shaken and late as the conditions have it."""
         t_ns, gyro_B, accel_B = self._scenario.imu_ns, self._scenario.gyro_B, self._scenario.accel_B
-        if self.conditions.vibration:
-            d_gyro, d_accel = vibration(self.conditions.vibration, (t_ns - t_ns[0]) / NS_PER_S, rng)
+        first = self.conditions[0]
+        if first.vibration:
+            d_gyro, d_accel = vibration(first.vibration, (t_ns - t_ns[0]) / NS_PER_S, rng)
             gyro_B, accel_B = gyro_B + d_gyro, accel_B + d_accel
-        return list(map(ImuSample, (t_ns + self.conditions.late_ns).tolist(), gyro_B, accel_B))
+        return list(map(ImuSample, (t_ns + first.late_ns).tolist(), gyro_B, accel_B))
 
-    def _kept(self, rng: np.random.Generator) -> Int:
-        """The stamps of the frames that are not dropped; the first and the last stay."""
+    def _kept(self, rng: np.random.Generator) -> tuple[Int, Bool]:
+        """The times (M,) of the frames that some camera does not drop, and which cameras those are (C, M).
+
+        None drops the first and the last one.
+        """
         frames_ns = self._scenario.frames_ns
-        kept = rng.random(len(frames_ns)) >= self.conditions.dropped_part
-        kept[[0, -1]] = True
-        return frames_ns[kept]
+        chance = rng.random(len(frames_ns))
+        kept = np.array([chance >= own.dropped_part for own in self.conditions])
+        kept[:, [0, -1]] = True
+        some = kept.any(axis=0)
+        return frames_ns[some], kept[:, some]
+
+    def _brightness(self, frames_ns: Int, rng: np.random.Generator) -> Float:
+        """(C, M) what each camera gains of the light at each frame."""
+        gains = np.ones((len(self.conditions), len(frames_ns)))
+        if any(own.stops for own in self.conditions):
+            wandering = _wandering(frames_ns / NS_PER_S, rng)
+            gains = np.array([2.0 ** (own.stops * wandering) for own in self.conditions])
+        from_middle_s = np.abs(frames_ns - 0.5 * (frames_ns[0] + frames_ns[-1])) / NS_PER_S
+        for gain, own in zip(gains, self.conditions, strict=True):
+            gain[from_middle_s < 0.5 * own.black_s] = 0.0
+        return gains
+
+    def _gathered(self, frames_ns: Int, taken: Bool) -> list[tuple[int, dict[int, int]]]:
+        """Stamps in ascending order, and by the cameras that take an image there the number of the frame it is of.
+
+        What would be taken after the last frame is not: it might have no readings behind it.
+        """
+        sets: dict[int, dict[int, int]] = {}
+        for index, camera in np.argwhere(taken.T).tolist():
+            delay_ms = self.config.delay_ms.get(self.true_calibration.cameras[camera].name, 0.0)
+            t_ns = int(frames_ns[index]) + round(1e6 * delay_ms)
+            if t_ns <= frames_ns[-1]:
+                sets.setdefault(t_ns, {})[camera] = index
+        return sorted(sets.items())
 
     @property
     def frame_count(self) -> int:
-        return len(self._frames_ns)
+        return len(self._sets)
 
     @property
     def imu_count(self) -> int:
@@ -143,15 +172,16 @@ class SimulatedRecording:
         studio = Studio(models, self.world, self._movers, self.conditions)
         pictures = take_pictures(studio, self._shots(), self._workers)
         samples: Iterable[Measurement] = self._imu
-        # As many pictures to a frame as there are cameras.
-        sets = zip(*[pictures] * len(self._cameras), strict=True)
-        frames: Iterable[Measurement] = map(FrameSet, self._frames_ns.tolist(), sets)
+        frames: Iterable[Measurement] = (
+            FrameSet(t_ns, tuple(next(pictures) if camera in taken else None for camera in self._cameras))
+            for t_ns, taken in self._sets
+        )
         yield from merge(samples, frames, key=lambda measurement: measurement.t_ns)
 
     def _shots(self) -> Iterator[Shot]:
-        """Of every camera in turn, for frame after frame."""
-        for index, (t_ns, gain) in enumerate(zip(self._frames_ns.tolist(), self._gains.tolist(), strict=True)):
-            for camera in self._cameras:
+        """Of every camera in turn, for set after set."""
+        for t_ns, taken in self._sets:
+            for camera, index in sorted(taken.items()):
                 instants_ns = self._instants(camera, t_ns)
                 R_WC, p_WC = self._camera_poses(camera, instants_ns.ravel())
                 movers = None
@@ -160,11 +190,12 @@ class SimulatedRecording:
                 rolling = self.true_calibration.cameras[camera].readout_s != 0.0
                 shape = instants_ns.shape if rolling else instants_ns.shape[:1]
                 R_WC, p_WC = R_WC.reshape(*shape, 3, 3), p_WC.reshape(*shape, 3)
-                yield Shot(camera, R_WC, p_WC, movers, gain, (self.config.seed, index, camera))
+                gain, seed = float(self._gains[camera, index]), (self.config.seed, index, camera)
+                yield Shot(camera, R_WC, p_WC, movers, gain, seed)
 
     def _instants(self, camera: int, t_ns: int) -> Int:
         """(S, R) stamps at which the exposure of R rows, or of the whole image, is rendered; the middle is ``t_ns``."""
-        exposure_s, on_body = self.conditions.exposure_s, self.true_calibration.cameras[camera]
+        exposure_s, on_body = self.conditions[camera].exposure_s, self.true_calibration.cameras[camera]
         count = self._blur_instants(camera, t_ns) if exposure_s else 1
         within = exposure_s * ((np.arange(count) + 0.5) / count - 0.5)
         of_row = np.zeros(1)
@@ -174,7 +205,7 @@ class SimulatedRecording:
 
     def _blur_instants(self, camera: int, t_ns: int) -> int:
         """How many instants of an exposure tell its blur apart from a row of sharp images."""
-        half_ns = round(0.5 * self.conditions.exposure_s * NS_PER_S)
+        half_ns = round(0.5 * self.conditions[camera].exposure_s * NS_PER_S)
         R_WC, p_WC = self._camera_poses(camera, self._known(np.array([t_ns - half_ns, t_ns + half_ns])))
         angle = float(np.arccos(np.clip(0.5 * (np.trace(R_WC[0].T @ R_WC[1]) - 1.0), -1.0, 1.0)))
         motion = angle + float(np.linalg.norm(p_WC[1] - p_WC[0])) / _TYPICAL_DEPTH_M
@@ -197,10 +228,10 @@ def _with_readout(calibration: Calibration, readout_s: list[float]) -> Calibrati
     return replace(calibration, cameras=tuple(replace(camera, readout_s=seconds) for camera, seconds in pairs))
 
 
-def _wandering_gain(t_s: Float, stops: float, rng: np.random.Generator) -> Float:
-    """Gains (N,) at ascending times (N,) s, within ``stops`` powers of two of one."""
+def _wandering(t_s: Float, rng: np.random.Generator) -> Float:
+    """(N,) between -1 and 1 at ascending times (N,) s."""
     drift = np.sin(2.0 * np.pi * (t_s / _DRIFT_PERIOD_S + rng.random()))
     count = int(np.ceil((t_s[-1] - t_s[0]) / _JUMP_EVERY_S[0])) + 1
     jumps_s = t_s[0] + np.cumsum(rng.uniform(*_JUMP_EVERY_S, count))
     level = rng.uniform(-1.0, 1.0, count + 1)[np.searchsorted(jumps_s, t_s)]
-    return np.asarray(2.0 ** (0.5 * stops * (drift + level)))
+    return np.asarray(0.5 * (drift + level))
