@@ -183,7 +183,7 @@ def test_noise_is_as_strong_as_asked_and_gain_saturates():
     noisy = Photographer(replace(studio, conditions=(Conditions(noise=0.6),))).take(shot)[inside].astype(float)
     assert (noisy - clean).std() == pytest.approx(0.048 * 255, rel=0.1)
     assert abs((noisy - clean).mean()) < 1.0
-    dark = Photographer(replace(studio, conditions=Conditions(low_light=1.0))).take(shot)[inside].astype(float)
+    dark = Photographer(replace(studio, conditions=(Conditions(low_light=1.0),))).take(shot)[inside].astype(float)
     assert dark.mean() == pytest.approx(clean.mean(), abs=2.0)
     assert (dark - clean).std() > 8.0
     assert (Photographer(studio).take(replace(shot, gain=8.0))[inside] == 255).all()
