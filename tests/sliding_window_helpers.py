@@ -30,7 +30,8 @@ from vioframe.io.calibration import packaged_calibration
 from vioframe.simulation import simulated_sequence
 from vioframe.types import Float
 
-CAMERA = packaged_calibration("euroc").cameras[0].model
+CALIBRATION = packaged_calibration("euroc")
+CAMERA = CALIBRATION.cameras[0].model
 NATURAL = np.repeat([0.01, 0.05, 0.1, 0.005, 0.05], 3)
 """Errors of a state that are large but linear enough: rad, m, m/s, rad/s, m/s^2."""
 NATURAL_CALIBRATION = np.repeat([0.005, 0.01, 0.002, 0.005, 2.0, 0.01], [3, 3, 1, 1, 4, 4])
@@ -46,9 +47,10 @@ def flown_window(
     offset_s: float = 0.003,
     readout_s: float = 0.0,
     camera: Camera = CAMERA,
+    cameras: int = 1,
     first_estimates: bool = True,
 ) -> tuple[Problem, Variables]:
-    """States a quarter of a second apart, landmarks seen by two frames or more, a prior on the first two states.
+    """States a quarter of a second apart, landmarks seen by two views or more, a prior on the first two states.
 
     They are the true ones, of which pixels and readings are off by noise, and the prior by as much. With ``noise_px`` 0
     all are exact. Each state but the last hosts some landmarks. With a rolling shutter the readout is one of
@@ -65,9 +67,13 @@ def flown_window(
         imu = join_segments([imu for imu, _ in sequence.packets[k + 1 : k + 6]])
         biases = np.zeros((2, 3)) if exact else rng.normal(size=(2, 3)) * [[0.002], [0.02]]
         readings.append(preintegrate(imu, *biases, sequence.calibration.imu))
-    on_body = sequence.calibration.cameras[0]
-    calibrated = Calibrated(on_body.R_BC, on_body.p_BC, offset_s, readout_s, intrinsics_of(camera)[1])
-    sightings, points = _sightings(states, calibrated, camera, landmarks, noise_px, on_sphere, rng)
+    lenses = [camera, *(other.model for other in CALIBRATION.cameras[1:cameras])]
+    calibrated = Calibrated.of(*CALIBRATION.cameras[:cameras])._replace(
+        offset_s=offset_s * np.arange(1.0, cameras + 1.0),
+        readout_s=readout_s * np.arange(1.0, cameras + 1.0),
+        intrinsics=np.stack([intrinsics_of(lens)[1] for lens in lenses]),
+    )
+    sightings, points = _sightings(states, calibrated, lenses, landmarks, noise_px, on_sphere, rng)
     x = Variables(states, calibrated, points)
     prior = prior_on(x, 2, rng)
     if exact:
@@ -85,7 +91,7 @@ def prior_on(x: Variables, frozen: int, rng: np.random.Generator) -> Prior:
     H, b = np.zeros((end, end)), np.zeros(end)
     H[np.ix_(index, index)] = random_covariance(rng, len(index)) / np.outer(sigma, sigma)
     b[index] = rng.normal(size=len(index)) / sigma
-    return Prior(H, b, x.states, x.camera, np.arange(len(x.states)) < frozen)
+    return Prior(H, b, x.states, x.cameras, np.arange(len(x.states)) < frozen)
 
 
 def standing(problem: Problem, state: int) -> Problem:
@@ -115,7 +121,7 @@ def moved(x: Variables, rng: np.random.Generator, scale: float) -> Variables:
 
 def natural(x: Variables) -> Float:
     """(n,) natural sizes of the error of states and calibration."""
-    return np.concatenate([np.tile(NATURAL, len(x.states)), NATURAL_CALIBRATION])
+    return np.concatenate([np.tile(NATURAL, len(x.states)), np.tile(NATURAL_CALIBRATION, len(x.cameras.p_BC))])
 
 
 def retracted(x: Variables, d: Float) -> Variables:
@@ -134,38 +140,40 @@ def numeric(function: Callable[[Float], Float], sizes: Float, eps: float = 1e-4)
     return np.stack(columns, axis=-1)
 
 
-def row_poses(states: StateArrays, camera: Calibrated, shutter: Shutter, row: int, frame: int) -> tuple[Float, Float]:
-    """R_WC (3, 3) and p_WC (3,) when the landmark ``row`` was seen in ``frame``."""
+def row_poses(states: StateArrays, cameras: Calibrated, shutter: Shutter, row: int, view: int) -> tuple[Float, Float]:
+    """R_WC (3, 3) and p_WC (3,) when the landmark ``row`` was seen in ``view``."""
+    frame, camera = divmod(view, len(cameras.p_BC))
     R_WB, p_WB = states.R_WB[frame], states.p_WB[frame]
     if shutter.rolling:
-        late_s = camera.readout_s * shutter.row[row, frame]
+        late_s = cameras.readout_s[camera] * shutter.row[row, view]
         p_WB = p_WB + R_WB @ shutter.velocity_B[frame] * late_s
         R_WB = R_WB @ so3.exp(shutter.rate_B[frame] * late_s)
-    return R_WB @ camera.R_BC, R_WB @ camera.p_BC + p_WB
+    return R_WB @ cameras.R_BC[camera], R_WB @ cameras.p_BC[camera] + p_WB
 
 
 def _sightings(
     states: StateArrays,
     calibrated: Calibrated,
-    camera: Camera,
+    lenses: list[Camera],
     count: int,
     noise_px: float,
     on_sphere: bool,
     rng: np.random.Generator,
 ) -> tuple[Sightings, Float]:
-    """Of random landmarks by random frames, two of them at least, and [x y rho] of the landmarks."""
-    frames, drawn = len(states), 4 * count
-    hosts = np.arange(drawn) % (frames - 1)
+    """Of random landmarks by random views, two of them at least, and [x y rho] of the landmarks."""
+    frames, N, drawn = len(states), len(lenses), 4 * count
+    views = N * frames
+    hosts = np.arange(drawn) % (views - N)
     xy_rho = np.column_stack([rng.uniform(-0.5, 0.5, (drawn, 2)), 1.0 / rng.uniform(3.0, 10.0, drawn)])
     p_WF = positions(states, calibrated, hosts, xy_rho)
     shutter = GLOBAL_SHUTTER
-    if calibrated.readout_s:
+    if calibrated.readout_s.any():
         own = np.random.default_rng(1)
-        shutter = Shutter(True, own.uniform(-0.5, 0.5, (drawn, frames)), *own.normal(size=(2, frames, 3)))
-    poses = [[row_poses(states, calibrated, shutter, i, f) for f in range(frames)] for i in range(drawn)]
+        shutter = Shutter(True, own.uniform(-0.5, 0.5, (drawn, views)), *own.normal(size=(2, frames, 3)))
+    poses = [[row_poses(states, calibrated, shutter, i, v) for v in range(views)] for i in range(drawn)]
     p_CF = np.array([[(p - p_WC) @ R_WC for R_WC, p_WC in own] for own, p in zip(poses, p_WF, strict=True)])
     in_view = (p_CF[..., 2] > 1.0) & (np.abs(p_CF[..., :2]) < 0.7 * p_CF[..., 2:]).all(axis=2)
-    seen = in_view & (rng.random((drawn, frames)) < 0.7) & (np.arange(frames) > hosts[:, None])
+    seen = in_view & (rng.random((drawn, views)) < 0.7) & (np.arange(views) > hosts[:, None])
     seen[np.arange(drawn), hosts] = True
     chosen = np.flatnonzero(seen.sum(axis=1) >= 2)[:count]
     assert len(chosen) == count
@@ -173,15 +181,18 @@ def _sightings(
     exact = p_CF[..., :2] / p_CF[..., 2:]
     exact[~seen] = 0.0
     velocity = np.where(seen[..., None], rng.normal(0.0, 0.3, exact.shape), 0.0)
-    xy = np.zeros_like(exact)
-    pixels = camera.distort(exact[seen]) + rng.normal(0.0, noise_px, (seen.sum(), 2))
-    xy[seen] = camera.undistort(pixels) + calibrated.offset_s * velocity[seen]
-    to_px = np.zeros((count, frames, 2, 2))
-    to_px[seen] = pixels_by_residual(*intrinsics_of(camera), xy[seen], on_sphere)
-    px = pixels_by_intrinsics(*intrinsics_of(camera), exact, seen)
+    noise, xy, to_px = np.zeros_like(exact), np.zeros_like(exact), np.zeros((count, views, 2, 2))
+    noise[seen] = rng.normal(0.0, noise_px, (seen.sum(), 2))
+    for c, lens in enumerate(lenses):
+        own = seen & (np.arange(views) % N == c)
+        pixels = lens.distort(exact[own]) + noise[own]
+        xy[own] = lens.undistort(pixels) + calibrated.offset_s[c] * velocity[own]
+        to_px[own] = pixels_by_residual(*intrinsics_of(lens), xy[own], on_sphere)
+    models, intrinsics = zip(*map(intrinsics_of, lenses), strict=True)
+    px = pixels_by_intrinsics(np.array(models), np.stack(intrinsics), exact, seen)
     lens = Lens(True, px, np.tile(calibrated.intrinsics, (frames, 1)))
     landmarks, in_front = in_hosts(states, calibrated, hosts, p_WF)
     assert in_front.all()
-    if calibrated.readout_s:
+    if shutter.rolling:
         shutter = shutter._replace(row=shutter.row[chosen])
     return Sightings(seen, xy, velocity, to_px, 0.8, 2.0, on_sphere, shutter, lens), landmarks

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -13,7 +15,6 @@ from vioframe.estimation.initialization.found import found_by
 from vioframe.estimation.initialization.window import ContradictedError, RefusalError, UnsureError
 from vioframe.estimation.lifecycle import LifeCycle
 from vioframe.geometry import so3
-from vioframe.geometry.kernels import intrinsics_of
 from vioframe.io.calibration import packaged_calibration
 from vioframe.simulation import TrackSequence, simulated_sequence
 from vioframe.types import Calibration, ImuSegment, Status
@@ -143,9 +144,8 @@ class TestFoundBy:
     @staticmethod
     def other(turn: float = 0.0, offset_s: float = 0.0, zoom: float = 1.0) -> Calibrated:
         camera = EUROC.cameras[0]
-        intrinsics = intrinsics_of(camera.model)[1]
-        intrinsics[:2] *= zoom
-        return Calibrated(camera.R_BC @ so3.exp(turn * AXIS), camera.p_BC, offset_s, 0.0, intrinsics)
+        turned = replace(camera, R_BC=camera.R_BC @ so3.exp(turn * AXIS), model=camera.model.zoomed(zoom))
+        return Calibrated.of(turned)._replace(offset_s=np.array([offset_s]))
 
     def test_only_what_is_clearly_off(self):
         found = found_by(EUROC, self.other(turn=0.001, offset_s=0.002, zoom=1.05), self.COV)

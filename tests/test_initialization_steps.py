@@ -111,7 +111,7 @@ def problem_of(s: Scene) -> tuple[Problem, Variables]:
     host = s.window.seen.argmax(axis=0)
     p_C = np.einsum("lji,lj->li", R_WC[host], s.p_WF - p_WC[host])
     truth = Variables(s.truth, camera, np.column_stack([p_C[:, :2] / p_C[:, 2:], 1.0 / p_C[:, 2]]))
-    return adjustment(s.window, s.imu(), truth, CAMERA, CALIBRATION_COV), truth
+    return adjustment(s.window, s.imu(), truth, [CAMERA], CALIBRATION_COV), truth
 
 
 class TestGyroBias:
@@ -225,9 +225,11 @@ class TestBundleAdjustment:
     def test_errors_vanish_at_the_truth(self):
         s = scene()
         problem, truth = problem_of(s)
-        np.testing.assert_allclose(problem.sightings.errors(truth.poses, truth.camera, truth.landmarks), 0.0, atol=1e-9)
+        np.testing.assert_allclose(
+            problem.sightings.errors(truth.poses, truth.cameras, truth.landmarks), 0.0, atol=1e-9
+        )
         hosts = problem.sightings.seen.argmax(axis=1)
-        np.testing.assert_allclose(positions(s.truth, truth.camera, hosts, truth.landmarks), s.p_WF, atol=1e-9)
+        np.testing.assert_allclose(positions(s.truth, truth.cameras, hosts, truth.landmarks), s.p_WF, atol=1e-9)
 
     def test_finds_back_from_far_off(self):
         s = scene()
@@ -237,7 +239,7 @@ class TestBundleAdjustment:
         start = s.truth.retract(rng.normal(0.0, sigma, (11, 15)))
         points = truth.landmarks + rng.normal(0.0, [0.01, 0.01, 0.05], truth.landmarks.shape)
         start = replace(truth, states=start, landmarks=points)
-        problem = adjustment(s.window, s.imu(), start, CAMERA, CALIBRATION_COV)
+        problem = adjustment(s.window, s.imu(), start, [CAMERA], CALIBRATION_COV)
         solution = adjusted(problem, start, CALIBRATION_COV)
         states = solution.variables.states
         assert solution.converged

@@ -106,11 +106,12 @@ def test_a_start_of_another_instant_than_the_first_frame_is_refused():
         life.process(*flight().packets[1])
 
 
-def test_cameras_may_take_turns():
+@pytest.mark.parametrize("name", BACKENDS)
+def test_cameras_may_take_turns(name):
     """Every other frame is of the right one alone; the left one finds the start, and both hold the scale."""
     sequence = simulated_sequence("figure_eight", duration_s=8.0, seed=1, calibration=STEREO)
     packets = [(imu, tracks.of_camera(k % 2)) for k, (imu, tracks) in enumerate(sequence.packets)]
-    life = LifeCycle(created("msckf"), STEREO)
+    life = LifeCycle(created(name), STEREO)
     estimates = [life.process(imu, tracks) for imu, tracks in packets]
     states = {e.state.t_ns: e.state for e in estimates if e.state is not None}
     assert len(states) > 60
@@ -119,6 +120,32 @@ def test_cameras_may_take_turns():
     begin, end = (states[t_ns] for t_ns in (min(states), max(states)))
     flown, expected = (np.linalg.norm(b.p_WB - a.p_WB) for a, b in ((begin, end), (truth[begin.t_ns], truth[end.t_ns])))
     assert abs(flown - expected) < 0.02 * max(expected, 1.0)
+
+
+@pytest.mark.parametrize("name", BACKENDS)
+def test_a_rig_begins_at_once_and_goes_on(name):
+    """Of one of its cameras nothing comes for a while, then of the other."""
+    sequence = simulated_sequence("figure_eight", duration_s=6.0, seed=2, calibration=STEREO)
+    life, estimates = LifeCycle(created(name), STEREO), []
+    for k, (imu, tracks) in enumerate(sequence.packets):
+        black = 1 if 30 <= k < 45 else 0 if 60 <= k < 75 else None
+        estimates.append(life.process(imu, tracks if black is None else tracks.only(tracks.camera != black)))
+    begin = next(k for k, e in enumerate(estimates) if e.status is Status.TRACKING)
+    assert estimates[begin].events[0] == "initialised (stereo)"
+    assert begin < 12
+    assert all(e.status is Status.TRACKING for e in estimates[begin:])
+    learned = estimates[-1].calibration
+    assert learned is not None
+    assert len(learned.calibration.cameras) == len(learned.sigma) == 2
+    truth = {state.t_ns: state for state in sequence.true_states}
+    speed = [np.linalg.norm(s.v_WB) for s in (estimates[-1].state, truth[sequence.packets[-1][1].t_ns])]
+    assert speed[0] == pytest.approx(speed[1], abs=0.2)
+
+
+def test_a_rig_of_which_a_camera_may_sit_anyhow_is_refused_in_one_line():
+    unknown = STEREO.with_camera(1, R_BC=np.full((3, 3), np.nan), rotation_known=False)
+    with pytest.raises(ConfigError, match=r"^of a rig every camera's rotation on the body must be known.*cam1 is not$"):
+        LifeCycle(created("msckf"), unknown)
 
 
 def test_two_cameras_are_refused_in_one_line():

@@ -8,7 +8,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from msckf_helpers import CALIBRATION, drawn_start, pose_nees, since
+from msckf_helpers import CALIBRATION, STEREO, drawn_start, pose_nees, since
 from scipy.stats import chi2
 from threadpoolctl import threadpool_limits
 
@@ -104,12 +104,16 @@ def test_exact_tracks_and_readings_give_the_exact_flight(flight, residual, limit
     assert checked > 500
 
 
-def test_errors_are_as_large_as_the_covariance_says():
+RIGS = pytest.mark.parametrize("calibration", [CALIBRATION, STEREO], ids=["mono", "stereo"])
+
+
+@RIGS
+def test_errors_are_as_large_as_the_covariance_says(calibration):
     """Three degrees of freedom over six flights, on readings as noisy as stated; each flight counts as one."""
     flights = 6
     values = []
     for seed in range(flights):
-        sequence = simulated_sequence("figure_eight", seed=seed, duration_s=10.0)
+        sequence = simulated_sequence("figure_eight", seed=seed, duration_s=10.0, calibration=calibration)
         done = fly(sequence, seed=seed, estimation=EXACT)
         assert position_errors(done, sequence).max() < 0.15
         values.append(pose_nees(done.states, {s.t_ns: s for s in sequence.true_states}))
@@ -135,10 +139,11 @@ def test_estimates_are_finite_and_covariances_positive(flight):
         assert np.linalg.eigvalsh(state.cov)[0] > 0.0
 
 
+@RIGS
 @pytest.mark.parametrize("first_estimates", [True, False])
-def test_yaw_never_becomes_better_known_than_it_was(first_estimates):
+def test_yaw_never_becomes_better_known_than_it_was(first_estimates, calibration):
     """Without first estimates it does, from nothing."""
-    sequence = simulated_sequence("aggressive", seed=3, duration_s=10.0)
+    sequence = simulated_sequence("aggressive", seed=3, duration_s=10.0, calibration=calibration)
     true = sequence.true_states[1]
     up_B = true.R_WB.T @ UP
     # Position and velocity turn with yaw, as after an initialisation: else a velocity would be a compass.
@@ -273,12 +278,25 @@ def test_parallax_is_free_of_rotation():
     def seen(points: Float) -> Float:
         return points[:, :2] / points[:, 2:]
 
+    R_WC, focal_px = np.stack([np.eye(3), R]), np.array([400.0])
     table = frames(seen(p_C), seen(p_C @ R))
-    assert parallax(table, 0, 1, R) == (30, pytest.approx(0.0, abs=1e-12))
+    assert parallax(table, R_WC, focal_px) == (30, pytest.approx(0.0, abs=1e-9))
     aside = p_C - [0.4, 0.0, 0.0]
-    common, moved = parallax(frames(seen(p_C), seen((aside @ R)[:20])), 0, 1, R)
-    assert (common, moved) == (20, pytest.approx(0.1, abs=1e-12))
-    assert parallax(frames(seen(p_C), np.empty((0, 2))), 0, 1, R) == (0, 0.0)
+    common, moved_px = parallax(frames(seen(p_C), seen((aside @ R)[:20])), R_WC, focal_px)
+    assert (common, moved_px) == (20, pytest.approx(40.0, abs=1e-9))
+    assert parallax(frames(seen(p_C), np.empty((0, 2))), R_WC, focal_px) == (0, 0.0)
+
+
+def test_cameras_that_take_turns_have_parallax_each_to_its_own_last_frame():
+    table, xy = TrackTable(cameras=2), np.random.default_rng(0).uniform(-0.3, 0.3, (20, 2))
+    for t, (camera, moved) in enumerate([(0, 0.0), (1, 0.0), (0, 0.1), (1, 0.05)]):
+        ids = 100 * camera + np.arange(20)
+        seen = xy + np.array([moved, 0.0])
+        table.add_frame(FrameTracks(t, ids, np.full(20, camera), 400.0 * seen, seen))
+    R_WC = np.tile(np.eye(3), (8, 1, 1))
+    assert parallax(table, R_WC, np.array([400.0, 200.0])) == (20, pytest.approx(10.0))
+    table.drop_frame(3)
+    assert parallax(table, R_WC[:6], np.array([400.0, 200.0])) == (20, pytest.approx(40.0))
 
 
 # What the options do.

@@ -25,12 +25,12 @@ from vioframe.estimation.factors import reprojection
 from vioframe.estimation.factors.inertial import ImuFactors
 from vioframe.estimation.factors.landmarks import camera_poses, positions
 from vioframe.estimation.factors.problem import Prior, Problem, Variables, pose_columns, symmetric
-from vioframe.estimation.factors.reprojection import CALIBRATION_SIZE, READOUT, Poses, Sightings
+from vioframe.estimation.factors.reprojection import CALIBRATION_SIZE, OFFSET, READOUT, Poses, Sightings
 from vioframe.estimation.factors.solver import covariance
 from vioframe.geometry import so3
 from vioframe.geometry.cameras import Camera
 from vioframe.geometry.kernels import intrinsics_of
-from vioframe.types import Float
+from vioframe.types import Float, Int
 
 CAMERAS = {
     "radtan": CAMERA,
@@ -48,17 +48,18 @@ def across(xy: Float) -> Float:
 
 def residuals(x: Variables, s: Sightings) -> Float:
     """(N, 2) px, of all sightings in turn, neither whitened nor weighted."""
-    row, frame = np.nonzero(s.seen)
-    p_WF = positions(x.states, x.camera, s.seen.argmax(axis=1), x.landmarks)
-    poses = [row_poses(x.states, x.camera, s.shutter, *at) for at in zip(row, frame, strict=True)]
+    row, view = np.nonzero(s.seen)
+    of = view % len(x.cameras.p_BC)
+    p_WF = positions(x.states, x.cameras, s.seen.argmax(axis=1), x.landmarks)
+    poses = [row_poses(x.states, x.cameras, s.shutter, *at) for at in zip(row, view, strict=True)]
     p_C = np.array([(p - p_WC) @ R_WC for p, (R_WC, p_WC) in zip(p_WF[row], poses, strict=True)])
-    xy = s.xy[row, frame] - x.camera.offset_s * s.velocity[row, frame]
+    xy = s.xy[row, view] - x.cameras.offset_s[of, None] * s.velocity[row, view]
     if s.on_sphere:
         r = (across(xy) @ (p_C / np.linalg.norm(p_C, axis=1, keepdims=True))[..., None])[..., 0]
     else:
         r = p_C[:, :2] / p_C[:, 2:] - xy
-    lens = s.lens.px[row, frame] @ (x.camera.intrinsics - s.lens.at[frame])[..., None]
-    return (s.to_px[row, frame] @ r[..., None] + lens)[..., 0]
+    lens = s.lens.px[row, view] @ (x.cameras.intrinsics[of] - s.lens.at[view])[..., None]
+    return (s.to_px[row, view] @ r[..., None] + lens)[..., 0]
 
 
 def sizes(x: Variables) -> Float:
@@ -76,17 +77,26 @@ def expected_normal(x: Variables, at: Variables, s: Sightings) -> tuple[Float, F
 
 def assembled(x: Variables, first: Variables, s: Sightings) -> tuple[Float, Float]:
     """The same as the kernels have it."""
-    camera, n = x.camera, len(natural(x))
+    n = len(natural(x))
     poses, first_poses = (Poses.of(v.states.R_WB, v.states.p_WB) for v in (x, first))
-    H_p, b_p, V, W, c, *_ = s.linearise(poses, first_poses, camera, x.landmarks)
+    H_p, b_p, V, W, c, *_ = s.linearise(poses, first_poses, x.cameras, x.landmarks)
     total = n + 3 * len(x.landmarks)
-    H, b, columns = np.zeros((total, total)), np.zeros(total), pose_columns(len(x.states))
+    H, b, columns = np.zeros((total, total)), np.zeros(total), columns_of(x)
     H[np.ix_(columns, columns)], b[columns] = symmetric(H_p), b_p
     for i in range(len(V)):
         own = np.arange(n + 3 * i, n + 3 * i + 3)
         H[np.ix_(own, own)], b[own] = V[i], c[i]
         H[np.ix_(own, columns)], H[np.ix_(columns, own)] = W[i], W[i].T
     return H, b
+
+
+def columns_of(x: Variables) -> Int:
+    return pose_columns(len(x.states), len(x.cameras.p_BC))
+
+
+def offsets_of(x: Variables) -> Int:
+    """Where the time offsets are: by them Jacobians on the sphere hold to first order in the noise alone."""
+    return np.arange(15 * len(x.states) + OFFSET, len(natural(x)), CALIBRATION_SIZE)
 
 
 def assert_normal(actual: tuple[Float, Float], expected: tuple[Float, Float], scale: Float, rtol: float) -> None:
@@ -96,39 +106,42 @@ def assert_normal(actual: tuple[Float, Float], expected: tuple[Float, Float], sc
         np.testing.assert_allclose(a * unit, e * unit, rtol=0.0, atol=rtol * np.abs(e * unit).max())
 
 
+RIGS = pytest.mark.parametrize("cameras", [1, 2], ids=["mono", "stereo"])
 SHUTTERS = pytest.mark.parametrize("readout_s", [0.0, 0.03], ids=["global", "rolling"])
 
 
 @pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS.keys())
 @pytest.mark.parametrize("on_sphere", [False, True], ids=["plane", "sphere"])
+@RIGS
 @SHUTTERS
-def test_sightings_on_the_manifold(camera, on_sphere, readout_s):
+def test_sightings_on_the_manifold(camera, on_sphere, cameras, readout_s):
     """Without noise, so that the tangents of the sphere, which turn with the time offset, have no part in it."""
-    problem, x = flown_window(on_sphere=on_sphere, noise_px=0.0, camera=camera, readout_s=readout_s)
+    problem, x = flown_window(on_sphere=on_sphere, noise_px=0.0, camera=camera, cameras=cameras, readout_s=readout_s)
     H, b = assembled(x, x, problem.sightings)
     expected, _ = expected_normal(x, x, problem.sightings)
     scale = sizes(x)
     assert_normal((H,), (expected,), scale, 1e-9)
     # No block is zero: poses of the host and the frame, the calibration, landmarks; all but the readout of no shutter.
     seen = np.diag(H) > 0.0
-    seen[15 * len(x.states) + READOUT] |= not readout_s
-    assert seen[pose_columns(len(x.states))].all()
+    seen[15 * len(x.states) + READOUT : len(natural(x)) : CALIBRATION_SIZE] |= not readout_s
+    assert seen[columns_of(x)].all()
     assert seen[15 * len(x.states) :].all()
     # The sphere's residual is exact, so there is nothing to pull at.
     assert np.abs(b * scale).max() < 1e-6
 
 
 @pytest.mark.parametrize("on_sphere", [False, True], ids=["plane", "sphere"])
+@RIGS
 @SHUTTERS
-def test_first_estimates_hold_the_jacobian_and_not_the_residual(on_sphere, readout_s):
-    problem, first = flown_window(on_sphere=on_sphere, readout_s=readout_s)
+def test_first_estimates_hold_the_jacobian_and_not_the_residual(on_sphere, cameras, readout_s):
+    problem, first = flown_window(on_sphere=on_sphere, cameras=cameras, readout_s=readout_s)
     x = moved(first, np.random.default_rng(1), 0.3)
     # Of what is linearised anew the first estimate is the present one.
     at = replace(x, states=first.states)
     s, scale = problem.sightings, sizes(x)
     expected, actual = expected_normal(x, at, s), assembled(x, at, s)
     if on_sphere:
-        offset = 15 * len(x.states) + 6
+        offset = offsets_of(x)
         expected, actual = ((np.delete(H, offset, 0), np.delete(b, offset)) for H, b in (expected, actual))
         expected, actual = ((np.delete(H, offset, 1), b) for H, b in (expected, actual))
         scale = np.delete(scale, offset)
@@ -146,11 +159,11 @@ def test_another_lens_moves_points_as_undistorting_them_anew(camera, on_sphere):
     change = np.array([4.0, -3.0, 2.0, 1.0, 0.01, -0.01, 0.001, 0.002])
     left = []
     for part in (1.0, 0.1):
-        other = camera.with_intrinsics(x.camera.intrinsics + part * change)
+        other = camera.with_intrinsics(x.cameras.intrinsics[0] + part * change)
         xy = np.zeros_like(s.xy)
         xy[s.seen] = other.undistort(camera.distort(s.xy[s.seen]))
-        anew = s._replace(xy=xy).errors(x.poses, x.camera, x.landmarks)
-        moved_lens = s.errors(x.poses, x.camera._replace(intrinsics=intrinsics_of(other)[1]), x.landmarks)
+        anew = s._replace(xy=xy).errors(x.poses, x.cameras, x.landmarks)
+        moved_lens = s.errors(x.poses, x.cameras._replace(intrinsics=intrinsics_of(other)[1][None]), x.landmarks)
         assert anew.min() > 0.1 * part
         left.append(np.abs(moved_lens - anew).max())
     assert left[0] < 0.3
@@ -182,7 +195,7 @@ def _of_readings(problem: Problem, x: Variables, at: Variables) -> Float:
     return H
 
 
-def assert_gradient(problem: Problem, x: Variables, skip: tuple[int, ...] = ()) -> None:
+def assert_gradient(problem: Problem, x: Variables, skip: Int | tuple[()] = ()) -> None:
     """The gradient is that of the cost, to a millionth of a standard deviation's worth."""
     normal = problem.linearise(x)
     b = np.concatenate([normal.b, normal.c.ravel()])
@@ -197,14 +210,17 @@ def assert_gradient(problem: Problem, x: Variables, skip: tuple[int, ...] = ()) 
 
 @pytest.mark.parametrize("on_sphere", [False, True], ids=["plane", "sphere"])
 @pytest.mark.parametrize("noise_px", [0.5, 20.0])
+@RIGS
 @SHUTTERS
-def test_gradient_of_the_robust_cost_of_sightings(on_sphere, noise_px, readout_s):
+def test_gradient_of_the_robust_cost_of_sightings(on_sphere, noise_px, cameras, readout_s):
     """Also far out, where Cauchy's loss discounts nearly all."""
-    problem, x = flown_window(on_sphere=on_sphere, noise_px=noise_px, first_estimates=False, readout_s=readout_s)
+    problem, x = flown_window(
+        on_sphere=on_sphere, noise_px=noise_px, cameras=cameras, first_estimates=False, readout_s=readout_s
+    )
     nothing = replace(problem.prior, H=np.zeros_like(problem.prior.H), b=np.zeros_like(problem.prior.b))
     problem = replace(problem, prior=nothing, readings=ImuFactors.stack([]))
-    offset = 15 * len(x.states) + 6
-    assert_gradient(problem, moved(x, np.random.default_rng(0), 0.2), (offset,) if on_sphere else ())
+    skip = offsets_of(x) if on_sphere else np.empty(0, int)
+    assert_gradient(problem, moved(x, np.random.default_rng(0), 0.2), skip)
 
 
 def test_gradient_of_readings_and_standstill():
@@ -219,8 +235,9 @@ def test_gradient_of_readings_and_standstill():
     assert np.flatnonzero(np.abs(H).max(axis=1)).tolist() == [*range(30, 33), *range(36, 45)]
 
 
-def test_gradient_of_everything_at_once():
-    problem, x = flown_window(first_estimates=False, readout_s=0.03)
+@RIGS
+def test_gradient_of_everything_at_once(cameras):
+    problem, x = flown_window(first_estimates=False, cameras=cameras, readout_s=0.03)
     assert_gradient(standing(problem, 3), replace(x, landmarks=x.landmarks + 0.01))
 
 
@@ -264,7 +281,7 @@ def test_prior_on_one_state_is_its_covariance():
     rng = np.random.default_rng(0)
     A = rng.normal(size=(15, 15))
     state = replace(x.states[:1].unstack(np.zeros(1, np.int64))[0], cov=A @ A.T)
-    prior = Prior.of(state, x.camera, np.diag(np.arange(1.0, 17.0)))
+    prior = Prior.of(state, x.cameras, np.diag(np.arange(1.0, 17.0)))
     np.testing.assert_allclose(prior.H[:15, :15] @ state.cov, np.eye(15), atol=1e-8)
     np.testing.assert_allclose(np.diag(prior.H)[15:], 1.0 / np.arange(1.0, 17.0))
     assert not prior.H[:15, 15:].any()
@@ -320,7 +337,7 @@ def test_residuals_are_pixels_of_the_distorted_image(camera, on_sphere):
 def test_errors_are_root_mean_squares_and_infinite_behind_the_camera(on_sphere):
     problem, x = flown_window(on_sphere=on_sphere)
     s = problem.sightings
-    poses, camera = Poses.of(x.states.R_WB, x.states.p_WB), x.camera
+    poses, camera = Poses.of(x.states.R_WB, x.states.p_WB), x.cameras
     r = residuals(x, s)
     row, _ = np.nonzero(s.seen)
     expected = np.sqrt(np.bincount(row, (r * r).sum(axis=1)) / (2.0 * s.seen.sum(axis=1))) / s.sigma

@@ -111,12 +111,12 @@ def slid(problem: Problem, at: list[Variables]) -> tuple[Problem, Variables]:
         prior = prior.without_newest()
     for k, x in enumerate(at[:-1]):
         window, rows = slice(k, k + SPAN), hosts == k
-        here = Variables(x.states[window], x.camera, x.landmarks[rows])
+        here = Variables(x.states[window], x.cameras, x.landmarks[rows])
         oldest = part(problem, prior, window, slice(k, k + 1), rows)
         oldest = replace(oldest, still={i: still for i, still in oldest.still.items() if i == 0})
         prior = marginalise_oldest(oldest, here).with_state(x.states[k + 1 : k + 1 + SPAN])
     gone, x, rows = len(at) - 1, at[-1], hosts >= len(at) - 1
-    left = Variables(x.states[gone:], x.camera, x.landmarks[rows])
+    left = Variables(x.states[gone:], x.cameras, x.landmarks[rows])
     return part(problem, prior, slice(gone, frames), slice(gone, frames - 1), rows), left
 
 

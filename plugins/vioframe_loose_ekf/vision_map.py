@@ -94,11 +94,11 @@ def adjust(scene: VisionMap, sigma: float, held: int, iterations: int) -> None:
     hosts = seen.argmax(axis=1)
     R_VC, p_VC = _stacked(scene.poses)
     states = StateArrays(R_VC, p_VC, *np.zeros((3, len(p_VC), 3)))
-    camera = Calibrated(np.eye(3), np.zeros(3))
+    camera = Calibrated(np.eye(3)[None], np.zeros((1, 3)), np.zeros(1), np.zeros(1), np.zeros((1, 8)))
     landmarks, in_front = in_hosts(states, camera, hosts, scene.p_VF[rows])
     seen &= in_front[:, None]
 
-    columns = pose_columns(len(states))[:-CALIBRATION_SIZE]
+    columns = pose_columns(len(states), 1)[:-CALIBRATION_SIZE]
     n = 15 * len(states) + CALIBRATION_SIZE
     weak = Prior(_UNSEEING * np.eye(n), np.zeros(n), states, camera, np.ones(len(states), bool))
     to_plane = np.tile(np.eye(2), (*seen.shape, 1, 1))

@@ -27,6 +27,8 @@ _MOST = 0.8
 class SlidingWindow:
     """One frame at a time; settings in :class:`SlidingWindowOptions`."""
 
+    takes_rigs = True
+
     def __init__(self, options: SlidingWindowOptions | None = None) -> None:
         self._options = options or SlidingWindowOptions()
 
@@ -36,6 +38,8 @@ class SlidingWindow:
         self.window = Window(start, self._options)
         self._before = start.tracks
         self._pending: list[ImuSegment] = []
+        # When something that each camera saw was last in it.
+        self._used_ns = np.full(len(start.calibration.calibration.cameras), start.state.t_ns)
 
     def process(self, imu: ImuSegment, tracks: FrameTracks, still: bool) -> Estimate:
         """Estimate one frame: predicted from the readings, or optimised where it is due."""
@@ -46,7 +50,9 @@ class SlidingWindow:
         since = join_segments(self._pending)
         predicted = window.predict(since)
         still = still and self._stands_still(predicted, since)
-        due = since.duration_s > 1.0 / options.max_rate_hz - 0.5 * imu.duration_s
+        of = np.unique(tracks.camera) if len(tracks.ids) else np.arange(len(self._used_ns))
+        waited_s = 1e-9 * (tracks.t_ns - self._used_ns[of].min())
+        due = waited_s > 1.0 / options.max_rate_hz - 0.5 * imu.duration_s
         watch.lap("propagate")
         if not due:
             return Estimate(
@@ -57,6 +63,7 @@ class SlidingWindow:
                 stage_seconds=watch.seconds,
             )
 
+        self._used_ns[of] = tracks.t_ns
         self._pending.clear()
         if still:
             window.hold_still(tracks.t_ns, Standstill.over(since, self._noise))
@@ -107,7 +114,7 @@ def _check_continuity(before: FrameTracks, tracks: FrameTracks, imu: ImuSegment)
     """
     if min(len(before.ids), len(tracks.ids)) < _MANY_TRACKS:
         return
-    if np.isin(tracks.ids, before.ids, assume_unique=True).any():
+    if np.isin(tracks.ids, before.ids).any() or not np.isin(tracks.camera, before.camera).any():
         return
     if np.linalg.norm(imu.gyro_B, axis=1).max() < _SLOW_TURN:
         raise DivergedError("everything in sight changed at once, though the body hardly turned")

@@ -8,8 +8,10 @@ from dataclasses import replace
 import numpy as np
 
 from vioframe.arrays import Bool
+from vioframe.estimation import rig
 from vioframe.estimation.factors.inertial import ImuFactors, StateArrays
 from vioframe.estimation.factors.landmarks import (
+    camera_poses,
     image_velocities,
     in_hosts,
     in_images,
@@ -39,6 +41,7 @@ from vioframe.estimation.inertial.noise import noise_over
 from vioframe.estimation.inertial.preintegration import Preintegrated, join_segments, preintegrate
 from vioframe.estimation.standstill import Standstill
 from vioframe.geometry.kernels import intrinsics_of
+from vioframe.geometry.two_view import rays
 from vioframe.types import (
     NS_PER_S,
     UNKNOWN_READOUT_S,
@@ -65,28 +68,29 @@ class Window:
 
     def __init__(self, start: Start, options: SlidingWindowOptions) -> None:
         state, calibration = start.state, start.calibration.calibration
-        (camera,), (sigma,) = calibration.cameras, start.calibration.sigma
         self._given = calibration
         self._noise_at_rest, self._noise = start.noise_at_rest, calibration.imu
         self._options = options
-        self._focal_px = camera.model.focal_px
-        self._sigma = options.pixel_sigma / self._focal_px
+        self._focal_px = np.array([camera.model.focal_px for camera in calibration.cameras])
+        self._sigma = options.pixel_sigma / self._focal_px[0]
         self._t_ns = [state.t_ns]
         self._states = StateArrays.stack([state])
         self._gyro_B = start.imu.gyro_B[-1:]
-        self._camera_model, _ = intrinsics_of(camera.model)
-        self._camera = Calibrated.of(camera)
-        known = sigma.stacked()
-        known[READOUT] = known[READOUT] or options.calibrate_readout * UNKNOWN_READOUT_S
-        self._calibrated = _calibrated(options) & (known > 0.0)
-        self._camera_sigma = np.where(self._calibrated, known, 0.0)
-        self._prior = Prior.of(state, self._camera, np.diag(self._camera_sigma**2))
+        self._models = np.array([intrinsics_of(camera.model)[0] for camera in calibration.cameras])
+        self._cameras = Calibrated.of(*calibration.cameras)
+        unknown_s = options.calibrate_readout * UNKNOWN_READOUT_S
+        sigma = tuple(replace(s, readout_s=s.readout_s or unknown_s) for s in start.calibration.sigma)
+        cov = rig.covariance(replace(start.calibration, sigma=sigma))
+        self._calibrated = np.tile(_calibrated(options), len(sigma)) & (np.diag(cov) > 0.0)
+        cov[~self._calibrated], cov[:, ~self._calibrated] = 0.0, 0.0
+        self._camera_sigma = np.sqrt(np.diag(cov))
+        self._prior = Prior.of(state, self._cameras, cov)
         self._readings: list[Preintegrated] = []
         self._still: dict[int, Standstill] = {}
         self._newest_is_keyframe = True
         self._cov = state.cov
-        self._undistorted_with = np.empty((0, 8))  # each frame's points
-        self.tracks = LandmarkTable()
+        self._undistorted_with = np.empty((0, 8))  # each view's points
+        self.tracks = LandmarkTable(len(sigma))
         self._add_tracks(start.tracks)
 
     def __len__(self) -> int:
@@ -98,23 +102,25 @@ class Window:
         return replace(self._states[-1:].unstack(np.array(self._t_ns[-1:]))[0], cov=self._cov)
 
     @property
-    def camera(self) -> Calibrated:
-        return self._camera
+    def cameras(self) -> Calibrated:
+        return self._cameras
 
     def calibration(self) -> CalibrationEstimate:
         """What is believed of the calibration by now."""
-        given, camera, sigma = self._given.cameras[0], self._camera, self._camera_sigma
-        offset_ns = given.time_offset_ns + round(camera.offset_s * NS_PER_S)
-        learned = self._given.with_camera(
-            0,
-            model=given.model.with_intrinsics(camera.intrinsics),
-            R_BC=camera.R_BC,
-            p_BC=camera.p_BC,
-            time_offset_ns=offset_ns,
-            readout_s=camera.readout_s,
+        learned, sigmas, x = self._given, self._camera_sigma.reshape(-1, CALIBRATION_SIZE), self._cameras
+        for c, given in enumerate(self._given.cameras):
+            learned = learned.with_camera(
+                c,
+                model=given.model.with_intrinsics(x.intrinsics[c]),
+                R_BC=x.R_BC[c],
+                p_BC=x.p_BC[c],
+                time_offset_ns=self._given.cameras[0].time_offset_ns + round(x.offset_s[c] * NS_PER_S),
+                readout_s=float(x.readout_s[c]),
+            )
+        return CalibrationEstimate(
+            learned,
+            tuple(CameraSigma(s[:3], s[3:6], float(s[OFFSET]), s[INTRINSICS], float(s[READOUT])) for s in sigmas),
         )
-        known = CameraSigma(sigma[:3], sigma[3:6], float(sigma[OFFSET]), sigma[INTRINSICS], float(sigma[READOUT]))
-        return CalibrationEstimate(learned, (known,))
 
     @property
     def prior(self) -> Prior:
@@ -143,12 +149,19 @@ class Window:
         self._newest_is_keyframe = False
 
     def _add_tracks(self, tracks: FrameTracks) -> None:
-        on_sphere, intrinsics = self._options.residual == "sphere", self._camera.intrinsics
+        on_sphere, lenses = self._options.residual == "sphere", list(enumerate(self._cameras.intrinsics))
         if self._varies_lens:
-            xy_normalised = undistorted(self._camera_model, intrinsics, tracks.xy, tracks.xy_normalised)
+            xy_normalised = np.empty_like(tracks.xy_normalised)
+            for c, lens in lenses:
+                own = tracks.camera == c
+                guess = tracks.xy_normalised[own]
+                xy_normalised[own] = undistorted(int(self._models[c]), lens, tracks.xy[own], guess)
             tracks = replace(tracks, xy_normalised=xy_normalised).finite()
-        self._undistorted_with = np.concatenate([self._undistorted_with, intrinsics[None]])
-        to_px = pixels_by_residual(self._camera_model, intrinsics, tracks.xy_normalised, on_sphere)
+        self._undistorted_with = np.concatenate([self._undistorted_with, self._cameras.intrinsics])
+        to_px = np.empty((len(tracks.ids), 2, 2))
+        for c, lens in lenses:
+            own = tracks.camera == c
+            to_px[own] = pixels_by_residual(int(self._models[c]), lens, tracks.xy_normalised[own], on_sphere)
         at = self.tracks.add_frame(tracks)
         self.tracks.to_px[at] = to_px
 
@@ -161,10 +174,10 @@ class Window:
         """Decide whether the newest frame stays in the window, and say so."""
         if not self._newest_is_keyframe:
             options, k = self._options, len(self) - 1
-            R_WC = self._states.R_WB @ self._camera.R_BC
-            common, moved = parallax(self.tracks, k - 1, k, R_WC[k - 1].T @ R_WC[k])
+            R_WC, _ = camera_poses(self._states, self._cameras)
+            common, moved_px = parallax(self.tracks, R_WC, self._focal_px)
             self._newest_is_keyframe = (
-                moved * self._focal_px >= options.keyframe_parallax_px
+                moved_px >= options.keyframe_parallax_px
                 or common < options.keyframe_min_tracks
                 or self._t_ns[k] - self._t_ns[k - 1] >= options.keyframe_interval_s * NS_PER_S
             )
@@ -182,7 +195,7 @@ class Window:
         self._t_ns.pop()
         self._readings.pop()
         self._states, self._gyro_B = self._states[:-1], self._gyro_B[:-1]
-        self._undistorted_with = self._undistorted_with[:-1]
+        self._undistorted_with = self._undistorted_with[: -self.tracks.cameras]
         self._prior = self._prior.without_newest()
 
     def triangulate(self) -> None:
@@ -190,7 +203,7 @@ class Window:
         tracks = self.tracks
         rows = np.flatnonzero(~tracks.known & (tracks.lengths() >= self._options.min_observations))
         known, landmarks = triangulate_tracks(
-            self._states, self._camera, tracks.seen[rows], tracks.xy_normalised[rows], self._sigma, self._shutter(rows)
+            self._states, self._cameras, tracks.seen[rows], tracks.xy_normalised[rows], self._sigma, self._shutter(rows)
         )
         tracks.landmarks[rows], tracks.known[rows] = landmarks, known
 
@@ -215,7 +228,7 @@ class Window:
             max_seconds=1e-3 * options.max_solve_ms,
         )
         x = solution.variables
-        self._states, self._camera, self.tracks.landmarks[rows] = x.states, x.camera, x.landmarks
+        self._states, self._cameras, self.tracks.landmarks[rows] = x.states, x.cameras, x.landmarks
         self._cov, self._camera_sigma = self._covariance(solution.normal)
         return solution.iterations
 
@@ -224,21 +237,21 @@ class Window:
         tracks = self.tracks
         rows = np.flatnonzero(tracks.known)
         x = self._variables(rows)
-        errors = self._sightings(rows).errors(x.poses, x.camera, x.landmarks)
+        errors = self._sightings(rows).errors(x.poses, x.cameras, x.landmarks)
         bad = (errors * self._options.pixel_sigma > self._options.outlier_px) | (x.landmarks[:, 2] <= 0.0)
-        newest = tracks.seen[rows, -1]
+        newest = tracks.in_sight()[rows]
         tracks.drop(rows[bad])
         return int((bad & newest).sum()), int(newest.sum())
 
     @property
     def in_sight(self) -> int:
         """Number of known landmarks that the newest frame sees."""
-        return int((self.tracks.known & self.tracks.seen[:, -1]).sum())
+        return int((self.tracks.known & self.tracks.in_sight()).sum())
 
     def landmarks(self) -> tuple[Int, Float]:
         """Ids (L,) and positions p_WF (L, 3) m of the known landmarks."""
         rows = np.flatnonzero(self.tracks.known)
-        p_WF = positions(self._states, self._camera, self.tracks.hosts[rows], self.tracks.landmarks[rows])
+        p_WF = positions(self._states, self._cameras, self.tracks.hosts[rows], self.tracks.landmarks[rows])
         return self.tracks.ids[rows], p_WF
 
     def marginalise_oldest(self) -> None:
@@ -248,32 +261,33 @@ class Window:
         them is left for later: the prior would freeze those states at estimates that have hardly begun.
         """
         tracks = self.tracks
-        rows = np.flatnonzero(tracks.known & (tracks.hosts == 0))
+        rows = np.flatnonzero(tracks.known & (tracks.hosts < tracks.cameras))
         seen = tracks.seen[rows]
-        seen[seen[:, -1], (len(self) + 1) // 2 :] = False
+        seen[tracks.in_sight()[rows], tracks.cameras * ((len(self) + 1) // 2) :] = False
         sightings = self._sightings(rows)._replace(seen=seen)
         still = {k: still for k, still in self._still.items() if k == 0}
         problem = self._problem(self._readings[:1], still, sightings)
         self._prior = marginalise_oldest(problem, self._variables(rows))
-        ids, p_WF = tracks.ids[rows], positions(self._states, self._camera, tracks.hosts[rows], tracks.landmarks[rows])
+        p_WF = positions(self._states, self._cameras, tracks.hosts[rows], tracks.landmarks[rows])
+        ids = tracks.ids[rows]
         tracks.drop_frame(0)
         self._t_ns.pop(0)
         self._readings.pop(0)
         self._states, self._gyro_B = self._states[1:], self._gyro_B[1:]
-        self._undistorted_with = self._undistorted_with[1:]
+        self._undistorted_with = self._undistorted_with[tracks.cameras :]
         self._still = {k - 1: still for k, still in self._still.items() if k > 0}
         self._host_again(ids, p_WF)
 
     def _host_again(self, ids: Int, p_WF: Float) -> None:
-        """Express landmarks at ``p_WF`` (N, 3) m in the frames that now host them, where two or more see them."""
+        """Express landmarks at ``p_WF`` (N, 3) m in the views that now host them, where two or more see them."""
         tracks = self.tracks
         _, rows, of = np.intersect1d(tracks.ids, ids, assume_unique=True, return_indices=True)
         enough = tracks.seen[rows].sum(axis=1) >= 2
         rows, p_WF = rows[enough], p_WF[of[enough]]
-        tracks.landmarks[rows], tracks.known[rows] = in_hosts(self._states, self._camera, tracks.hosts[rows], p_WF)
+        tracks.landmarks[rows], tracks.known[rows] = in_hosts(self._states, self._cameras, tracks.hosts[rows], p_WF)
 
     def _variables(self, rows: Int) -> Variables:
-        return Variables(self._states, self._camera, self.tracks.landmarks[rows])
+        return Variables(self._states, self._cameras, self.tracks.landmarks[rows])
 
     def _problem(self, readings: list[Preintegrated], still: Mapping[int, Standstill], sightings: Sightings) -> Problem:
         return Problem(
@@ -282,8 +296,8 @@ class Window:
 
     def _sightings(self, rows: Int) -> Sightings:
         options, tracks = self._options, self.tracks
-        xy, depth = in_images(self._states, self._camera, tracks.hosts[rows], tracks.landmarks[rows])
-        velocity = image_velocities(self._states, self._camera, self._gyro_B, xy, depth)
+        xy, depth = in_images(self._states, self._cameras, tracks.hosts[rows], tracks.landmarks[rows])
+        velocity = image_velocities(self._states, self._cameras, self._gyro_B, xy, depth)
         return Sightings(
             tracks.seen[rows],
             tracks.xy_normalised[rows],
@@ -297,19 +311,22 @@ class Window:
         )
 
     def _shutter(self, rows: Int) -> Shutter:
-        if not (self._camera.readout_s or self._calibrated[READOUT]):
+        if not (self._cameras.readout_s.any() or self._calibrated[READOUT::CALIBRATION_SIZE].any()):
             return GLOBAL_SHUTTER
-        row = self._given.cameras[0].row(self.tracks.xy[rows, :, 1])
+        y, N = self.tracks.xy[rows, :, 1], self.tracks.cameras
+        row = np.empty_like(y)
+        for c, camera in enumerate(self._given.cameras):
+            row[:, c::N] = camera.row(y[:, c::N])
         return Shutter(True, row, *motion_in_body(self._states, self._gyro_B))
 
     @property
     def _varies_lens(self) -> bool:
-        return bool(self._calibrated[INTRINSICS].any())
+        return bool(self._calibrated[INTRINSICS].any())  # of the first camera, and so of all
 
     def _lens(self, seen: Bool, xy: Float) -> Lens:
         if not self._varies_lens:
             return FIXED_LENS
-        px = pixels_by_intrinsics(self._camera_model, self._camera.intrinsics, xy, seen)
+        px = pixels_by_intrinsics(self._models, self._cameras.intrinsics, xy, seen)
         return Lens(True, px, self._undistorted_with)
 
     def _active(self) -> Int:
@@ -319,28 +336,35 @@ class Window:
     def _covariance(self, normal: Normal) -> tuple[Float, Float]:
         """Of the newest state (15, 15), and the standard deviations of the calibration, zero where it is fixed."""
         end = covariance(normal, self._active(), STATE_SIZE + int(self._calibrated.sum()))
-        sigma = np.zeros(CALIBRATION_SIZE)
+        sigma = np.zeros(len(self._calibrated))
         sigma[self._calibrated] = np.sqrt(np.diag(end)[STATE_SIZE:])
         return end[:STATE_SIZE, :STATE_SIZE], sigma
 
 
 def _calibrated(options: SlidingWindowOptions) -> Bool:
-    """(16,) what of the calibration is to be estimated unless it is known for sure."""
+    """(16,) what of a camera's calibration is to be estimated unless it is known for sure."""
     out = np.empty(CALIBRATION_SIZE, bool)
     out[:OFFSET], out[OFFSET] = options.calibrate_extrinsics, options.calibrate_time_offset
     out[READOUT], out[INTRINSICS] = True, options.calibrate_intrinsics
     return out
 
 
-def parallax(tracks: TrackTable, before: int, now: int, R_CbCn: Float) -> tuple[int, float]:
-    """Number of tracks common to two frames, and their mean motion on the z = 1 plane with the rotation taken out.
+def parallax(tracks: TrackTable, R_WC: Float, focal_px: Float) -> tuple[int, float]:
+    """Number of tracks that the newest frame has in common with those before, and their mean motion since, px.
 
-    ``R_CbCn`` (3, 3) takes the later camera's axes to the earlier one's.
+    For each camera, of focal length ``focal_px`` (N,), the frame before is the last in which it saw anything, or just
+    the last. The rotation is taken out: ``R_WC`` (V, 3, 3) is that of every view.
     """
-    common = tracks.seen[:, before] & tracks.seen[:, now]
-    if not common.any():
-        return 0, 0.0
-    rays = np.column_stack([tracks.xy_normalised[common, now], np.ones(common.sum())]) @ R_CbCn.T
-    ahead = rays[:, 2] > 0.0
-    moved = rays[ahead, :2] / rays[ahead, 2:] - tracks.xy_normalised[common, before][ahead]
-    return int(common.sum()), float(np.linalg.norm(moved, axis=1).mean()) if ahead.any() else np.inf
+    N, last = tracks.cameras, tracks.seen.shape[1]
+    common, moved_px = np.zeros(len(tracks.ids), bool), [np.empty(0)]
+    for c in range(N):
+        now, earlier = last - N + c, np.arange(last - 2 * N + c, -1, -N)
+        before = next((v for v in earlier if tracks.seen[:, v].any()), earlier[0])
+        both = tracks.seen[:, before] & tracks.seen[:, now]
+        turned = rays(tracks.xy_normalised[both, now]) @ (R_WC[before].T @ R_WC[now]).T
+        ahead = turned[:, 2] > 0.0
+        moved = turned[ahead, :2] / turned[ahead, 2:] - tracks.xy_normalised[both, before][ahead]
+        moved_px.append(focal_px[c] * np.linalg.norm(moved, axis=1))
+        common |= both
+    mean_px = np.concatenate(moved_px).mean() if any(map(len, moved_px)) else np.inf if common.any() else 0.0
+    return int(common.sum()), float(mean_px)

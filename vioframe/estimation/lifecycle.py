@@ -51,8 +51,11 @@ class LifeCycle:
         self._backend, self._name = backend, name or f"the back-end {type(backend).__name__}"
         if not getattr(backend, "takes_rigs", False):
             calibration.single(self._name)
+        if len(calibration.cameras) > 1 and not known:
+            unknown = next(camera.name for camera in calibration.cameras if not camera.rotation_known)
+            raise ConfigError(f"of a rig every camera's rotation on the body must be known, that of {unknown} is not")
         self._given = calibration
-        self._initializer = Initializer(calibration.only(0), self._options.imu_noise_factor)
+        self._initializer = Initializer(calibration, self._options.imu_noise_factor)
         self._standstill = StandstillDetector(self._options.standstill_disparity_px)
         self._initial_state = initial_state
         self._following = False
@@ -67,7 +70,7 @@ class LifeCycle:
         The readings count with its first camera's time offset, and reach back to where those of the frame before ended;
         its cameras have undistorted the points.
         """
-        return self._given.moved_with(self._initializer.calibration.cameras[0])
+        return self._initializer.calibration
 
     def process(self, imu: ImuSegment, tracks: FrameTracks) -> Estimate:
         """Begin, or follow one frame; where that fails it says so, and begins anew from where it was."""
@@ -105,7 +108,7 @@ class LifeCycle:
                 raise ConfigError(f"the initial state is of {state.t_ns} ns, the first frame of {tracks.t_ns} ns")
             return self._begun(self._start(state, imu, tracks), Stopwatch(), "state given")
         watch = Stopwatch()
-        initial = self._initializer.add(imu, tracks.of_camera(0))
+        initial = self._initializer.add(imu, tracks)
         watch.lap("initialise")
         if initial is None:
             refusal = self._initializer.refusal

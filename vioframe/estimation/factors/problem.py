@@ -1,7 +1,7 @@
 """What the solver minimises: prior, readings, standstill and sightings over the states of a window, and calibration.
 
 The error vector is [dtheta dp dv dbg dba] of every state, oldest first, then [dtheta_BC dp_BC d_offset d_readout
-d_intrinsics(8)]; landmarks are eliminated before it is solved for (Triggs et al., "Bundle Adjustment:
+d_intrinsics(8)] of every camera; landmarks are eliminated before it is solved for (Triggs et al., "Bundle Adjustment:
 A Modern Synthesis", 2000, section 6.1). A state that has to go leaves all that its factors say about the others behind
 as the prior (Sibley, Matthies, Sukhatme, "Sliding window filter with application to planetary landing", J. Field
 Robotics 2010). Derivation: ``docs/derivations/sliding_window.md``.
@@ -45,10 +45,10 @@ _NULL = 1e-12
 
 @dataclass(frozen=True, slots=True)
 class Variables:
-    """K states, the calibration, and L landmarks [x y rho]."""
+    """K states, the calibration of N cameras, and L landmarks [x y rho]."""
 
     states: StateArrays
-    camera: Calibrated
+    cameras: Calibrated
     landmarks: Float
 
     @property
@@ -56,33 +56,33 @@ class Variables:
         return Poses.of(self.states.R_WB, self.states.p_WB)
 
     def retract(self, step: Float, landmark_step: Float) -> Variables:
-        """Moved by ``step`` (15 K + 16,) and ``landmark_step`` (L, 3)."""
-        states, camera = _moved(self.states.parts, self.camera, step)
-        return Variables(StateArrays(*states), camera, self.landmarks + landmark_step)
+        """Moved by ``step`` (15 K + 16 N,) and ``landmark_step`` (L, 3)."""
+        states, cameras = _moved(self.states.parts, self.cameras, step)
+        return Variables(StateArrays(*states), cameras, self.landmarks + landmark_step)
 
 
 @dataclass(frozen=True, slots=True)
 class Prior:
     """What is known from frames that have left the window: half dx^T H dx + b^T dx about first estimates.
 
-    ``states`` and ``camera`` are the first estimates; ``frozen`` (K,) are the states that the prior knows of, to which
+    ``states`` and ``cameras`` are the first estimates; ``frozen`` (K,) are the states that the prior knows of, to which
     alone they matter. ``H`` (n, n) is zero for the others.
     """
 
     H: Float
     b: Float
     states: StateArrays
-    camera: Calibrated
+    cameras: Calibrated
     frozen: Bool
 
     @staticmethod
-    def of(state: NavState, camera: Calibrated, camera_cov: Float) -> Prior:
-        """On a single state with covariance, and on the calibration with ``camera_cov`` (16, 16), zero where fixed."""
+    def of(state: NavState, cameras: Calibrated, cov: Float) -> Prior:
+        """On a single state with covariance, and on N cameras with ``cov`` (16 N, 16 N), zero where they are fixed."""
         assert state.cov is not None
-        H = np.zeros((STATE_SIZE + CALIBRATION_SIZE, STATE_SIZE + CALIBRATION_SIZE))
+        H = np.zeros((STATE_SIZE + len(cov), STATE_SIZE + len(cov)))
         H[:STATE_SIZE, :STATE_SIZE] = np.linalg.inv(state.cov)
-        H[STATE_SIZE:, STATE_SIZE:] = calibration_information(camera_cov)
-        return Prior(H, np.zeros(len(H)), StateArrays.stack([state]), camera, np.ones(1, dtype=bool))
+        H[STATE_SIZE:, STATE_SIZE:] = calibration_information(cov)
+        return Prior(H, np.zeros(len(H)), StateArrays.stack([state]), cameras, np.ones(1, dtype=bool))
 
     def with_state(self, states: StateArrays) -> Prior:
         """The same on the window ``states`` (K + 1), of which it does not know the newest."""
@@ -90,22 +90,22 @@ class Prior:
         old = np.r_[0:at, at + STATE_SIZE : len(self.b) + STATE_SIZE]
         H, b = np.zeros((len(self.b) + STATE_SIZE, len(self.b) + STATE_SIZE)), np.zeros(len(self.b) + STATE_SIZE)
         H[np.ix_(old, old)], b[old] = self.H, self.b
-        return Prior(H, b, self.first(states[:-1]).append(states[-1:]), self.camera, np.append(self.frozen, False))
+        return Prior(H, b, self.first(states[:-1]).append(states[-1:]), self.cameras, np.append(self.frozen, False))
 
     def without_newest(self) -> Prior:
         """The same without the newest state, of which it must not know."""
         assert not self.frozen[-1]
         at = STATE_SIZE * (len(self.frozen) - 1)
         keep = np.r_[0:at, at + STATE_SIZE : len(self.b)]
-        return Prior(self.H[np.ix_(keep, keep)], self.b[keep], self.states[:-1], self.camera, self.frozen[:-1])
+        return Prior(self.H[np.ix_(keep, keep)], self.b[keep], self.states[:-1], self.cameras, self.frozen[:-1])
 
     def difference(self, x: Variables) -> Float:
         """``x`` beyond the first estimates, (n,); zero for states that the prior does not know."""
-        return _difference(self._parts, x.states.parts, x.camera)
+        return _difference(self._parts, x.states.parts, x.cameras)
 
     @property
     def _parts(self) -> PriorArrays:
-        return self.H, self.b, self.states.parts, self.camera, self.frozen
+        return self.H, self.b, self.states.parts, self.cameras, self.frozen
 
     def first(self, states: StateArrays) -> StateArrays:
         """``states``, with the first estimates of those that are frozen in their place."""
@@ -133,9 +133,9 @@ class Problem:
         """The normal equations at ``x``, and the cost."""
         states = x.states.parts
         equations = _normal_equations(
-            self.prior._parts, self.readings, self.sightings, self.first_estimates, states, x.camera, x.landmarks
+            self.prior._parts, self.readings, self.sightings, self.first_estimates, states, x.cameras, x.landmarks
         )
-        normal = Normal(*equations, self.sightings.seen)
+        normal = Normal(*equations, self.sightings.seen, len(x.cameras.p_BC))
         for k, still in self.still.items():
             residual = still.residual(*(part[k] for part in states if part is not x.states.p_WB)) / still.sigma
             first = self.prior.first(x.states) if self.first_estimates else x.states
@@ -158,7 +158,7 @@ class Normal:
     """Normal equations [H W^T; W V], gradients b and c; ``W`` (L, 3, m) has the columns ``columns`` (m,) of H.
 
     Of ``H`` (n, n) the upper half counts. ``cost`` is that of the problem, ``errors`` (L,) are the landmarks' root mean
-    square residuals (:meth:`Sightings.errors`), which are ``seen`` (L, K).
+    square residuals (:meth:`Sightings.errors`), which are ``seen`` (L, V) by N ``cameras``.
     """
 
     H: Float
@@ -170,13 +170,15 @@ class Normal:
     errors: Float
     columns: NDArray[np.intp]
     seen: Bool
+    cameras: int
 
     def reduced(self, damping: float) -> tuple[Float, Float, Eliminated]:
         """Damped equations S (n, n) and gradient (n,) without the landmarks, and what :meth:`landmark_step` needs.
 
         Of S the upper half counts.
         """
-        return _reduced(self.H, self.b, self.V, self.W, self.c, self.columns, self.seen, damping)
+        landmarks = self.V, self.W, self.c
+        return _reduced(self.H, self.b, landmarks, self.columns, self.seen, self.cameras, damping)
 
     def landmark_step(self, step: Float, eliminated: Eliminated) -> Float:
         """(L, 3), given the ``step`` (n,) of the rest."""
@@ -184,36 +186,43 @@ class Normal:
 
 
 @kernel
-def _moved(states: States, camera: Calibrated, step: Float) -> tuple[States, Calibrated]:
-    """States and camera moved by ``step`` (15 K + 16,)."""
+def _moved(states: States, cameras: Calibrated, step: Float) -> tuple[States, Calibrated]:
+    """States and cameras moved by ``step`` (15 K + 16 N,)."""
     n = STATE_SIZE * len(states[0])
-    d, p_BC, intrinsics = step[n:], camera.p_BC.copy(), camera.intrinsics.copy()
-    for k in range(3):
-        p_BC[k] += d[3 + k]
-    for k in range(8):
-        intrinsics[k] += d[8 + k]
-    R_BC = product(camera.R_BC, exp(d[:3]))
-    moved = Calibrated(R_BC, p_BC, camera.offset_s + d[OFFSET], camera.readout_s + d[READOUT], intrinsics)
+    R_BC, p_BC, intrinsics = cameras.R_BC.copy(), cameras.p_BC.copy(), cameras.intrinsics.copy()
+    offset_s, readout_s = cameras.offset_s.copy(), cameras.readout_s.copy()
+    for c in range(len(p_BC)):
+        d = step[n + CALIBRATION_SIZE * c : n + CALIBRATION_SIZE * (c + 1)]
+        R_BC[c] = product(R_BC[c], exp(d[:3]))
+        for k in range(3):
+            p_BC[c, k] += d[3 + k]
+        for k in range(8):
+            intrinsics[c, k] += d[8 + k]
+        offset_s[c] += d[OFFSET]
+        readout_s[c] += d[READOUT]
+    moved = Calibrated(R_BC, p_BC, offset_s, readout_s, intrinsics)
     return retract(states, step[:n].reshape(-1, STATE_SIZE)), moved
 
 
 @kernel
-def _difference(prior: PriorArrays, states: States, camera: Calibrated) -> Float:
+def _difference(prior: PriorArrays, states: States, cameras: Calibrated) -> Float:
     """What :meth:`Prior.difference` says."""
     _, b, first, given, frozen = prior
-    n = len(b) - CALIBRATION_SIZE
     out = np.zeros(len(b))
     moved = inertial.difference(states, first)
     for k in range(len(frozen)):
         if frozen[k]:
             for m in range(STATE_SIZE):
                 out[STATE_SIZE * k + m] = moved[k, m]
-    rotation = log(product(given.R_BC.T, camera.R_BC))
-    for k in range(3):
-        out[n + k], out[n + 3 + k] = rotation[k], camera.p_BC[k] - given.p_BC[k]
-    out[n + OFFSET], out[n + READOUT] = camera.offset_s - given.offset_s, camera.readout_s - given.readout_s
-    for k in range(8):
-        out[n + 8 + k] = camera.intrinsics[k] - given.intrinsics[k]
+    for c in range(len(cameras.p_BC)):
+        own = out[STATE_SIZE * len(frozen) + CALIBRATION_SIZE * c :]
+        rotation = log(product(given.R_BC[c].T, cameras.R_BC[c]))
+        for k in range(3):
+            own[k], own[3 + k] = rotation[k], cameras.p_BC[c, k] - given.p_BC[c, k]
+        own[OFFSET] = cameras.offset_s[c] - given.offset_s[c]
+        own[READOUT] = cameras.readout_s[c] - given.readout_s[c]
+        for k in range(8):
+            own[8 + k] = cameras.intrinsics[c, k] - given.intrinsics[c, k]
     return out
 
 
@@ -224,13 +233,13 @@ def _normal_equations(
     sightings: Sightings,
     first_estimates: bool,
     states: States,
-    camera: Calibrated,
+    cameras: Calibrated,
     landmarks: Float,
 ) -> tuple[Float, Float, Float, Float, Float, float, Float, NDArray[np.intp]]:
     """All but standstill of :meth:`Problem.linearise`."""
     frozen = prior[4] if first_estimates else np.zeros(len(prior[4]), np.bool_)
     first = _with_those_of(prior[2], states, frozen)
-    d = _difference(prior, states, camera)
+    d = _difference(prior, states, cameras)
     H, b = prior[0].copy(), prior[0] @ d
     cost = 0.0
     for k in range(len(d)):
@@ -239,8 +248,8 @@ def _normal_equations(
     cost += _add_readings(readings, states, first, frozen, H, b)
     poses = Poses(*relative_poses(states[0], states[1]))
     first_poses = Poses(*relative_poses(first[0], first[1]))
-    H_visual, b_visual, V, W, c, visual_cost, errors = linearise(poses, first_poses, camera, sightings, landmarks)
-    columns = pose_columns(len(frozen))
+    H_visual, b_visual, V, W, c, visual_cost, errors = linearise(poses, first_poses, cameras, sightings, landmarks)
+    columns = pose_columns(len(frozen), len(cameras.p_BC))
     for u in range(len(columns)):
         b[columns[u]] += b_visual[u]
         own, visual = H[columns[u]], H_visual[u]
@@ -295,12 +304,18 @@ def _add_readings(readings: ImuFactors, states: States, first: States, frozen: B
 
 @kernel
 def _reduced(
-    H: Float, b: Float, V: Float, W: Float, c: Float, columns: NDArray[np.intp], seen: Bool, damping: float
+    H: Float,
+    b: Float,
+    landmarks: tuple[Float, Float, Float],
+    columns: NDArray[np.intp],
+    seen: Bool,
+    cameras: int,
+    damping: float,
 ) -> tuple[Float, Float, Eliminated]:
     S, g = H.copy(), b.copy()
     for u in range(len(b)):
         S[u, u] *= 1.0 + damping
-    S_visual, g_visual, eliminated = eliminate(seen, V, W, c, damping)
+    S_visual, g_visual, eliminated = eliminate(seen, cameras, *landmarks, damping)
     for u in range(len(columns)):
         g[columns[u]] -= g_visual[u]
         own, visual = S[columns[u]], S_visual[u]
@@ -323,17 +338,17 @@ def _landmark_step(eliminated: Eliminated, step: Float) -> Float:
 
 
 def calibration_information(cov: Float) -> Float:
-    """The inverse of a covariance (16, 16), with one for what is known for sure and stays as it is."""
+    """The inverse of a covariance (16 N, 16 N), with one for what is known for sure and stays as it is."""
     return np.linalg.inv(cov + np.diag(np.where(np.diag(cov) > 0.0, 0.0, 1.0)))
 
 
 @kernel
-def pose_columns(K: int) -> NDArray[np.intp]:
-    """Indices of [dtheta dp] of every state, and of the calibration, in the error vector of K states."""
-    out = np.empty(6 * K + CALIBRATION_SIZE, np.intp)
+def pose_columns(K: int, N: int) -> NDArray[np.intp]:
+    """Indices of [dtheta dp] of every state, and of the calibration, in the error vector of K states and N cameras."""
+    out = np.empty(6 * K + CALIBRATION_SIZE * N, np.intp)
     for u in range(6 * K):
         out[u] = STATE_SIZE * (u // 6) + u % 6
-    out[6 * K :] = STATE_SIZE * K + np.arange(CALIBRATION_SIZE)
+    out[6 * K :] = STATE_SIZE * K + np.arange(CALIBRATION_SIZE * N)
     return out
 
 
@@ -352,7 +367,7 @@ def marginalise_oldest(problem: Problem, x: Variables) -> Prior:
     # The gradient at the first estimates, from which the prior counts.
     b = b - H @ prior.difference(x)
     H, b = schur(H, b, STATE_SIZE)
-    return Prior(H, b, first[1:], prior.camera, (prior.frozen | touched)[1:])
+    return Prior(H, b, first[1:], prior.cameras, (prior.frozen | touched)[1:])
 
 
 def symmetric(S: Float) -> Float:

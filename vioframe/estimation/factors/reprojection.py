@@ -1,12 +1,13 @@
 """Reprojection factors: residuals, Jacobians and normal equations of all landmarks of a window, compiled.
 
-A landmark m = [x y rho] of the host h is seen from the frame f at the direction of
+Of a rig of N cameras each frame f has N views, f N + c of its camera c. A landmark m = [x y rho] whose host is the
+camera d in the frame h is seen by the camera c in the frame f at the direction of
 
-    X = R_BC^T (R_fh q + rho t_fh - rho p_BC),   q = R_BC [x y 1]^T + rho p_BC,
+    X = R_BC^T (R_fh q + rho t_fh - rho p_BC),   q = R_BD [x y 1]^T + rho p_BD,
 
 with R_fh = R_WBf^T R_WBh and t_fh = R_WBf^T (p_WBh - p_WBf): rho times its position in the camera. Being polynomial in
-rho, it holds for points as far as one likes. With a rolling shutter, a frame's camera is where the body's motion has
-taken it by the time of the row: R_BC and p_BC in X, not in q, become Exp(w t) R_BC and Exp(w t) p_BC + v t. Other
+rho, it holds for points as far as one likes. With a rolling shutter, a view's camera is where the body's motion has
+taken it by the time of the row: R_BC and p_BC in X become Exp(w t) R_BC and Exp(w t) p_BC + v t. Other
 intrinsics than a point was undistorted with move it in the image, to first order. Residuals are evaluated at the
 estimate, Jacobians at the first estimates of poses that are in the prior. Derivation:
 ``docs/derivations/sliding_window.md``.
@@ -27,7 +28,7 @@ from vioframe.types import CameraOnBody
 # Depth in a frame over depth in the host: a landmark nearer than this is beside the camera, and cannot be seen.
 _LEAST_DEPTH_RATIO = 0.05
 CALIBRATION_SIZE = 16
-"""Error of the calibration: [dtheta_BC dp_BC d_offset d_readout d_intrinsics(8)]."""
+"""Error of a camera's calibration: [dtheta_BC dp_BC d_offset d_readout d_intrinsics(8)]."""
 OFFSET, READOUT, INTRINSICS = 6, 7, slice(8, 16)
 """Where in that error they are, behind the camera's pose on the body."""
 
@@ -37,23 +38,28 @@ View = tuple[Float, Float, Float]
 
 
 class Calibrated(NamedTuple):
-    """What may be estimated: the camera on the body, what is left of the time offset, s, the readout, s, and the lens.
+    """What may be estimated of N cameras: where they are on the body, when they see it, and their lenses.
 
-    ``intrinsics`` (8,) are fx fy cx cy px and the four distortion coefficients.
+    ``R_BC`` (N, 3, 3), ``p_BC`` (N, 3) m, ``readout_s`` (N,); ``offset_s`` (N,) are the time offsets beyond the one
+    that the readings were cut by; ``intrinsics`` (N, 8) are fx fy cx cy px and the four distortion coefficients.
     """
 
     R_BC: Float
     p_BC: Float
-    offset_s: float = 0.0
-    readout_s: float = 0.0
-    intrinsics: Float = np.zeros(8)
+    offset_s: Float
+    readout_s: Float
+    intrinsics: Float
 
     @staticmethod
-    def of(camera: CameraOnBody) -> Calibrated:
-        """``camera`` as it is given."""
-        # Contiguous, as what the solver makes of it is: kernels are compiled for each layout that they meet.
-        R_BC, p_BC = np.ascontiguousarray(camera.R_BC), np.ascontiguousarray(camera.p_BC)
-        return Calibrated(R_BC, p_BC, 0.0, camera.readout_s, intrinsics_of(camera.model)[1])
+    def of(*cameras: CameraOnBody) -> Calibrated:
+        """``cameras`` as they are given, the readings being cut by the time offset of the first."""
+        return Calibrated(
+            np.stack([camera.R_BC for camera in cameras]),
+            np.stack([camera.p_BC for camera in cameras]),
+            np.array([1e-9 * (camera.time_offset_ns - cameras[0].time_offset_ns) for camera in cameras]),
+            np.array([camera.readout_s for camera in cameras]),
+            np.stack([intrinsics_of(camera.model)[1] for camera in cameras]),
+        )
 
 
 class Poses(NamedTuple):
@@ -74,7 +80,7 @@ class Poses(NamedTuple):
 class Shutter(NamedTuple):
     """When the rows are read, and how the body moves meanwhile, which is constant while a window is solved for.
 
-    ``row`` (L, K) is that of a sighting, from -1/2 for the first to 1/2 for the last; ``rate_B`` (K, 3) rad/s and
+    ``row`` (L, V) is that of a sighting, from -1/2 for the first to 1/2 for the last; ``rate_B`` (K, 3) rad/s and
     ``velocity_B`` (K, 3) m/s are the body's in every frame, in its own axes. Where it is not ``rolling``, and stays so,
     nothing is asked of the rest.
     """
@@ -89,10 +95,10 @@ GLOBAL_SHUTTER = Shutter(False, np.zeros((1, 1)), np.zeros((1, 3)), np.zeros((1,
 
 
 class Lens(NamedTuple):
-    """How sightings move with the intrinsics: ``px`` (L, K, 2, 8) by intrinsics, and ``at`` (K, 8), each frame's.
+    """How sightings move with the intrinsics: ``px`` (L, V, 2, 8) by intrinsics, and ``at`` (V, 8), each view's.
 
     The former is taken where the landmarks are, not where they were seen: the noise of a sighting would be in both the
-    Jacobian and the residual, and pass for a longer focal length. The latter are those with which the points of a frame
+    Jacobian and the residual, and pass for a longer focal length. The latter are those with which the points of a view
     were undistorted. Where the lens is not ``varied``, nothing is asked of the rest.
     """
 
@@ -105,10 +111,10 @@ FIXED_LENS = Lens(False, np.zeros((1, 1, 2, 8)), np.zeros((1, 8)))
 
 
 class Sightings(NamedTuple):
-    """What was seen of L landmarks in K frames, as in the table of tracks, with its noise and robust loss.
+    """What was seen of L landmarks in V views, as in the table of tracks, with its noise and robust loss.
 
-    ``seen`` (L, K); ``xy`` (L, K, 2) on the z = 1 plane, and how they move there, ``velocity`` (L, K, 2) 1/s.
-    ``to_px`` (L, K, 2, 2) turns residuals into pixels, in which ``sigma`` is the standard deviation; ``cauchy`` is the
+    ``seen`` (L, V); ``xy`` (L, V, 2) on the z = 1 plane, and how they move there, ``velocity`` (L, V, 2) 1/s.
+    ``to_px`` (L, V, 2, 2) turns residuals into pixels, in which ``sigma`` is the standard deviation; ``cauchy`` is the
     scale of the robust loss, in standard deviations. Residuals are on the plane, or on the unit sphere.
     """
 
@@ -122,22 +128,22 @@ class Sightings(NamedTuple):
     shutter: Shutter = GLOBAL_SHUTTER
     lens: Lens = FIXED_LENS
 
-    def cost(self, poses: Poses, camera: Calibrated, landmarks: Float) -> float:
+    def cost(self, poses: Poses, cameras: Calibrated, landmarks: Float) -> float:
         """Half the robust sum of squares."""
-        return _evaluate(poses, camera, self, landmarks)[0]
+        return _evaluate(poses, cameras, self, landmarks)[0]
 
-    def errors(self, poses: Poses, camera: Calibrated, landmarks: Float) -> Float:
+    def errors(self, poses: Poses, cameras: Calibrated, landmarks: Float) -> Float:
         """(L,) root mean square residual of each landmark, standard deviations; infinite behind a camera."""
-        return _evaluate(poses, camera, self, landmarks)[1]
+        return _evaluate(poses, cameras, self, landmarks)[1]
 
-    def linearise(self, poses: Poses, first: Poses, camera: Calibrated, landmarks: Float) -> Linearised:
+    def linearise(self, poses: Poses, first: Poses, cameras: Calibrated, landmarks: Float) -> Linearised:
         """H (n, n), b (n,) of poses and calibration, V (L, 3, 3), W (L, 3, n), c (L, 3) of the landmarks; cost, errors.
 
-        n = 6 K + 16: [dtheta dp] of every frame, then the calibration. The gradient is [b c], the Gauss-Newton matrix
+        n = 6 K + 16 N: [dtheta dp] of every frame, then the cameras'. The gradient is [b c], the Gauss-Newton matrix
         [H W^T; W V], with the robust weights in them; of ``H`` the upper half. Jacobians are taken at the poses
         ``first``. The last two are those of :meth:`cost` and :meth:`errors`.
         """
-        return linearise(poses, first, camera, self, landmarks)
+        return linearise(poses, first, cameras, self, landmarks)
 
 
 @kernel
@@ -190,19 +196,23 @@ def pixels_by_residual(model: int, k: Float, xy: Float, on_sphere: bool) -> Floa
 
 
 @kernel
-def pixels_by_intrinsics(model: int, k: Float, xy: Float, seen: Bool) -> Float:
-    """(L, K, 2, 8) px of the image by the intrinsics, where ``seen`` (L, K), at points (L, K, 2) of the z = 1 plane."""
+def pixels_by_intrinsics(model: Int, k: Float, xy: Float, seen: Bool) -> Float:
+    """(L, V, 2, 8) px of the image by the intrinsics, where ``seen`` (L, V), at points (L, V, 2) of the z = 1 plane.
+
+    ``model`` (N,) and ``k`` (N, 8) are those of the cameras.
+    """
     out = np.zeros((*seen.shape, 2, 8))
     for i in range(len(seen)):
-        for f in range(seen.shape[1]):
-            if seen[i, f]:
-                out[i, f] = intrinsics_jacobian(model, k, xy[i, f, 0], xy[i, f, 1])
+        for v in range(seen.shape[1]):
+            if seen[i, v]:
+                c = v % len(k)
+                out[i, v] = intrinsics_jacobian(model[c], k[c], xy[i, v, 0], xy[i, v, 1])
     return out
 
 
 @kernel
 def eliminate(
-    seen: Bool, V: Float, W: Float, c: Float, damping: float
+    seen: Bool, cameras: int, V: Float, W: Float, c: Float, damping: float
 ) -> tuple[Float, Float, tuple[Float, Float, Float]]:
     """What is known of the rest through the landmarks: W^T V^-1 W (n, n), the upper half, and W^T V^-1 c (n,).
 
@@ -235,19 +245,20 @@ def eliminate(
         z[i, 0] = i00 * c[i, 0]
         z[i, 1] = i10 * c[i, 0] + i11 * c[i, 1]
         z[i, 2] = i20 * c[i, 0] + i21 * c[i, 1] + i22 * c[i, 2]
-    _add_squares(seen, Y, z, S, g)
+    _add_squares(seen, cameras, Y, z, S, g)
     return S, g, (Y, z, inverse)
 
 
 @kernel
-def _add_squares(seen: Bool, Y: Float, z: Float, S: Float, g: Float) -> None:
+def _add_squares(seen: Bool, cameras: int, Y: Float, z: Float, S: Float, g: Float) -> None:
     """Add Y^T Y to the upper half of ``S`` (n, n) and Y^T z to ``g`` (n,), two landmarks at a time.
 
     These are neighbours in an order by which most have been seen by the same frames.
     """
-    count, frames = seen.shape
-    n, at_camera = len(g), 6 * frames
+    count, frames = len(seen), seen.shape[1] // cameras
+    n, at_cameras = len(g), 6 * frames
     first, last = _ends(seen)
+    first, last = first // cameras, last // cameras
     order, _ = _sorted(first * frames + last, frames * frames)
     for k in range(0, count, 2):
         i, j = order[k], order[min(k + 1, count - 1)]
@@ -255,7 +266,7 @@ def _add_squares(seen: Bool, Y: Float, z: Float, S: Float, g: Float) -> None:
         y_0, y_1, y_2, y_3, y_4, y_5 = Y[i, 0], Y[i, 1], Y[i, 2], Y[j, 0], Y[j, 1], Y[j, 2]
         begin, end = 6 * min(first[i], first[j]), 6 * max(last[i], last[j]) + 6
         for u in range(begin, n):
-            if end <= u < at_camera:
+            if end <= u < at_cameras:
                 continue
             a_0, a_1, a_2 = y_0[u], y_1[u], y_2[u]
             a_3, a_4, a_5 = other * y_3[u], other * y_4[u], other * y_5[u]
@@ -265,7 +276,7 @@ def _add_squares(seen: Bool, Y: Float, z: Float, S: Float, g: Float) -> None:
                 own[v] += (
                     a_0 * y_0[v] + a_1 * y_1[v] + a_2 * y_2[v] + a_3 * y_3[v] + a_4 * y_4[v] + a_5 * y_5[v]
                 )  # fmt: skip
-            for v in range(max(u, at_camera), n):
+            for v in range(max(u, at_cameras), n):
                 own[v] += (
                     a_0 * y_0[v] + a_1 * y_1[v] + a_2 * y_2[v] + a_3 * y_3[v] + a_4 * y_4[v] + a_5 * y_5[v]
                 )  # fmt: skip
@@ -280,7 +291,7 @@ def _in_body(R_BC: Float, p_BC: Float, m: Float, q: Float) -> None:
 
 @kernel
 def _in_camera(R_fh: Float, t_fh: Float, R_BC: Float, p_BC: Float, rho: float, q: Float, b: Float, X: Float) -> None:
-    """``b`` and ``X`` (3,): rho times the landmark's position in the frame's body, and in its camera."""
+    """``b`` and ``X`` (3,): rho times the landmark's position in the frame's body, and in the view's camera."""
     for i in range(3):
         b[i] = R_fh[i, 0] * q[0] + R_fh[i, 1] * q[1] + R_fh[i, 2] * q[2] + rho * t_fh[i]
     for i in range(3):
@@ -290,17 +301,17 @@ def _in_camera(R_fh: Float, t_fh: Float, R_BC: Float, p_BC: Float, rho: float, q
 
 
 @kernel
-def camera_at_row(camera: Calibrated, shutter: Shutter, i: int, f: int, R_rowC: Float, p_rowC: Float) -> None:
-    """``R_rowC`` (3, 3) and ``p_rowC`` (3,): the camera, seen from the body at frame f, when it saw landmark i."""
-    late_s = camera.readout_s * shutter.row[i, f]
+def camera_at_row(cameras: Calibrated, shutter: Shutter, i: int, v: int, R_rowC: Float, p_rowC: Float) -> None:
+    """``R_rowC`` (3, 3) and ``p_rowC`` (3,): the camera of view v, seen from the body, when it saw landmark i."""
+    f, c = v // len(cameras.p_BC), v % len(cameras.p_BC)
+    R_BC, p_BC = cameras.R_BC[c], cameras.p_BC[c]
+    late_s = cameras.readout_s[c] * shutter.row[i, v]
     turn = exp(late_s * shutter.rate_B[f])
     for j in range(3):
         p_rowC[j] = late_s * shutter.velocity_B[f, j]
         for k in range(3):
-            p_rowC[j] += turn[j, k] * camera.p_BC[k]
-            R_rowC[j, k] = (
-                turn[j, 0] * camera.R_BC[0, k] + turn[j, 1] * camera.R_BC[1, k] + turn[j, 2] * camera.R_BC[2, k]
-            )
+            p_rowC[j] += turn[j, k] * p_BC[k]
+            R_rowC[j, k] = turn[j, 0] * R_BC[0, k] + turn[j, 1] * R_BC[1, k] + turn[j, 2] * R_BC[2, k]
 
 
 @kernel
@@ -331,12 +342,12 @@ def _residual(X: Float, x: float, y: float, to_px: Float, on_sphere: bool, T: Fl
 
 
 @kernel
-def _add_lens(lens: Lens, i: int, f: int, intrinsics: Float, r: Float) -> None:
+def _add_lens(lens: Lens, i: int, v: int, intrinsics: Float, r: Float) -> None:
     """To ``r`` (2,) px what other intrinsics than it was undistorted with move the sighting by."""
     for k in range(8):
-        change = intrinsics[k] - lens.at[f, k]
-        r[0] += lens.px[i, f, 0, k] * change
-        r[1] += lens.px[i, f, 1, k] * change
+        change = intrinsics[k] - lens.at[v, k]
+        r[0] += lens.px[i, v, 0, k] * change
+        r[1] += lens.px[i, v, 1, k] * change
 
 
 @kernel
@@ -370,28 +381,32 @@ def _residual_jacobian(
 
 
 @kernel
-def _evaluate(poses: Poses, camera: Calibrated, s: Sightings, landmarks: Float) -> tuple[float, Float]:
+def _evaluate(poses: Poses, cameras: Calibrated, s: Sightings, landmarks: Float) -> tuple[float, Float]:
     """Half the robust sum of squares, and each landmark's root mean square residual."""
-    R_BC, p_BC, offset_s, _, intrinsics = camera
     seen, xy, velocity, to_px, sigma, cauchy, on_sphere, shutter, lens = s
-    R_rowC, p_rowC = R_BC.copy(), p_BC.copy()
+    R_rowC, p_rowC = np.empty((3, 3)), np.empty(3)
     q, b, X, r, T = np.empty(3), np.empty(3), np.empty(3), np.empty(2), np.empty((2, 3))
-    count, frames = seen.shape
+    count, N = len(seen), len(cameras.p_BC)
     cost, errors = 0.0, np.empty(count)
     for i in range(count):
         host, views, total = -1, 0, 0.0
-        _in_body(R_BC, p_BC, landmarks[i], q)
-        for f in range(frames):
-            if not seen[i, f]:
+        for v in range(seen.shape[1]):
+            if not seen[i, v]:
                 continue
-            host = f if host < 0 else host
-            x, y = xy[i, f, 0] - offset_s * velocity[i, f, 0], xy[i, f, 1] - offset_s * velocity[i, f, 1]
+            f, c = v // N, v % N
+            if host < 0:
+                host = f
+                _in_body(cameras.R_BC[c], cameras.p_BC[c], landmarks[i], q)
+            x = xy[i, v, 0] - cameras.offset_s[c] * velocity[i, v, 0]
+            y = xy[i, v, 1] - cameras.offset_s[c] * velocity[i, v, 1]
+            R_C, p_C = cameras.R_BC[c], cameras.p_BC[c]
             if shutter.rolling:
-                camera_at_row(camera, shutter, i, f, R_rowC, p_rowC)
-            _in_camera(poses.R_fh[f, host], poses.t_fh[f, host], R_rowC, p_rowC, landmarks[i, 2], q, b, X)
-            _residual(X, x, y, to_px[i, f], on_sphere, T, r)
+                camera_at_row(cameras, shutter, i, v, R_rowC, p_rowC)
+                R_C, p_C = R_rowC, p_rowC
+            _in_camera(poses.R_fh[f, host], poses.t_fh[f, host], R_C, p_C, landmarks[i, 2], q, b, X)
+            _residual(X, x, y, to_px[i, v], on_sphere, T, r)
             if lens.varied:
-                _add_lens(lens, i, f, intrinsics, r)
+                _add_lens(lens, i, v, cameras.intrinsics[c], r)
             squared = r[0] * r[0] + r[1] * r[1]
             cost += 0.5 * cauchy * cauchy * math.log(1.0 + squared / (sigma * sigma * cauchy * cauchy))
             total += squared / (sigma * sigma)
@@ -403,73 +418,81 @@ def _evaluate(poses: Poses, camera: Calibrated, s: Sightings, landmarks: Float) 
 
 
 @kernel
-def linearise(poses: Poses, first: Poses, camera: Calibrated, s: Sightings, landmarks: Float) -> Linearised:
-    R_BC, p_BC, offset_s, _, intrinsics = camera
+def linearise(poses: Poses, first: Poses, cameras: Calibrated, s: Sightings, landmarks: Float) -> Linearised:
     seen, xy, velocity, to_px, sigma, cauchy, on_sphere, shutter, lens = s
     rolling = shutter.rolling
-    count, frames = seen.shape
-    at_camera = 6 * frames
-    n = at_camera + CALIBRATION_SIZE
+    count, views = seen.shape
+    N = len(cameras.p_BC)
+    at_cameras = 6 * (views // N)
+    n = at_cameras + CALIBRATION_SIZE * N
     H, g = np.zeros((n, n)), np.zeros(n)
     V, W, c = np.zeros((count, 3, 3)), np.zeros((count, 3, n)), np.zeros((count, 3))
-    cost, squares, views, behind = 0.0, np.zeros(count), np.zeros(count), np.zeros(count, np.bool_)
-    hosted, begins = _sorted(_ends(seen)[0], frames)
+    cost, squares, sightings, behind = 0.0, np.zeros(count), np.zeros(count), np.zeros(count, np.bool_)
+    hosted, begins = _sorted(_ends(seen)[0], views)
 
-    # Of all sightings of a frame whose landmarks have the same host: by [dtheta_host dp_host dtheta_frame calibration],
-    # the residual behind it. By dp_frame it is minus that by dp_host.
-    rows, own = np.zeros((2 * count + 2, 26)), np.empty((25, 26))
+    # Of all sightings of a view whose landmarks have the same host: by [dtheta_host dp_host dtheta_frame camera], and
+    # where the host is another camera's by [dtheta_BD dp_BD] of that, the residual behind it. By dp_frame it is minus
+    # that by dp_host.
+    rows, own = np.zeros((2 * count + 2, 32)), np.empty((31, 32))
     D, J_m = np.empty((2, 3)), np.empty((2, 3))
     q, b, X, r, T = np.empty(3), np.empty(3), np.empty(3), np.empty(2), np.empty((2, 3))
     by_offset, p_row = np.empty(2), np.empty(3)
-    R_rowC, p_rowC = R_BC.copy(), p_BC.copy()
+    R_rowC, p_rowC = np.empty((3, 3)), np.empty(3)
     now, then = _empty_view(), _empty_view()
-    for host in range(frames):
-        for f in range(host, frames):
-            moved = host != f
+    for host in range(views):
+        h, d = host // N, host % N
+        R_BD, p_BD, at_host = cameras.R_BC[d], cameras.p_BC[d], at_cameras + CALIBRATION_SIZE * d
+        for view in range(host, views):
+            f, of = view // N, view % N
+            R_BC, p_BC, at_camera = cameras.R_BC[of], cameras.p_BC[of], at_cameras + CALIBRATION_SIZE * of
+            offset_s = cameras.offset_s[of]
+            moved, across = h != f, d != of
+            width = 31 if across else 25
             # In the host itself a landmark is where it was seen, unless rows are read at different times.
-            apart = moved or rolling
+            apart = moved or across or rolling
             filled = 0
-            R_fh, t_fh, R_BW = first.R_fh[f, host], first.t_fh[f, host], first.R_WB[f].T
-            _view(poses.R_fh[f, host], poses.t_fh[f, host], R_rowC, p_rowC, R_BC, p_BC, now)
-            _view(R_fh, t_fh, R_rowC, p_rowC, R_BC, p_BC, then)
-            M, N, t = then
+            R_fh, t_fh, R_BW = first.R_fh[f, h], first.t_fh[f, h], first.R_WB[f].T
+            R_rowC[:], p_rowC[:] = R_BC, p_BC
+            _view(poses.R_fh[f, h], poses.t_fh[f, h], R_rowC, p_rowC, R_BD, p_BD, now)
+            _view(R_fh, t_fh, R_rowC, p_rowC, R_BD, p_BD, then)
+            M, B, t = then
             for i in hosted[begins[host] : begins[host + 1]]:
-                if not seen[i, f]:
+                if not seen[i, view]:
                     continue
                 m_x, m_y, rho = landmarks[i, 0], landmarks[i, 1], landmarks[i, 2]
-                vx, vy = velocity[i, f, 0], velocity[i, f, 1]
-                px = to_px[i, f]
+                vx, vy = velocity[i, view, 0], velocity[i, view, 1]
+                px = to_px[i, view]
                 if rolling:
-                    camera_at_row(camera, shutter, i, f, R_rowC, p_rowC)
-                    _view(poses.R_fh[f, host], poses.t_fh[f, host], R_rowC, p_rowC, R_BC, p_BC, now)
-                    _view(R_fh, t_fh, R_rowC, p_rowC, R_BC, p_BC, then)
+                    camera_at_row(cameras, shutter, i, view, R_rowC, p_rowC)
+                    _view(poses.R_fh[f, h], poses.t_fh[f, h], R_rowC, p_rowC, R_BD, p_BD, now)
+                    _view(R_fh, t_fh, R_rowC, p_rowC, R_BD, p_BD, then)
                 _direction(now, m_x, m_y, rho, X)
-                _residual(X, xy[i, f, 0] - offset_s * vx, xy[i, f, 1] - offset_s * vy, px, on_sphere, T, r)
+                _residual(X, xy[i, view, 0] - offset_s * vx, xy[i, view, 1] - offset_s * vy, px, on_sphere, T, r)
                 if lens.varied:
-                    _add_lens(lens, i, f, intrinsics, r)
+                    _add_lens(lens, i, view, cameras.intrinsics[of], r)
                 squared = (r[0] * r[0] + r[1] * r[1]) / (sigma * sigma)
                 cost += 0.5 * cauchy * cauchy * math.log(1.0 + squared / (cauchy * cauchy))
                 squares[i] += squared
-                views[i] += 1.0
+                sightings[i] += 1.0
                 behind[i] |= X[2] <= _LEAST_DEPTH_RATIO
                 scale = math.sqrt(1.0 / (1.0 + squared / (cauchy * cauchy))) / sigma
 
                 _direction(then, m_x, m_y, rho, X)
                 _residual_jacobian(X, vx, vy, px, on_sphere, T, D, by_offset)
                 for k in range(3):
-                    q[k] = R_BC[k, 0] * m_x + R_BC[k, 1] * m_y + R_BC[k, 2] + rho * p_BC[k]
+                    q[k] = R_BD[k, 0] * m_x + R_BD[k, 1] * m_y + R_BD[k, 2] + rho * p_BD[k]
                     b[k] = R_rowC[k, 0] * X[0] + R_rowC[k, 1] * X[1] + R_rowC[k, 2] * X[2] + rho * p_rowC[k]
                 for a in range(2):
                     J = rows[filled + a]
-                    J[25] = scale * r[a]
+                    J[width] = scale * r[a]
                     d_0, d_1, d_2 = scale * D[a, 0], scale * D[a, 1], scale * D[a, 2]
                     # By the landmark's ray in its host, and by its points in the bodies of host and frame.
                     c_0 = d_0 * M[0, 0] + d_1 * M[1, 0] + d_2 * M[2, 0]
                     c_1 = d_0 * M[0, 1] + d_1 * M[1, 1] + d_2 * M[2, 1]
                     c_2 = d_0 * M[0, 2] + d_1 * M[1, 2] + d_2 * M[2, 2]
-                    B_0 = d_0 * N[0, 0] + d_1 * N[1, 0] + d_2 * N[2, 0]
-                    B_1 = d_0 * N[0, 1] + d_1 * N[1, 1] + d_2 * N[2, 1]
-                    B_2 = d_0 * N[0, 2] + d_1 * N[1, 2] + d_2 * N[2, 2]
+                    B_0 = d_0 * B[0, 0] + d_1 * B[1, 0] + d_2 * B[2, 0]
+                    B_1 = d_0 * B[0, 1] + d_1 * B[1, 1] + d_2 * B[2, 1]
+                    B_2 = d_0 * B[0, 2] + d_1 * B[1, 2] + d_2 * B[2, 2]
                     A_0 = d_0 * R_rowC[0, 0] + d_1 * R_rowC[0, 1] + d_2 * R_rowC[0, 2]
                     A_1 = d_0 * R_rowC[1, 0] + d_1 * R_rowC[1, 1] + d_2 * R_rowC[1, 2]
                     A_2 = d_0 * R_rowC[2, 0] + d_1 * R_rowC[2, 1] + d_2 * R_rowC[2, 2]
@@ -489,14 +512,18 @@ def linearise(poses: Poses, first: Poses, camera: Calibrated, s: Sightings, land
                         a_2 = d_0 * R_BC[2, 0] + d_1 * R_BC[2, 1] + d_2 * R_BC[2, 2]
                     else:
                         a_0, a_1, a_2 = A_0, A_1, A_2
-                    if apart:
-                        J_m[a, 2] = d_0 * t[0] + d_1 * t[1] + d_2 * t[2]
+                    J_m[a, 2] = d_0 * t[0] + d_1 * t[1] + d_2 * t[2] if apart else 0.0
+                    if across:
+                        J[9], J[10], J[11] = d_1 * X[2] - d_2 * X[1], d_2 * X[0] - d_0 * X[2], d_0 * X[1] - d_1 * X[0]
+                        J[12], J[13], J[14] = -rho * a_0, -rho * a_1, -rho * a_2
+                        J[25], J[26], J[27] = m_y * c_2 - c_1, c_0 - m_x * c_2, m_x * c_1 - m_y * c_0
+                        J[28], J[29], J[30] = rho * B_0, rho * B_1, rho * B_2
+                    elif apart:
                         J[9] = d_1 * X[2] - d_2 * X[1] + m_y * c_2 - c_1
                         J[10] = d_2 * X[0] - d_0 * X[2] + c_0 - m_x * c_2
                         J[11] = d_0 * X[1] - d_1 * X[0] + m_x * c_1 - m_y * c_0
                         J[12], J[13], J[14] = rho * (B_0 - a_0), rho * (B_1 - a_1), rho * (B_2 - a_2)
                     else:
-                        J_m[a, 2] = 0.0
                         for k in range(9, 15):
                             J[k] = 0.0
                     J[15], J[16] = scale * by_offset[a], 0.0
@@ -507,32 +534,36 @@ def linearise(poses: Poses, first: Poses, camera: Calibrated, s: Sightings, land
                         J[16] -= a_0 * (rate[1] * p_row[2] - rate[2] * p_row[1]) + rho * A_0 * v_B[0]
                         J[16] -= a_1 * (rate[2] * p_row[0] - rate[0] * p_row[2]) + rho * A_1 * v_B[1]
                         J[16] -= a_2 * (rate[0] * p_row[1] - rate[1] * p_row[0]) + rho * A_2 * v_B[2]
-                        J[16] *= shutter.row[i, f]
+                        J[16] *= shutter.row[i, view]
                     if lens.varied:
                         for k in range(8):
-                            J[17 + k] = scale * lens.px[i, f, a, k]
+                            J[17 + k] = scale * lens.px[i, view, a, k]
 
                 J_0, J_1 = rows[filled], rows[filled + 1]
                 filled += 2
                 for k in range(3):
                     a_0, a_1 = J_m[0, k], J_m[1, k]
-                    c[i, k] += a_0 * J_0[25] + a_1 * J_1[25]
+                    c[i, k] += a_0 * J_0[width] + a_1 * J_1[width]
                     for v in range(3):
                         V[i, k, v] += a_0 * J_m[0, v] + a_1 * J_m[1, v]
                     w = W[i, k]
                     for v in range(CALIBRATION_SIZE):
                         w[at_camera + v] += a_0 * J_0[9 + v] + a_1 * J_1[9 + v]
+                    if across:
+                        for v in range(6):
+                            w[at_host + v] += a_0 * J_0[25 + v] + a_1 * J_1[25 + v]
                     if moved:
                         for v in range(6):
-                            w[6 * host + v] += a_0 * J_0[v] + a_1 * J_1[v]
+                            w[6 * h + v] += a_0 * J_0[v] + a_1 * J_1[v]
                         for v in range(3):
-                            w[6 * f + v] = a_0 * J_0[6 + v] + a_1 * J_1[6 + v]
-                            w[6 * f + 3 + v] = -(a_0 * J_0[3 + v] + a_1 * J_1[3 + v])
-            _squared(rows, filled, own)
-            _add_own(own, host, f, H, g)
+                            w[6 * f + v] += a_0 * J_0[6 + v] + a_1 * J_1[6 + v]
+                            w[6 * f + 3 + v] -= a_0 * J_0[3 + v] + a_1 * J_1[3 + v]
+            if filled:
+                _squared(rows, filled, width, own)
+                _add_own(own, h, f, at_host, at_camera, H, g)
     errors = np.empty(count)
     for i in range(count):
-        errors[i] = np.inf if behind[i] else math.sqrt(0.5 * squares[i] / max(views[i], 1.0))
+        errors[i] = np.inf if behind[i] else math.sqrt(0.5 * squares[i] / max(sightings[i], 1.0))
     return H, g, V, W, c, cost, errors
 
 
@@ -564,16 +595,16 @@ def _sorted(keys: Int, most: int) -> tuple[Int, Int]:
 
 
 @kernel
-def _squared(rows: Float, count: int, out: Float) -> None:
-    """The upper half of J^T [J r], (25, 26), of the first ``count`` rows [J r], an even number, four at a time."""
+def _squared(rows: Float, count: int, width: int, out: Float) -> None:
+    """Upper half of J^T [J r], J of ``width`` columns, of the first ``count`` rows, an even number, four at a time."""
     if count % 4:
         rows[count : count + 2] = 0.0
     out[:] = 0.0
     for k in range(0, count, 4):
         J_0, J_1, J_2, J_3 = rows[k], rows[k + 1], rows[k + 2], rows[k + 3]
-        for u in range(25):
+        for u in range(width):
             own, a_0, a_1, a_2, a_3 = out[u], J_0[u], J_1[u], J_2[u], J_3[u]
-            for v in range(u, 26):
+            for v in range(u, width + 1):
                 own[v] += a_0 * J_0[v] + a_1 * J_1[v] + a_2 * J_2[v] + a_3 * J_3[v]
 
 
@@ -583,51 +614,68 @@ def _empty_view() -> View:
 
 
 @kernel
-def _view(R_fh: Float, t_fh: Float, R_rowC: Float, p_rowC: Float, R_BC: Float, p_BC: Float, view: View) -> None:
-    """``view`` from the host: rotations from its camera and its body to the frame's camera, and the translation."""
-    R_CC, R_CB, t_C = view
+def _view(R_fh: Float, t_fh: Float, R_rowC: Float, p_rowC: Float, R_BD: Float, p_BD: Float, view: View) -> None:
+    """``view`` from the host: rotations from its camera and its body to the view's camera, and the translation."""
+    R_CD, R_CB, t_C = view
     for i in range(3):
         for k in range(3):
             R_CB[i, k] = R_rowC[0, i] * R_fh[0, k] + R_rowC[1, i] * R_fh[1, k] + R_rowC[2, i] * R_fh[2, k]
     for i in range(3):
         t_C[i] = 0.0
         for k in range(3):
-            R_CC[i, k] = R_CB[i, 0] * R_BC[0, k] + R_CB[i, 1] * R_BC[1, k] + R_CB[i, 2] * R_BC[2, k]
-            t_C[i] += R_CB[i, k] * p_BC[k] + R_rowC[k, i] * (t_fh[k] - p_rowC[k])
+            R_CD[i, k] = R_CB[i, 0] * R_BD[0, k] + R_CB[i, 1] * R_BD[1, k] + R_CB[i, 2] * R_BD[2, k]
+            t_C[i] += R_CB[i, k] * p_BD[k] + R_rowC[k, i] * (t_fh[k] - p_rowC[k])
 
 
 @kernel
 def _direction(view: View, x: float, y: float, rho: float, X: Float) -> None:
-    """``X`` (3,): rho times the position in the frame's camera of the landmark [x y rho]."""
-    R_CC, _, t_C = view
+    """``X`` (3,): rho times the position in the view's camera of the landmark [x y rho]."""
+    R_CD, _, t_C = view
     for i in range(3):
-        X[i] = R_CC[i, 0] * x + R_CC[i, 1] * y + R_CC[i, 2] + rho * t_C[i]
+        X[i] = R_CD[i, 0] * x + R_CD[i, 1] * y + R_CD[i, 2] + rho * t_C[i]
 
 
 @kernel
-def _add_own(own: Float, host: int, f: int, H: Float, g: Float) -> None:
-    """Add what :func:`_squared` makes of a frame's sightings of a host's landmarks; of ``H`` the upper half."""
-    at_h, at_f, at_camera = 6 * host, 6 * f, len(g) - CALIBRATION_SIZE
-    if host != f:
+def _add_own(own: Float, h: int, f: int, at_host: int, at_camera: int, H: Float, g: Float) -> None:
+    """Add what :func:`_squared` makes of a view's sightings of a host's landmarks; of ``H`` the upper half.
+
+    The entries of the cameras, that of the host and that of the view, begin at ``at_host`` and ``at_camera``.
+    """
+    at_h, at_f, across = 6 * h, 6 * f, at_host != at_camera
+    width = 31 if across else 25
+    if h != f:
         for u in range(9):
             row = at_h + u if u < 6 else at_f + u - 6
-            g[row] += own[u, 25]
+            g[row] += own[u, width]
             for v in range(u, 6):
                 H[row, at_h + v] += own[u, v]
             for v in range(max(u, 6), 9):
                 H[row, at_f + v - 6] += own[u, v]
             for v in range(9, 25):
                 H[row, at_camera + v - 9] += own[u, v]
+            for v in range(25, width):
+                H[row, at_host + v - 25] += own[u, v]
             for v in range(3):  # dp_frame
                 H[row, at_f + 3 + v] -= own[u, 3 + v] if u < 3 + v else own[3 + v, u]
         for u in range(3, 6):
             row = at_f + u
-            g[row] -= own[u, 25]
+            g[row] -= own[u, width]
             for v in range(u, 6):
                 H[row, at_f + v] += own[u, v]
             for v in range(9, 25):
                 H[row, at_camera + v - 9] -= own[u, v]
-    for u in range(CALIBRATION_SIZE):
-        g[at_camera + u] += own[9 + u, 25]
-        for v in range(u, CALIBRATION_SIZE):
-            H[at_camera + u, at_camera + v] += own[9 + u, 9 + v]
+            for v in range(25, width):
+                H[row, at_host + v - 25] -= own[u, v]
+    for u in range(9, 25):
+        row = at_camera + u - 9
+        g[row] += own[u, width]
+        for v in range(u, 25):
+            H[row, at_camera + v - 9] += own[u, v]
+        for v in range(25, width):
+            column = at_host + v - 25
+            H[min(row, column), max(row, column)] += own[u, v]
+    for u in range(25, width):
+        row = at_host + u - 25
+        g[row] += own[u, width]
+        for v in range(u, width):
+            H[row, at_host + v - 25] += own[u, v]

@@ -92,17 +92,17 @@ class TrackTable:
 class LandmarkTable(TrackTable):
     """Tracks with the landmark that each belongs to.
 
-    ``landmarks`` (F, 3) are [x y rho]: the point on the z = 1 plane of the track's host, the first frame that sees it,
+    ``landmarks`` (F, 3) are [x y rho]: the point on the z = 1 plane of the track's host, the first that sees it,
     and the inverse depth there, 1/m (Civera, Davison, Montiel, "Inverse Depth Parametrization for Monocular SLAM",
-    T-RO 2008). They mean something where ``known`` (F,). ``to_px`` (F, K, 2, 2) are the pixels by residual of each
+    T-RO 2008). They mean something where ``known`` (F,). ``to_px`` (F, V, 2, 2) are the pixels by residual of each
     sighting.
     """
 
     _by_track = ("ids", "landmarks", "known")
     _by_sighting = ("seen", "xy", "xy_normalised", "to_px")
 
-    def __init__(self) -> None:
-        super().__init__()
+    def __init__(self, cameras: int = 1) -> None:
+        super().__init__(cameras)
         self.landmarks: Float = np.empty((0, 3))
         self.known: Bool = np.empty(0, dtype=bool)
         self.to_px: Float = np.empty((0, 0, 2, 2))

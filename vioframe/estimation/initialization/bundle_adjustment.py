@@ -6,6 +6,7 @@ which nothing measures, are held at one of the states, and the priors on the bia
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -41,29 +42,34 @@ _RELATIVE_DECREASE, _ROUGH_DECREASE = 1e-4, 1e-3
 _HELD, _FIXED = 1e4, 1e8
 
 
-def adjustment(window: Window, imu: list[Preintegrated], x: Variables, camera: CameraOnBody, known: Float) -> Problem:
+def adjustment(
+    window: Window, imu: list[Preintegrated], x: Variables, cameras: Sequence[CameraOnBody], known: Float
+) -> Problem:
     """All factors of ``window``, whose readings are ``imu``, about the values ``x``; the first state is held.
 
-    ``known`` (16, 16) is the covariance of the calibration of ``camera``, zero in what is known for sure.
+    ``known`` (16 N, 16 N) is the covariance of the calibration of ``cameras``, zero in what is known for sure.
     """
-    seen = np.ascontiguousarray(window.seen.T)
+    seen, N = np.ascontiguousarray(window.seen.T), len(cameras)
     gyro_B = np.stack([imu[0].imu.gyro_B[0], *(m.imu.gyro_B[-1] for m in imu)])
-    xy, rolling = window.xy, bool(camera.readout_s or known[READOUT, READOUT])
-    if rolling:
-        xy = camera.model.undistort(window.xy_px.reshape(-1, 2)).reshape(xy.shape)
-    xy = np.ascontiguousarray(np.where(seen[..., None], np.swapaxes(xy, 0, 1), 0.0))
-    model, intrinsics = intrinsics_of(camera.model)
-    to_px = pixels_by_residual(model, intrinsics, xy.reshape(-1, 2), False).reshape(*seen.shape, 2, 2)
-    at, depth = in_images(x.states, x.camera, seen.argmax(axis=1), x.landmarks)
-    lens = Lens(True, pixels_by_intrinsics(model, intrinsics, at, seen), np.tile(intrinsics, (len(gyro_B), 1)))
-    velocity = image_velocities(x.states, x.camera, gyro_B, at, depth)
-    shutter = GLOBAL_SHUTTER
-    if rolling:
-        row = camera.row(np.ascontiguousarray(window.xy_px[..., 1].T))
-        shutter = Shutter(True, row, *motion_in_body(x.states, gyro_B))
+    rolling = bool(any(camera.readout_s for camera in cameras) or np.diag(known)[READOUT::CALIBRATION_SIZE].any())
+    xy, row, to_px = np.zeros((*seen.shape, 2)), np.zeros(seen.shape), np.zeros((*seen.shape, 2, 2))
+    models, intrinsics = zip(*(intrinsics_of(camera.model) for camera in cameras), strict=True)
+    for c, camera in enumerate(cameras):
+        px, own = np.swapaxes(window.xy_px[c::N], 0, 1), np.swapaxes(window.xy[c::N], 0, 1)
+        if rolling:
+            own = camera.model.undistort(px.reshape(-1, 2)).reshape(px.shape)
+            row[:, c::N] = camera.row(px[..., 1])
+        own = np.where(seen[:, c::N, None], own, 0.0)
+        by_residual = pixels_by_residual(models[c], intrinsics[c], own.reshape(-1, 2), False)
+        xy[:, c::N], to_px[:, c::N] = own, by_residual.reshape(*own.shape, 2)
+    at, depth = in_images(x.states, x.cameras, seen.argmax(axis=1), x.landmarks)
+    by_intrinsics = pixels_by_intrinsics(np.array(models), np.stack(intrinsics), at, seen)
+    lens = Lens(True, by_intrinsics, np.tile(np.stack(intrinsics), (len(gyro_B), 1)))
+    velocity = image_velocities(x.states, x.cameras, gyro_B, at, depth)
+    shutter = Shutter(True, row, *motion_in_body(x.states, gyro_B)) if rolling else GLOBAL_SHUTTER
     sightings = Sightings(seen, xy, velocity, to_px, PIXEL_SIGMA, _CAUCHY, shutter=shutter, lens=lens)
     return Problem(
-        _prior(x, 0, _HELD, Calibrated.of(camera), known), ImuFactors.stack(imu), {}, sightings, first_estimates=False
+        _prior(x, 0, _HELD, Calibrated.of(*cameras), known), ImuFactors.stack(imu), {}, sightings, first_estimates=False
     )
 
 
@@ -72,17 +78,17 @@ def adjusted(problem: Problem, x: Variables, known: Float, roughly: bool = False
     return solve(problem, x, _active(x, known), _MAX_ITERATIONS, _ROUGH_DECREASE if roughly else _RELATIVE_DECREASE)
 
 
-def with_calibration(problem: Problem, x: Variables, camera: CameraOnBody, known: Float) -> Problem:
+def with_calibration(problem: Problem, x: Variables, cameras: Sequence[CameraOnBody], known: Float) -> Problem:
     """``problem`` with another prior on the calibration."""
-    return replace(problem, prior=_prior(x, 0, _HELD, Calibrated.of(camera), known))
+    return replace(problem, prior=_prior(x, 0, _HELD, Calibrated.of(*cameras), known))
 
 
 def covariance(problem: Problem, x: Variables, known: Float) -> Float:
-    """Of all states and the calibration (15 K + 16, 15 K + 16) at the minimum ``x``; zero where ``known`` is.
+    """Of all states and the calibration (15 K + 16 N, 15 K + 16 N) at the minimum ``x``; zero where ``known`` is.
 
     Position and yaw are pinned at the *newest* state.
     """
-    prior = _prior(x, len(x.states) - 1, _FIXED, problem.prior.camera, known)
+    prior = _prior(x, len(x.states) - 1, _FIXED, problem.prior.cameras, known)
     normal = replace(problem, prior=prior).linearise(x)
     active = _active(x, known)
     cov = np.zeros(normal.H.shape)
@@ -96,12 +102,12 @@ def _active(x: Variables, known: Float) -> Int:
 
 
 def _prior(x: Variables, held: int, information: float, given: Calibrated, known: Float) -> Prior:
-    """The first state's biases about zero, the calibration about ``given`` with the covariance ``known`` (16, 16).
+    """The first state's biases about zero, the calibration about ``given`` with the covariance ``known`` (16 N, 16 N).
 
     And that state ``held`` neither moves nor turns about gravity.
     """
     states, K = x.states, len(x.states)
-    H = np.zeros((STATE_SIZE * K + CALIBRATION_SIZE, STATE_SIZE * K + CALIBRATION_SIZE))
+    H = np.zeros((STATE_SIZE * K + len(known), STATE_SIZE * K + len(known)))
     first, own = H[:STATE_SIZE, :STATE_SIZE], H[STATE_SIZE * held :, STATE_SIZE * held :]
     first[DBG, DBG] = np.eye(3) / BIAS_GYRO_SIGMA**2
     first[DBA, DBA] = np.eye(3) / BIAS_ACCEL_SIGMA**2
@@ -110,5 +116,5 @@ def _prior(x: Variables, held: int, information: float, given: Calibrated, known
     own[DP, DP] = information * np.eye(3)
     zero = np.zeros((K, 3))
     about = StateArrays(states.R_WB, states.p_WB, states.v_WB, zero, zero)
-    H[-CALIBRATION_SIZE:, -CALIBRATION_SIZE:] = calibration_information(known)
+    H[-len(known) :, -len(known) :] = calibration_information(known)
     return Prior(H, np.zeros(len(H)), about, given, np.isin(np.arange(K), (0, held)))

@@ -45,6 +45,8 @@ _SOLVES = 4
 _LEAST_PARALLAX = 3.0
 # Depths beyond these, in terms of the median, are not used for weighing.
 _NEAR, _FAR = 0.02, 50.0
+# Information about the scale where it is known, far beyond what the alignment finds.
+_SURE = 1e9
 # What the path from images and the doubly integrated readings may differ by.
 _POSITION_SIGMA_M = 0.01
 
@@ -222,7 +224,9 @@ def rotations(imu: Sequence[Preintegrated]) -> Float:
     return np.stack(R)
 
 
-def align(camera: Float, imu: Sequence[Preintegrated], p_BC: Float, bias_sigma: float) -> Alignment:
+def align(
+    camera: Float, imu: Sequence[Preintegrated], p_BC: Float, bias_sigma: float, *, in_metres: bool = False
+) -> Alignment:
     """``camera`` (K, 3) positions from the first camera in the axes of B0, in any unit; ``bias_sigma`` prior, m/s^2."""
     R = rotations(imu)
     t, p_imu, v_imu, p_by_bias, v_by_bias = _cumulate(imu, R)
@@ -235,6 +239,9 @@ def align(camera: Float, imu: Sequence[Preintegrated], p_BC: Float, bias_sigma: 
     b = -(p_imu + arm - arm[0]).ravel()
     H, s = A.T @ A, A.T @ b
     H[6:9, 6:9] += eye * (_POSITION_SIGMA_M / bias_sigma) ** 2
+    if in_metres:
+        H[9, 9] += _SURE
+        s[9] += _SURE
     x = _solve_on_gravity_sphere(H, s)
     v_0, g, bias = x[:3], x[3:6], x[6:9]
     p = v_0 * t[:, None] + 0.5 * g * t[:, None] ** 2 + p_imu + p_by_bias @ bias

@@ -74,7 +74,7 @@ _SCALE_SIGMA, _VELOCITY_SIGMA, _SPEED_SIGMA, _TILT_SIGMA_DEG = 0.06, 0.05, 0.03,
 _SCALE_SIGMA_FOUND = 0.05
 # A calibration is wrong where the likeliest makes the rest so much likelier, as a difference of logarithms: far more
 # than chance would, because the noise in many landmarks, each with few sightings, makes focal lengths seem longer.
-_CONTRADICTED = 20.0
+CONTRADICTED = 20.0
 # A readout is doubted where it can be found to this.
 _READOUT_SIGMA_S, _READOUT = 0.0025, READOUT - CALIBRATION_SIZE
 # Beyond so many times these the first adjustment is not gone on with.
@@ -101,9 +101,9 @@ def initialise(
     noise = PIXEL_SIGMA / calibration.cameras[0].model.focal_px
 
     window = build_window(packets, [*chosen, len(packets) - 1], _MIN_VIEWS, _MOST_LANDMARKS)
-    _require(window, "tracks are long enough")
-    window, bias_gyro = _with_gyro_bias(window, bias_gyro_B, calibration, noise)
-    imu = _preintegrate(window, bias_gyro, np.zeros(3), calibration)
+    require_tracks(window, "tracks are long enough")
+    window, bias_gyro = with_gyro_bias(window, bias_gyro_B, calibration, noise)
+    imu = preintegrated(window, bias_gyro, np.zeros(3), calibration)
     R_B0B = rotations(imu)
     _check_parallax(window, R_B0B, calibration)
 
@@ -111,36 +111,37 @@ def initialise(
     alignment = align(structure.position, imu[:-1], calibration.cameras[0].p_BC, BIAS_ACCEL_SIGMA)
     refuse_unless(alignment.scale > 0.0, "the readings contradict the direction of the motion in the images")
     x = _start_of_adjustment(window.without_last(), structure, alignment, calibration)
-    problem, solution = _adjusted(window.without_last(), x, calibration, doubted, roughly=True)
+    problem, solution = adjusted_window(window.without_last(), x, calibration, doubted, roughly=True)
     cov = covariance(problem, solution.variables, doubted)
     scale_sigma = _SCALE_SIGMA_FOUND if found else _SCALE_SIGMA
-    _check_uncertainty(solution.variables.states, cov, scale_sigma, _HOPELESS)
+    check_uncertainty(solution.variables.states, cov, scale_sigma, _HOPELESS)
     if not cov[_READOUT, _READOUT] <= _READOUT_SIGMA_S**2:
         # Only fast turns tell a readout; slow ones would have it make up for something else.
         doubted = doubted.copy()
         doubted[READOUT, READOUT] = known[READOUT, READOUT]
-    keep = _explained(problem, solution.variables)
+    keep = explained(problem, solution.variables)
     window = window.only(keep)
-    _require(window, "tracks fit the bundle adjustment")
+    require_tracks(window, "tracks fit the bundle adjustment")
     x = replace(solution.variables, landmarks=solution.variables.landmarks[keep])
-    problem, solution = _adjusted(window.without_last(), x, calibration, doubted)
-    _check_fit(problem, solution)
+    problem, solution = adjusted_window(window.without_last(), x, calibration, doubted)
+    check_fit(problem, solution)
 
     x = solution.variables
-    predicted = _predict(packets[-held_out:], x.states.unstack(window.t_ns[:-1])[-1], calibration)
-    p_WF = _positions(problem, x)
-    _check_lookahead(predicted, packets[-held_out:], x.camera, window.ids, p_WF, calibration.cameras[0].model)
+    predicted = predicted_states(packets[-held_out:], x.states.unstack(window.t_ns[:-1])[-1], calibration)
+    p_WF = landmark_positions(problem, x)
+    check_lookahead(predicted, packets[-held_out:], x.cameras, window.ids, p_WF, calibration.cameras[0].model)
 
     x = replace(x, states=x.states.append(StateArrays.stack(predicted[-1:])))
-    problem, solution = _adjusted(window, x, calibration, doubted)
-    _check_fit(problem, solution)
+    problem, solution = adjusted_window(window, x, calibration, doubted)
+    check_fit(problem, solution)
     x = solution.variables
     cov = covariance(problem, x, doubted)
-    _check_uncertainty(x.states, cov, scale_sigma)
+    check_uncertainty(x.states, cov, scale_sigma)
     problem, x = _believed(problem, solution, calibration, known, cov)
     cov = covariance(problem, x, known)
-    keep = _explained(problem, x)
-    return _estimate(window.only(keep), x, cov, _positions(problem, x)[keep])
+    keep = explained(problem, x)
+    states, p_WF = from_zero(window.t_ns, x, cov, landmark_positions(problem, x)[keep])
+    return InitialEstimate("dynamic", states, window.ids[keep], p_WF, x.cameras, _camera(cov))
 
 
 def _believed(
@@ -150,38 +151,38 @@ def _believed(
 
     Raises :class:`ContradictedError` where the ``solution`` that doubts it, of covariance ``cov``, is far likelier.
     """
-    camera, x = calibration.cameras[0], solution.variables
-    problem = with_calibration(problem, x, camera, known)
-    believed = adjusted(problem, replace(x, camera=Calibrated.of(camera)), known)
-    if not believed.cost < solution.cost + _CONTRADICTED * _variance(problem, x):
-        raise ContradictedError(x.camera, _camera(cov))
+    cameras, x = calibration.cameras, solution.variables
+    problem = with_calibration(problem, x, cameras, known)
+    believed = adjusted(problem, replace(x, cameras=Calibrated.of(*cameras)), known)
+    if not believed.cost < solution.cost + CONTRADICTED * variance_of(problem, x):
+        raise ContradictedError(x.cameras, _camera(cov))
     return problem, believed.variables
 
 
-def _variance(problem: Problem, x: Variables) -> float:
+def variance_of(problem: Problem, x: Variables) -> float:
     """That of the sightings as the landmarks show it, over that which is assumed."""
-    errors, views = problem.sightings.errors(x.poses, x.camera, x.landmarks), problem.sightings.seen.sum(axis=1)
+    errors, views = problem.sightings.errors(x.poses, x.cameras, x.landmarks), problem.sightings.seen.sum(axis=1)
     return float(np.median(2.0 * views * errors**2 / (2.0 * views - 3.0)))
 
 
-def _require(window: Window, what: str) -> None:
+def require_tracks(window: Window, what: str) -> None:
     refuse_unless(len(window.ids) >= _FEWEST_LANDMARKS, f"{len(window.ids)} {what}, {_FEWEST_LANDMARKS} are needed")
 
 
-def _preintegrate(
+def preintegrated(
     window: Window, bias_gyro_B: Float, bias_accel_B: Float, calibration: Calibration
 ) -> list[Preintegrated]:
     return [preintegrate(segment, bias_gyro_B, bias_accel_B, calibration.imu) for segment in window.segments]
 
 
-def _with_gyro_bias(window: Window, about: Float, calibration: Calibration, sigma: float) -> tuple[Window, Float]:
+def with_gyro_bias(window: Window, about: Float, calibration: Calibration, sigma: float) -> tuple[Window, Float]:
     """The tracks on their epipolar lines, and the gyroscope's bias (3,) near ``about`` that puts them there."""
-    imu = _preintegrate(window, about, np.zeros(3), calibration)
+    imu = preintegrated(window, about, np.zeros(3), calibration)
     bias, distance = estimate_gyro_bias(window, imu, calibration.cameras[0].R_BC, sigma, BIAS_GYRO_SIGMA)
     rate = float(np.linalg.norm(bias))
     refuse_unless(rate <= 3.0 * BIAS_GYRO_SIGMA, f"gyroscope bias of {rate:.2f} rad/s is not plausible")
     window = window.only(distance < _EPIPOLAR_LIMIT)
-    _require(window, "tracks lie on their epipolar lines")
+    require_tracks(window, "tracks lie on their epipolar lines")
     return window, bias
 
 
@@ -192,7 +193,7 @@ def _structure(window: Window, R_B0C: Float, sigma: float) -> tuple[Window, Stru
         typical = np.nanmedian(structure.error, axis=0)
         keep = structure.good & (typical < _STRUCTURE_LIMIT * sigma)
         window = window.only(keep)
-        _require(window, "tracks have parallax and fit the structure")
+        require_tracks(window, "tracks have parallax and fit the structure")
     return window, structure.only(keep)
 
 
@@ -205,31 +206,34 @@ def _start_of_adjustment(
     host = window.seen.argmax(axis=0)
     inverse_depth = 1.0 / (alignment.scale * structure.depth[host, track])
     landmarks = np.column_stack([window.xy[host, track], inverse_depth])
-    return Variables(states, Calibrated.of(calibration.cameras[0]), landmarks)
+    return Variables(states, Calibrated.of(*calibration.cameras), landmarks)
 
 
-def _adjusted(
+def adjusted_window(
     window: Window, x: Variables, calibration: Calibration, known: Float, roughly: bool = False
 ) -> tuple[Problem, Solution]:
-    """The adjustment of ``window`` from ``x``, its readings integrated at the biases there."""
+    """The adjustment of ``window`` from ``x``, its readings integrated at the biases there.
+
+    ``known`` (16 N, 16 N) is the covariance of the ``calibration``'s cameras.
+    """
     biases = zip(x.states.bias_gyro_B[:-1], x.states.bias_accel_B[:-1], strict=True)
     imu = [preintegrate(segment, *bias, calibration.imu) for segment, bias in zip(window.segments, biases, strict=True)]
-    problem = adjustment(window, imu, x, calibration.cameras[0], known)
+    problem = adjustment(window, imu, x, calibration.cameras, known)
     return problem, adjusted(problem, x, known, roughly)
 
 
-def _explained(problem: Problem, x: Variables) -> Bool:
+def explained(problem: Problem, x: Variables) -> Bool:
     """(L,) whether a track's landmark lies in front of its cameras, at a finite depth, and near its observations."""
-    errors = problem.sightings.errors(x.poses, x.camera, x.landmarks)
+    errors = problem.sightings.errors(x.poses, x.cameras, x.landmarks)
     return np.asarray((errors < _ADJUSTED_LIMIT) & (x.landmarks[:, 2] > 1.0 / _FARTHEST_M))
 
 
-def _positions(problem: Problem, x: Variables) -> Float:
+def landmark_positions(problem: Problem, x: Variables) -> Float:
     """(L, 3) m of the landmarks in the world."""
-    return positions(x.states, x.camera, problem.sightings.seen.argmax(axis=1), x.landmarks)
+    return positions(x.states, x.cameras, problem.sightings.seen.argmax(axis=1), x.landmarks)
 
 
-def _predict(packets: Sequence[Packet], last: NavState, calibration: Calibration) -> list[NavState]:
+def predicted_states(packets: Sequence[Packet], last: NavState, calibration: Calibration) -> list[NavState]:
     """The state at each of ``packets``, of which the first follows ``last``, from readings alone."""
     out = []
     for imu, _ in packets:
@@ -238,17 +242,17 @@ def _predict(packets: Sequence[Packet], last: NavState, calibration: Calibration
     return out
 
 
-def _estimate(window: Window, x: Variables, cov: Float, p_WF: Float) -> InitialEstimate:
-    """The world turned and moved so that yaw and position are zero at the first state."""
+def from_zero(t_ns: Int, x: Variables, cov: Float, p_WF: Float) -> tuple[tuple[NavState, ...], Float]:
+    """States and landmarks (L, 3) m in the world turned and moved so that yaw and position are zero at the first."""
     adjusted = x.states
     R_0, p_0 = adjusted.R_WB[0], adjusted.p_WB[0]
     R_new = level_rotation(R_0[2]) @ R_0.T  # R_0[2] is the vertical in the body
     turn = np.eye(15)
     turn[DP, DP] = turn[DV, DV] = R_new
-    states = replace(adjusted, p_WB=adjusted.p_WB - p_0).turned(R_new).unstack(window.t_ns)
-    newest = turn @ _newest(cov) @ turn.T
+    states = replace(adjusted, p_WB=adjusted.p_WB - p_0).turned(R_new).unstack(t_ns)
+    newest = turn @ _newest(cov, len(states)) @ turn.T
     states[-1] = replace(states[-1], cov=0.5 * (newest + newest.T))
-    return InitialEstimate("dynamic", tuple(states), window.ids, (p_WF - p_0) @ R_new.T, x.camera, _camera(cov))
+    return tuple(states), (p_WF - p_0) @ R_new.T
 
 
 def _check_parallax(window: Window, R_B0B: Float, calibration: Calibration) -> None:
@@ -262,11 +266,11 @@ def _check_parallax(window: Window, R_B0B: Float, calibration: Calibration) -> N
     refuse_unless(parallax >= _LEAST_PARALLAX_PX, f"parallax of {parallax:.1f} px, {_LEAST_PARALLAX_PX} px are needed")
 
 
-def _check_fit(problem: Problem, solution: Solution) -> None:
+def check_fit(problem: Problem, solution: Solution) -> None:
     """Observations, readings and biases must be as the noise and the priors have them."""
     refuse_unless(solution.converged, "the bundle adjustment did not converge")
     x, sightings = solution.variables, problem.sightings
-    errors = sightings.errors(x.poses, x.camera, x.landmarks)
+    errors = sightings.errors(x.poses, x.cameras, x.landmarks)
     used = ~np.isinf(errors)  # what is behind a camera is let go of, and says nothing of the others
     views = sightings.seen.sum(axis=1)[used]
     rms = sightings.sigma * float(np.sqrt((views * errors[used] ** 2).sum() / views.sum()))
@@ -279,10 +283,10 @@ def _check_fit(problem: Problem, solution: Solution) -> None:
     refuse_unless(bias <= _MAX_BIAS_ACCEL, f"accelerometer bias of {bias:.2f} m/s^2 is not plausible")
 
 
-def _check_lookahead(
+def check_lookahead(
     predicted: Sequence[NavState],
     packets: Sequence[Packet],
-    camera: Calibrated,
+    cameras: Calibrated,
     ids: Int,
     p_WF: Float,
     given: Camera,
@@ -291,22 +295,22 @@ def _check_lookahead(
 
     Points were undistorted with the camera ``given``.
     """
-    found = given.with_intrinsics(camera.intrinsics)
+    found = given.with_intrinsics(cameras.intrinsics[0])
     for state, (imu, tracks) in zip(predicted, packets, strict=True):
         _, a, b = np.intersect1d(ids, tracks.ids, return_indices=True)
         refuse_unless(len(a) >= _FEWEST_COMMON, f"only {len(a)} landmarks were still tracked in the frames held back")
-        turned = so3.exp((imu.gyro_B[-1] - state.bias_gyro_B) * camera.offset_s)
-        p_WB = state.p_WB + state.v_WB * camera.offset_s
-        p_C = ((p_WF[a] - p_WB) @ (state.R_WB @ turned) - camera.p_BC) @ camera.R_BC
+        turned = so3.exp((imu.gyro_B[-1] - state.bias_gyro_B) * cameras.offset_s[0])
+        p_WB = state.p_WB + state.v_WB * cameras.offset_s[0]
+        p_C = ((p_WF[a] - p_WB) @ (state.R_WB @ turned) - cameras.p_BC[0]) @ cameras.R_BC[0]
         z = np.where(p_C[:, 2] > 0.0, p_C[:, 2], np.nan)
         error = found.distort(p_C[:, :2] / z[:, None]) - given.distort(tracks.xy_normalised[b])
         px = float(np.median(np.nan_to_num(np.linalg.norm(error, axis=1), nan=np.inf)))
         refuse_unless(px <= _LARGEST_LOOKAHEAD_PX, f"the prediction misses a later frame by {px:.1f} px")
 
 
-def _newest(cov: Float) -> Float:
-    """(15, 15) of the newest state."""
-    return cov[-15 - CALIBRATION_SIZE : -CALIBRATION_SIZE, -15 - CALIBRATION_SIZE : -CALIBRATION_SIZE]
+def _newest(cov: Float, count: int) -> Float:
+    """(15, 15) of the newest of ``count`` states."""
+    return cov[15 * (count - 1) : 15 * count, 15 * (count - 1) : 15 * count]
 
 
 def _camera(cov: Float) -> Float:
@@ -314,15 +318,15 @@ def _camera(cov: Float) -> Float:
     return cov[-CALIBRATION_SIZE:, -CALIBRATION_SIZE:]
 
 
-def _check_uncertainty(states: StateArrays, cov: Float, scale_sigma: float, factor: float = 1.0) -> None:
+def check_uncertainty(states: StateArrays, cov: Float, scale_sigma: float, factor: float = 1.0) -> None:
     """Velocity, gravity's direction and scale must be determined well; ``cov`` is of all states and the calibration.
 
     The limits, ``scale_sigma`` among them, are ``factor`` times as wide.
     """
-    newest = _newest(cov)
+    newest = _newest(cov, len(states))
     velocity = float(np.sqrt(np.linalg.eigvalsh(newest[DV, DV])[-1]))
     tilt = float(np.rad2deg(np.sqrt(np.linalg.eigvalsh(newest[DTHETA, DTHETA])[-1])))
-    scale = path_scale_sigma(states.p_WB, cov)
+    scale = 0.0 if np.isinf(scale_sigma) else path_scale_sigma(states.p_WB, cov)
     enough = max(_VELOCITY_SIGMA, _SPEED_SIGMA * float(np.linalg.norm(states.v_WB[-1])))
     by, what = max(
         (velocity / enough, f"velocity known to {velocity:.3f} m/s only"),
@@ -341,12 +345,13 @@ def path_scale_sigma(p_WB: Float, cov: Float) -> float:
     q = p_WB - p_WB.mean(axis=0)
     by_state = np.zeros((len(q), 15))
     by_state[:, DP] = q / (q**2).sum()
-    a = np.append(by_state.ravel(), np.zeros(CALIBRATION_SIZE))
-    return float(np.sqrt(a @ cov @ a))
+    a, n = by_state.ravel(), by_state.size
+    return float(np.sqrt(a @ cov[:n, :n] @ a))
 
 
 def warm_up(calibration: Calibration) -> None:
     """Compile the kernels of a start, or load them from the cache, so that the first attempt does not wait."""
+    calibration = calibration.only(0)
     t_ns, half_ns = np.arange(4) * 100_000_000, np.arange(3) * 50_000_000
     xy = np.tile(np.random.default_rng(0).uniform(-0.3, 0.3, (20, 2)), (4, 1, 1))
     segments = tuple(ImuSegment(t + half_ns, np.zeros((3, 3)), np.tile(-g_W, (3, 1))) for t in t_ns[:-1])
@@ -355,8 +360,8 @@ def warm_up(calibration: Calibration) -> None:
     turns = [turn for a, b in pairwise(frames) if (turn := turn_between(a, b, 1e-3)) is not None]
     far_ns = np.arange(-10, 11) * 100_000_000
     Turns(turns, far_ns, np.zeros((21, 3))).fit(HandEye(np.zeros(3), np.eye(3)), ())
-    _with_gyro_bias(window, np.zeros(3), calibration, 1e-3)
+    with_gyro_bias(window, np.zeros(3), calibration, 1e-3)
     state, landmarks = NavState(0, np.eye(3), *np.zeros((4, 3))), np.column_stack([xy[0], np.full(20, 0.2)])
-    x = Variables(StateArrays.stack([state] * 4), Calibrated.of(calibration.cameras[0]), landmarks)
-    problem, solution = _adjusted(window, x, calibration, 1e-4 * np.eye(CALIBRATION_SIZE))
-    _explained(problem, solution.variables)
+    x = Variables(StateArrays.stack([state] * 4), Calibrated.of(*calibration.cameras), landmarks)
+    problem, solution = adjusted_window(window, x, calibration, 1e-4 * np.eye(CALIBRATION_SIZE))
+    explained(problem, solution.variables)

@@ -53,14 +53,14 @@ class Found:
         kept = {name: getattr(before, name) for name in self.__slots__ if getattr(self, name) is None}
         return replace(self, **kept)
 
-    def settled(self, camera: Calibrated, cov: Float) -> Found:
+    def settled(self, cameras: Calibrated, cov: Float) -> Found:
         """With the parts that were found as an adjustment has them in the end, with covariance (16, 16).
 
         The time offset stays as the frames have been cut by it; an estimator finds the rest.
         """
         again = ("rotation", self.rotation_sigma), ("focal", self.focal_sigma), ("readout", self.readout_sigma_s)
         parts = {part for part, sigma in again if sigma is not None}
-        return _found(self.calibration, camera, _sigmas(self.calibration, cov), parts).after(self)
+        return _found(self.calibration, cameras, _sigmas(self.calibration, cov), parts).after(self)
 
     def __str__(self) -> str:
         (camera,), parts = self.calibration.cameras, []
@@ -78,18 +78,18 @@ class Found:
         return "found while starting: " + ", ".join(parts)
 
 
-def found_by(given: Calibration, camera: Calibrated, cov: Float) -> Found:
-    """What of ``camera``, with covariance (16, 16), differs most from the calibration ``given``, or clearly.
+def found_by(given: Calibration, cameras: Calibrated, cov: Float) -> Found:
+    """What of ``cameras``, with covariance (16, 16), differs most from the calibration ``given``, or clearly.
 
     Raises :class:`UnsureError` where that is not known well enough.
     """
     old = given.cameras[0]
     sigma = _sigmas(given, cov)
     off = {
-        "rotation": float(np.linalg.norm(so3.log(old.R_BC.T @ camera.R_BC))),
-        "offset": abs(camera.offset_s),
-        "focal": abs(_zoom(given, camera)),
-        "readout": abs(camera.readout_s - old.readout_s),
+        "rotation": float(np.linalg.norm(so3.log(old.R_BC.T @ cameras.R_BC[0]))),
+        "offset": float(abs(cameras.offset_s[0])),
+        "focal": abs(_zoom(given, cameras)),
+        "readout": float(abs(cameras.readout_s[0] - old.readout_s)),
     }
     clear = {part: off[part] / max(sigma[part], 1e-12) for part in off}
     chosen = {part for part in clear if clear[part] >= min(_CLEAR, max(clear.values()))}
@@ -97,7 +97,7 @@ def found_by(given: Calibration, camera: Calibrated, cov: Float) -> Found:
         raise UnsureError(
             f"the {' and '.join(unsure)} given contradict what is seen; what fits is not known well enough"
         )
-    return _found(given, camera, sigma, chosen)
+    return _found(given, cameras, sigma, chosen)
 
 
 def _sigmas(given: Calibration, cov: Float) -> dict[str, float]:
@@ -112,20 +112,20 @@ def _sigmas(given: Calibration, cov: Float) -> dict[str, float]:
     }
 
 
-def _zoom(given: Calibration, camera: Calibrated) -> float:
+def _zoom(given: Calibration, cameras: Calibrated) -> float:
     """By how much longer the focal length is, relative."""
     model = given.cameras[0].model
-    return float(np.mean(camera.intrinsics[:2] / (model.fx, model.fy))) - 1.0
+    return float(np.mean(cameras.intrinsics[0, :2] / (model.fx, model.fy))) - 1.0
 
 
-def _found(given: Calibration, camera: Calibrated, sigma: dict[str, float], parts: Set[str]) -> Found:
-    """``given`` with the ``parts`` that are as ``camera`` has them."""
+def _found(given: Calibration, cameras: Calibrated, sigma: dict[str, float], parts: Set[str]) -> Found:
+    """``given`` with the ``parts`` that are as ``cameras`` have them."""
     old = given.cameras[0]
     changes: dict[str, dict[str, Any]] = {
-        "rotation": {"R_BC": camera.R_BC},
-        "offset": {"time_offset_ns": old.time_offset_ns + round(camera.offset_s * NS_PER_S)},
-        "focal": {"model": old.model.zoomed(1.0 + _zoom(given, camera))},
-        "readout": {"readout_s": camera.readout_s},
+        "rotation": {"R_BC": cameras.R_BC[0]},
+        "offset": {"time_offset_ns": old.time_offset_ns + round(cameras.offset_s[0] * NS_PER_S)},
+        "focal": {"model": old.model.zoomed(1.0 + _zoom(given, cameras))},
+        "readout": {"readout_s": float(cameras.readout_s[0])},
     }
     return Found(
         given.with_camera(0, **{name: value for part in parts for name, value in changes[part].items()}),

@@ -8,10 +8,11 @@ from dataclasses import replace
 import numpy as np
 
 from vioframe.arrays import Float
+from vioframe.estimation import rig
 from vioframe.estimation.factors.reprojection import CALIBRATION_SIZE, INTRINSICS, OFFSET, READOUT
 from vioframe.estimation.inertial.noise import jumps
 from vioframe.estimation.inertial.readings import Readings
-from vioframe.estimation.initialization import dynamic, static
+from vioframe.estimation.initialization import dynamic, static, stereo
 from vioframe.estimation.initialization.found import Found, found_by
 from vioframe.estimation.initialization.sensors import SensorCheck
 from vioframe.estimation.initialization.window import (
@@ -25,12 +26,22 @@ from vioframe.estimation.initialization.window import (
     unrolled,
 )
 from vioframe.geometry import so3
-from vioframe.types import NS_PER_S, Calibration, CameraSigma, FrameTracks, ImuNoise, ImuSegment
+from vioframe.types import (
+    NS_PER_S,
+    Calibration,
+    CalibrationEstimate,
+    CameraSigma,
+    FrameTracks,
+    ImuNoise,
+    ImuSegment,
+)
 
 _log = logging.getLogger("vioframe.estimation.initialization")
 
 # Length of the standstill that the static method needs.
 _STATIC_WINDOW_S = 1.0
+# Lengths of what a rig that sees depth begins from.
+_SHORTEST_STEREO_S, _LONGEST_STEREO_S = 0.44, 1.5
 # The dynamic method is first tried when the window is this long, and looks back no farther than this; every so often.
 _SHORTEST_WINDOW_S, _USUAL_WINDOW_S, _LONGEST_WINDOW_S, _LONGER = 1.5, 3.0, 10.0, 1.2
 # Each attempt that is refused puts the next off by so much more, up to a longest wait.
@@ -56,31 +67,34 @@ class Initializer:
 
     Ahead of the dynamic method time offset, the camera's rotation on the body, its focal length and readout are held
     against what turns of camera and gyroscope say, and others found in their place where they do not fit, or are not
-    known.
+    known. With a rig whose cameras overlap a start by stereo comes ahead of it; all else looks at the first camera.
     ``imu_noise_factor`` is that of :meth:`~vioframe.types.ImuNoise.in_flight`. Every attempt is logged to
     ``vioframe.estimation.initialization``.
     """
 
     def __init__(self, calibration: Calibration, imu_noise_factor: float = 4.0) -> None:
         self._factor = _IN_MOTION * imu_noise_factor
-        self._calibration = calibration
+        self._given = calibration
+        self._calibration = calibration.only(0)
         self._sensors = SensorCheck()
         self._found: Found | None = None
         self._refusals: dict[str, str] = {}
         self._readings = Readings()
         self._packets: list[Packet] = []
         self._waiting: list[FrameTracks] = []
+        self._of_rig: list[Packet] = []
         self.in_doubt = False
-        """Whether a start was made that bears out nothing of the calibration: at rest."""
+        """Whether a start was made that bears out nothing of the calibration: at rest, or by stereo."""
         self._begin_waiting()
 
     def _begin_waiting(self) -> None:
         self._window_s, self._wait_s, self._next_attempt_ns = _USUAL_WINDOW_S, _SOON_S - _LATER_S, 0
+        self._next_stereo_ns = 0
 
     @property
     def calibration(self) -> Calibration:
         """That of the sensors, with what was found in place of what was given."""
-        return self._calibration
+        return self._given.moved_with(self._calibration.cameras[0])
 
     @property
     def found(self) -> Found | None:
@@ -103,6 +117,7 @@ class Initializer:
         self._readings = Readings()
         self._packets.clear()
         self._waiting.clear()
+        self._of_rig.clear()
         self._refusals.clear()
         self.in_doubt = False
         self._begin_waiting()
@@ -113,10 +128,12 @@ class Initializer:
         Where :attr:`calibration` has another time offset after it, ``imu`` of the next call must count with it, and
         begin where that of this call ended on the IMU's own clock, or earlier.
         """
-        if not self._take(imu, tracks):
+        if not self._take(imu, tracks.of_camera(0)):
             return None
+        self._take_of_rig(imu, tracks)
         known = self._calibration.cameras[0].rotation_known
-        methods = {"static": self._static, "dynamic": self._dynamic} if known else {"dynamic": self._dynamic}
+        placed = {"static": self._static, "stereo": self._stereo} if known else {}
+        methods = {**placed, "dynamic": self._dynamic}
         for method, attempt in methods.items():
             try:
                 estimate = attempt()
@@ -127,7 +144,7 @@ class Initializer:
             if estimate is not None:
                 _log.info("%d %s initialisation accepted", tracks.t_ns, method)
                 self._refusals.clear()
-                self.in_doubt = estimate.method == "static"
+                self.in_doubt = estimate.method != "dynamic"
                 return estimate
         return None
 
@@ -190,6 +207,30 @@ class Initializer:
             return None
         return static.initialise(packets, self._calibration.imu)
 
+    def _take_of_rig(self, imu: ImuSegment, tracks: FrameTracks) -> None:
+        """Take a frame for a start by stereo, if it follows that before."""
+        if len(self._given.cameras) == 1:
+            return
+        if self._of_rig and imu.t_ns[0] != self._of_rig[-1][0].t_ns[-1]:
+            self._of_rig.clear()
+        self._of_rig.append((imu, tracks))
+        oldest_ns = tracks.t_ns - round(_LONGEST_STEREO_S * NS_PER_S)
+        self._of_rig = [packet for packet in self._of_rig if packet[1].t_ns >= oldest_ns]
+
+    def _stereo(self) -> InitialEstimate | None:
+        packets = self._of_rig
+        if not packets or _duration_s(packets) < _SHORTEST_STEREO_S or packets[-1][1].t_ns < self._next_stereo_ns:
+            return None
+        self._next_stereo_ns = packets[-1][1].t_ns + round((_SOON_S - 1e-3) * NS_PER_S)
+        calibration = replace(self.calibration, imu=self._noise_in_motion())
+        first, others = self._sigma(_WITHOUT_ITS_FRAMES), tuple(GIVEN for _ in calibration.cameras[1:])
+        wrong = np.sqrt(np.diag(self._doubted(np.diag(first.stacked() ** 2))))
+        doubted = CameraSigma(wrong[:3], wrong[3:6], float(wrong[OFFSET]), wrong[INTRINSICS], first.readout_s)
+        known, doubted_cov = (
+            rig.covariance(CalibrationEstimate(calibration, (sigma, *others))) for sigma in (first, doubted)
+        )
+        return stereo.initialise(packets, calibration, known, doubted_cov)
+
     def _dynamic(self) -> InitialEstimate | None:
         newest_ns = self._packets[-1][1].t_ns
         if newest_ns < self._next_attempt_ns or _duration_s(self._packets) < _SHORTEST_WINDOW_S:
@@ -210,7 +251,7 @@ class Initializer:
                     estimate = dynamic.initialise(packets, calibration, known, doubted, bias, found=was_found)
                     return self._settled(estimate)
                 except ContradictedError as other:
-                    self._take_over(found_by(self._calibration, other.camera, other.cov))
+                    self._take_over(found_by(self._calibration, other.cameras, other.cov))
             raise RefusalError("images and readings contradict every calibration")
         except UnsureError:
             self._window_s = min(self._window_s * _LONGER, _LONGEST_WINDOW_S)
@@ -221,8 +262,8 @@ class Initializer:
 
     def _settled(self, estimate: InitialEstimate) -> InitialEstimate:
         """The ``estimate``, with what was found of the calibration as it has that."""
-        if self._found is not None and estimate.camera is not None:
-            self._found = self._found.settled(estimate.camera, estimate.cov_camera)
+        if self._found is not None and estimate.cameras is not None:
+            self._found = self._found.settled(estimate.cameras, estimate.cov_cameras)
             self._calibration = self._found.calibration
             _log.info("%d %s", estimate.states[-1].t_ns, self._found)
         return estimate
@@ -261,6 +302,7 @@ class Initializer:
         frames = [*(tracks for _, tracks in self._packets), *self._waiting]
         frames = [seen_anew(tracks, camera, self._readings.gyro_at(tracks.t_ns)) for tracks in frames]
         self._sensors.see_through(camera, self._readings)
+        self._of_rig.clear()
         self._packets, self._waiting = [], [f for f in frames if f.t_ns >= self._readings.t_ns[0]]
         self._cut()
 

@@ -34,15 +34,15 @@ class InitialEstimate:
 
     ``states`` are the window's frames, oldest first. The last is the newest frame and has ``cov`` (15, 15), with
     position and yaw, which nothing measures, pinned at that frame. ``landmark_ids`` (L,) and ``p_WF`` (L, 3) m are the
-    dynamic method's landmarks; ``camera``, of covariance ``cov_camera`` (16, 16), is what it saw them with.
+    landmarks that were used; ``cameras``, of covariance ``cov_cameras`` (16, 16), is what it saw them with.
     """
 
-    method: Literal["static", "dynamic"]
+    method: Literal["static", "stereo", "dynamic"]
     states: tuple[NavState, ...]
     landmark_ids: Int = field(default_factory=lambda: np.empty(0, np.int64))
     p_WF: Float = field(default_factory=lambda: np.empty((0, 3)))
-    camera: Calibrated | None = None
-    cov_camera: Float = field(default_factory=lambda: np.zeros((CALIBRATION_SIZE, CALIBRATION_SIZE)))
+    cameras: Calibrated | None = None
+    cov_cameras: Float = field(default_factory=lambda: np.zeros((CALIBRATION_SIZE, CALIBRATION_SIZE)))
 
 
 class RefusalError(Exception):
@@ -54,11 +54,11 @@ class UnsureError(RefusalError):
 
 
 class ContradictedError(RefusalError):
-    """What was seen and felt speaks against the calibration, and for ``camera``, of covariance ``cov`` (16, 16)."""
+    """What was seen and felt speaks against the calibration, and for ``cameras``, of covariance ``cov`` (16, 16)."""
 
-    def __init__(self, camera: Calibrated, cov: Float) -> None:
+    def __init__(self, cameras: Calibrated, cov: Float) -> None:
         super().__init__("images and readings contradict the calibration")
-        self.camera, self.cov = camera, cov
+        self.cameras, self.cov = cameras, cov
 
 
 def refuse_unless(good: object, why: str) -> None:
@@ -69,10 +69,10 @@ def refuse_unless(good: object, why: str) -> None:
 
 @dataclass(frozen=True, slots=True)
 class Window:
-    """K keyframes, the readings between them, and L tracks.
+    """K keyframes, the readings between them, and L tracks over the V = K N views of N ``cameras``.
 
-    ``t_ns`` (K,), ``segments`` K - 1, ``ids`` (L,). ``xy`` (K, L, 2) are points on the z = 1 plane, as :func:`unrolled`
-    leaves them, NaN where ``seen`` (K, L) is False; ``xy_px`` (K, L, 2) the pixels.
+    ``t_ns`` (K,), ``segments`` K - 1, ``ids`` (L,). ``xy`` (V, L, 2) are points on the z = 1 plane, as :func:`unrolled`
+    leaves them, NaN where ``seen`` (V, L) is False; ``xy_px`` (V, L, 2) the pixels. A frame's views are together.
     """
 
     t_ns: Int
@@ -81,16 +81,23 @@ class Window:
     xy: Float
     seen: Bool
     xy_px: Float
+    cameras: int = 1
 
     def only(self, keep: Bool) -> Window:
         """The same window with the tracks ``keep`` (L,)."""
-        return Window(
-            self.t_ns, self.segments, self.ids[keep], self.xy[:, keep], self.seen[:, keep], self.xy_px[:, keep]
-        )
+        seen, xy, xy_px = self.seen[:, keep], self.xy[:, keep], self.xy_px[:, keep]
+        return replace(self, ids=self.ids[keep], seen=seen, xy=xy, xy_px=xy_px)
 
     def without_last(self) -> Window:
         """The same tracks without the newest keyframe."""
-        return Window(self.t_ns[:-1], self.segments[:-1], self.ids, self.xy[:-1], self.seen[:-1], self.xy_px[:-1])
+        earlier = slice(0, -self.cameras)
+        seen, xy, xy_px = self.seen[earlier], self.xy[earlier], self.xy_px[earlier]
+        return replace(self, t_ns=self.t_ns[:-1], segments=self.segments[:-1], seen=seen, xy=xy, xy_px=xy_px)
+
+    def of_camera(self, camera: int) -> Window:
+        """The same tracks as one of the cameras sees them."""
+        own = slice(camera, None, self.cameras)
+        return replace(self, seen=self.seen[own], xy=self.xy[own], xy_px=self.xy_px[own], cameras=1)
 
 
 def unrolled(tracks: FrameTracks, camera: CameraOnBody, rate_B: Float) -> FrameTracks:
@@ -110,11 +117,13 @@ def seen_anew(tracks: FrameTracks, camera: CameraOnBody, rate_B: Float) -> Frame
     return unrolled(tracks.undistorted(camera.model).finite(), camera, rate_B)
 
 
-def build_window(packets: Sequence[Packet], chosen: Sequence[int], min_views: int, max_landmarks: int) -> Window:
+def build_window(
+    packets: Sequence[Packet], chosen: Sequence[int], min_views: int, max_landmarks: int, cameras: int = 1
+) -> Window:
     """The frames ``chosen``, ascending indices of ``packets``, and the tracks that ``min_views`` or more see."""
     tracks = [packets[k][1] for k in chosen]
     segments = tuple(join_segments([imu for imu, _ in packets[a + 1 : b + 1]]) for a, b in pairwise(chosen))
-    table = TrackTable()
+    table = TrackTable(cameras)
     for frame in tracks:
         table.add_frame(frame)
     # The longest first; the older id where they are equally long.
@@ -124,7 +133,7 @@ def build_window(packets: Sequence[Packet], chosen: Sequence[int], min_views: in
     seen = table.seen[rows].T
     xy = np.where(seen[..., None], np.swapaxes(table.xy_normalised[rows], 0, 1), np.nan)
     xy_px = np.swapaxes(table.xy[rows], 0, 1)
-    return Window(np.array([t.t_ns for t in tracks]), segments, table.ids[rows], xy, seen, xy_px)
+    return Window(np.array([t.t_ns for t in tracks]), segments, table.ids[rows], xy, seen, xy_px, cameras)
 
 
 def spread_indices(t_ns: Int, count: int) -> list[int]:

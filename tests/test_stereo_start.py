@@ -1,0 +1,115 @@
+"""A start by two cameras that see the same: at once, at rest and in motion, with the scale, as sure as it says."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from initialization_helpers import Motion, first_estimate, judge
+from msckf_helpers import CALIBRATION, STEREO
+from test_initialization import assert_sound, motion
+
+from vioframe.estimation.initialization import Initializer
+from vioframe.frontend import Frontend, FrontendOptions
+from vioframe.geometry import so3
+from vioframe.incidents import Incidents
+from vioframe.io.synchronise import synchronise
+from vioframe.io.trajectories import load_trajectory
+from vioframe.simulation import TrackSequence, simulated_sequence
+from vioframe.types import Calibration
+from vioframe_euroc import EurocDataset
+from vioframe_shi_tomasi import ShiTomasi
+
+FLIGHTS = ["figure_eight", "aggressive", "stop_and_go", "hover"]
+
+
+def flown(flight: str, seed: int = 0, calibration: Calibration = STEREO) -> TrackSequence:
+    return simulated_sequence(flight, duration_s=6.0, seed=seed, calibration=calibration)
+
+
+@pytest.mark.parametrize("flight", FLIGHTS)
+def test_it_begins_within_six_tenths_of_a_second_and_is_as_sure_as_it_says(flight):
+    """Wherever in the flight it begins; velocity and tilt have five degrees of freedom."""
+    nees = []
+    for seed in range(2):
+        sequence = flown(flight, seed)
+        for start in range(0, 96, 16):
+            packets = sequence.packets[start : start + 20]
+            estimate, _ = first_estimate(packets, STEREO)
+            assert estimate is not None
+            assert estimate.method == "stereo"
+            assert_sound(estimate)
+            errors = judge(estimate, Motion.of(sequence), packets[0][1].t_ns)
+            assert errors.seconds < 0.65
+            assert errors.velocity < 0.3
+            nees.append(errors.nees)
+    assert 0.1 < np.mean(nees) < 1.5
+    assert max(nees) < 5.0
+
+
+def test_landmarks_are_where_they_are():
+    sequence = flown("figure_eight", 1)
+    estimate, _ = first_estimate(sequence.packets[:20], STEREO)
+    assert estimate is not None
+    assert len(estimate.landmark_ids) > 25
+    # Far less parallax than one camera would need: the same frames refuse without the other one.
+    alone = [(imu, tracks.of_camera(0)) for imu, tracks in sequence.packets[:20]]
+    assert first_estimate(alone, CALIBRATION)[0] is None
+    newest, camera = estimate.states[-1], STEREO.cameras[0]
+    tracks = next(tracks for _, tracks in sequence.packets if tracks.t_ns == newest.t_ns).of_camera(0)
+    _, i, j = np.intersect1d(estimate.landmark_ids, tracks.ids, return_indices=True)
+    p_C = ((estimate.p_WF[i] - newest.p_WB) @ newest.R_WB - camera.p_BC) @ camera.R_BC
+    off_px = np.linalg.norm(camera.model.project(p_C) - tracks.xy[j], axis=1)
+    assert np.median(off_px) < 2.0
+
+
+@pytest.mark.parametrize("turned_deg", [8.0, 90.0])
+def test_cameras_that_sit_otherwise_are_left_to_the_slower_start(turned_deg):
+    """The first camera turned, and the other with it: images and readings contradict each other where it turns."""
+    sequence = flown("aggressive", 2)
+    turn = so3.exp(np.deg2rad(turned_deg) * np.array([0.6, -0.5, 0.62]))
+    wrong = STEREO.moved_with(replace(STEREO.cameras[0], R_BC=turn @ STEREO.cameras[0].R_BC))
+    estimate, initializer = first_estimate(sequence.packets[:40], wrong)
+    assert estimate is None or initializer.found is not None
+    estimate, initializer = first_estimate(sequence.packets, wrong)
+    assert estimate is not None
+    left = so3.log(initializer.calibration.cameras[0].R_BC.T @ STEREO.cameras[0].R_BC)
+    assert np.rad2deg(np.linalg.norm(left)) < 3.0
+    # The other one is where it was beside the first.
+    (a, b), (c, d) = initializer.calibration.cameras, STEREO.cameras
+    np.testing.assert_allclose(a.R_BC.T @ b.R_BC, c.R_BC.T @ d.R_BC, atol=1e-9)
+
+
+def test_a_pair_that_shares_nothing_begins_by_the_first_camera():
+    sequence = flown("figure_eight", 3)
+    apart = [(imu, replace(tracks, ids=tracks.ids + 10_000 * tracks.camera)) for imu, tracks in sequence.packets]
+    estimate, _ = first_estimate(apart, STEREO)
+    assert estimate is not None
+    assert estimate.method == "dynamic"
+
+
+def test_frames_of_one_camera_alone_are_no_pair():
+    sequence = flown("figure_eight", 3)
+    initializer = Initializer(STEREO)
+    for imu, tracks in sequence.packets[:25]:
+        assert initializer.add(imu, tracks.of_camera(0)) is None
+
+
+def test_a_real_flight_begins_at_once(shared_data: Path):
+    folder = shared_data / "euroc" / "MH_01_easy_15s"
+    dataset, incidents = EurocDataset(folder, cameras=["cam0", "cam1"]), Incidents()
+    frontend = Frontend(ShiTomasi(), dataset.calibration, FrontendOptions(), incidents)
+    packets = [
+        (imu, frontend.track(imu, frames, dataset.calibration))
+        for imu, frames in synchronise(dataset.measurements(), duration_s=1.0, incidents=incidents)
+    ]
+    estimate, _ = first_estimate(packets, dataset.calibration)
+    assert estimate is not None
+    assert estimate.method == "stereo"
+    truth = motion(load_trajectory(folder / "mav0/state_groundtruth_estimate0/data.csv"), packets)
+    errors = judge(estimate, truth, packets[0][1].t_ns)
+    assert errors.seconds <= 0.5
+    assert errors.velocity < 0.06
+    assert errors.tilt_deg < 1.0
