@@ -131,7 +131,7 @@ def prepare(config: Config, registry: Registry, *, warm: bool = False) -> Experi
     config = configuration.complete(config, registry)
     if config.dataset.path is None:
         raise DatasetError("no data set given; name a bag or folder, or set dataset.path in the configuration")
-    dataset, options, left_aside = _one_camera(registry, config)
+    dataset, options, left_aside = _of_usable_cameras(registry, config)
     config = config.model_copy(update={"dataset": config.dataset.model_copy(update={"options": options})})
     odometry = Odometry(
         dataset.calibration,
@@ -159,8 +159,8 @@ def prepare(config: Config, registry: Registry, *, warm: bool = False) -> Experi
     )
 
 
-def _one_camera(registry: Registry, config: Config) -> tuple[Dataset, dict[str, Any], tuple[str, ...]]:
-    """The data set, of a rig its first camera where nothing is said: front-end and back-ends take one for now.
+def _of_usable_cameras(registry: Registry, config: Config) -> tuple[Dataset, dict[str, Any], tuple[str, ...]]:
+    """The data set, of a rig its first camera where nothing is said and the back-end, or a camera, is no use for more.
 
     With its options, and the names of the cameras that are left aside.
     """
@@ -168,7 +168,9 @@ def _one_camera(registry: Registry, config: Config) -> tuple[Dataset, dict[str, 
     assert path is not None
     dataset = registry.open_dataset(path, reader, options)
     cameras = dataset.calibration.cameras
-    if len(cameras) > 1 and "cameras" in options and options["cameras"] is None:
+    backend = registry.create_backend(config.backend.name, config.backend.options)
+    usable = getattr(backend, "takes_rigs", False) and all(camera.rotation_known for camera in cameras)
+    if len(cameras) > 1 and not usable and "cameras" in options and options["cameras"] is None:
         options["cameras"] = [cameras[0].name]
         return registry.open_dataset(path, reader, options), options, tuple(camera.name for camera in cameras[1:])
     return dataset, options, ()

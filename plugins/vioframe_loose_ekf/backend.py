@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from vioframe.estimation.inertial.noise import noise_over
+from vioframe.estimation.inertial.preintegration import join_segments
 from vioframe.geometry import so3
 from vioframe.quantiles import chi2_quantile
 from vioframe.stopwatch import Stopwatch
@@ -38,6 +39,8 @@ _JUMPED_SCALE = 0.1
 class LooseEkf:
     """One frame at a time; settings in :class:`LooseEkfOptions`."""
 
+    takes_rigs = True
+
     def __init__(self, options: LooseEkfOptions | None = None) -> None:
         self._options = options or LooseEkfOptions()
 
@@ -49,13 +52,22 @@ class LooseEkf:
         self.fusion = Fusion(start.state, self._camera)
         self._odometry = VisualOdometry(calibration, self._options)
         self._fitting_ns, self._tied_ns = start.state.t_ns, 0
-        self._odometry.restart(start.tracks)
+        self._odometry.restart(start.tracks.of_camera(0))
+        self._passed: list[ImuSegment] = []
         self.fusion.place_vision_frame()
 
     def process(self, imu: ImuSegment, tracks: FrameTracks, still: bool) -> Estimate:
         """Filter one frame."""
-        fusion, watch = self.fusion, Stopwatch()
-        sighting = self._odometry.track(tracks, self._turn(fusion, imu))
+        fusion, watch, of_all, tracks = self.fusion, Stopwatch(), len(tracks.ids), tracks.of_camera(0)
+        self._passed.append(imu)
+        if len(tracks.ids) == 0 < of_all:
+            # Another camera's alone.
+            fusion.propagate(imu, noise_over(imu, self._noise_at_rest, self._noise))
+            watch.lap("propagate")
+            state = fusion.nav_state(tracks.t_ns)
+            return Estimate(Status.TRACKING, state, corrected=False, stage_seconds=watch.seconds)
+        sighting = self._odometry.track(tracks, self._turn(fusion, join_segments(self._passed)))
+        self._passed.clear()
         watch.lap("odometry")
         if still and fusion.hold_still(imu, self._noise_at_rest):
             self._fitting_ns = tracks.t_ns

@@ -31,7 +31,7 @@ class PoseGraph:
     def __init__(self, calibration: Calibration, options: PoseGraphOptions | None = None) -> None:
         self._options = options or PoseGraphOptions()
         self._selector = KeyframeSelector(calibration, self._options.parallax_px)
-        self._recogniser = Recogniser(calibration.single("the loop closer").model.focal_px, self._options)
+        self._recogniser = Recogniser(calibration.cameras[0].model.focal_px, self._options)
         self._worker = ThreadPoolExecutor(1, "loop-closure")
         self._waiting: deque[Future[None]] = deque()
         # Of every tracked frame: an hour of them takes 10 MB like this.

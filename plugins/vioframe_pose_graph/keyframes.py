@@ -40,10 +40,13 @@ class Keyframe:
 
 
 class KeyframeSelector:
-    """Thins the frames of any back-end by how much the picture has moved, turning left out."""
+    """Thins the frames of any back-end by how much the picture has moved, turning left out.
+
+    Of a rig the first camera's alone: what it has seen before it finds again by itself.
+    """
 
     def __init__(self, calibration: Calibration, parallax_px: float) -> None:
-        self._camera = calibration.single("the loop closer")
+        self._camera = calibration.cameras[0]
         self._offset_ns = self._camera.time_offset_ns
         self._parallax = parallax_px / self._camera.model.focal_px
         self._previous: NavState | None = None
@@ -71,12 +74,13 @@ class KeyframeSelector:
         self._p_WF.update(zip(estimate.landmark_ids.tolist(), estimate.p_WF, strict=True))
         R_WC, p_WC = self._camera_pose(state)
         self._previous = state
-        image = next(iter(step.frames.images), None)
-        due = self._last is None or (estimate.is_keyframe and self._moved_on(self._last, step.tracks, R_WC))
-        if due and image is not None:
-            self._last = Keyframe(state, self.segment, image, step.tracks, self._camera.model, R_WC, p_WC, _UNKNOWN)
+        image, tracks = next(iter(step.frames.images), None), step.tracks.of_camera(0)
+        if image is not None and (
+            self._last is None or (estimate.is_keyframe and self._moved_on(self._last, tracks, R_WC))
+        ):
+            self._last = Keyframe(state, self.segment, image, tracks, self._camera.model, R_WC, p_WC, _UNKNOWN)
             self._pending.append(self._last)
-            self._forget(step.tracks)
+            self._forget(tracks)
         while self._pending and step.frames.t_ns - self._pending[0].state.t_ns >= _WAIT_NS:
             ready.append(self._complete(self._pending.popleft()))
         return ready

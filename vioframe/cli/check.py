@@ -33,7 +33,7 @@ _COLOURS = {Severity.WRONG: "bold red", Severity.WORTH_KNOWING: "yellow"}
 @click.argument("target", metavar="DATA|NAME")
 @calibration_option
 @click.option("--reader", type=PartName("DATASET"), help="Data-set reader, where several accept DATA.")
-@cameras_option("target", "look at", "the first")
+@cameras_option("target", "look at", "all")
 @click.option("--start", "start_s", type=float, default=0.0, metavar="S", help="Skip the first S seconds.")
 @click.option("--duration", "duration_s", type=float, metavar="S", help="Stop after S seconds.")
 @click.option("--data", type=FILE, help="For a reader: a recording to try it on.")
@@ -76,7 +76,7 @@ def _check_recording(
     try:
         dataset = installed.open_dataset(path, part.name, options)
         rig = [camera.name for camera in dataset.calibration.cameras]
-        for chosen in cameras or rig[:1]:
+        for chosen in cameras or rig:
             if cameras or (len(rig) > 1 and any(option.name == "cameras" for option in part.options)):
                 dataset = installed.open_dataset(path, part.name, {**options, "cameras": [chosen]})
             with Bar(dataset.frame_count, quiet=quiet, late=True) as bar, limited_threads(), installed.blaming():

@@ -42,7 +42,7 @@ _MOST_REASONS = 4
 @click.option("--config", "file", type=FILE, help="Configuration file; the other options override it.")
 @click.option("--ground-truth", type=FILE, help="Trajectory to compare with: TUM or EuRoC csv.")
 @calibration_option
-@cameras_option("data", "estimate from", "the first")
+@cameras_option("data", "estimate from", "all that the estimator takes")
 @click.option("--reader", type=PartName("DATASET"), help="Data-set reader, where several accept DATA.")
 @click.option("--start", "start_s", type=float, metavar="S", help="Skip the first S seconds.")
 @click.option("--duration", "duration_s", type=float, metavar="S", help="Stop after S seconds.")
