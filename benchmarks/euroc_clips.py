@@ -7,9 +7,10 @@ most 15 mm with shi_tomasi and 25 mm with the others. V1_01_easy_rest stands sti
 where it was first. Front-end and back-end together take at most 15 ms a frame.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 import click
 import numpy as np
@@ -81,10 +82,13 @@ def _ready(installed: Registry) -> tuple[str, ...]:
 
 def run(config: Config, installed: Registry, folder: Path) -> Row:
     """One run, and what its folder says of it."""
-    summary = record(prepare(config, installed), folder)
+    return {"detector": config.detector.name, **judged(record(prepare(config, installed), folder), folder)}
+
+
+def judged(summary: Mapping[str, Any], folder: Path) -> Row:
+    """What a run came to, by its ``summary`` and the truth in its ``folder``."""
     row = {
         "clip": summary["dataset"],
-        "detector": config.detector.name,
         "initialised_s": summary["initialised_after_s"],
         "completion": summary["completion"],
         "resets": summary["resets"],

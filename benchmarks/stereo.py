@@ -1,0 +1,121 @@
+"""EuRoC flights with their real IMU, rendered for both cameras: one camera, and both.
+
+    python benchmarks/stereo.py [--record] [--flight MH_05_difficult]
+
+Both back-ends fly each of the worlds with the left camera and with both; in the first world also with each of them
+black for five seconds, and with the right one exposed 20 ms later, with stamps of its own. Targets: with both cameras
+at most 0.6 times the ATE, in the mean over the worlds, and at most 1.6 times the time a frame; black at most twice,
+apart at most 1.2 times the ATE of both; no resets.
+"""
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import click
+import numpy as np
+from common import benchmark, present
+from euroc_clips import judged
+from rendered_flights import START_S
+
+from vioframe.bench import Row
+from vioframe.cores import usable_cores
+from vioframe.interfaces import Dataset
+from vioframe.parts import config as configuration
+from vioframe.parts import registry
+from vioframe.parts.config import Config, DatasetConfig, PartConfig
+from vioframe.pipeline import prepare, record
+from vioframe.simulation.config import SimulationConfig, complete
+from vioframe.simulation.record import record as render
+from vioframe.simulation.recording import SimulatedRecording
+from vioframe.types import NS_PER_S, FrameSet, Measurement
+
+BACKENDS = ("msckf", "sliding_window")
+WORLDS = 3
+# Seconds into the recording in which the left camera sees nothing, and the right one.
+BLACK_S = ((30.0, 35.0), (45.0, 50.0))
+APART_MS = 20.0
+COLUMNS = {
+    "clip": "",
+    "world": "d",
+    "backend": "",
+    "cameras": "",
+    "initialised_s": ".2f",
+    "completion": ".1%",
+    "resets": "d",
+    "ate_mm": ".0f",
+    "scale": ".4f",
+    "frame_ms": ".1f",
+}
+
+
+class _Covered:
+    """A data set of two cameras, each of them black for a while."""
+
+    def __init__(self, dataset: Dataset) -> None:
+        self._dataset = dataset
+
+    def __getattr__(self, name: str) -> object:
+        return getattr(self._dataset, name)
+
+    def measurements(self) -> Iterator[Measurement]:
+        first_ns = None
+        for measured in self._dataset.measurements():
+            if isinstance(measured, FrameSet):
+                first_ns = measured.t_ns if first_ns is None else first_ns
+                at_s = (measured.t_ns - first_ns) / NS_PER_S
+                images = tuple(
+                    np.zeros_like(image) if image is not None and begin <= at_s < end else image
+                    for image, (begin, end) in zip(measured.images, BLACK_S, strict=True)
+                )
+                measured = replace(measured, images=images)
+            yield measured
+
+
+@benchmark
+@click.option("--flight", default="MH_05_difficult", show_default=True, type=click.Choice(list(START_S)))
+def main(data: Path, backend: str, assignments: tuple[str, ...], keep: bool, flight: str) -> None:
+    """Rendered EuRoC flights by one camera and by two; both back-ends, whatever --backend says."""
+    installed = registry.load()
+
+    def flown(bag: Path, backend: str, cameras: str, world: int) -> Row:
+        config = Config(
+            dataset=DatasetConfig(path=bag, options={"cameras": ["cam0"] if cameras == "one" else ["cam0", "cam1"]}),
+            backend=PartConfig(name=backend),
+            start_s=START_S[flight],
+        )
+        experiment = prepare(configuration.override(config, installed, assignments), installed)
+        if cameras == "both, black in turn":
+            experiment = replace(experiment, dataset=_Covered(experiment.dataset))
+        folder = bag.parent / "run"
+        row = judged(record(experiment, folder, overwrite=True), folder)
+        click.echo(f"{backend}, {cameras}, world {world}: {row.get('ate_mm', float('nan')):.0f} mm", err=True)
+        return {**row, "clip": flight, "backend": backend, "cameras": cameras, "world": world}
+
+    def rows() -> Iterator[Row]:
+        with TemporaryDirectory() as temporary:
+            bag = Path(temporary) / "flight.bag"
+
+            def rendered(world: int, **settings: object) -> None:
+                recorded = {"recorded": data / "euroc_imu_gt" / flight, "seed": world, "rig": ("stereo",), **settings}
+                simulated = complete(SimulationConfig.model_validate(recorded), installed)
+                bag.unlink(missing_ok=True)
+                render(SimulatedRecording(simulated, installed, usable_cores()), [bag], overwrite=True)
+
+            for world in range(WORLDS):
+                rendered(world)
+                black = ["both, black in turn"] if world == 0 else []
+                for name in BACKENDS:
+                    for cameras in ("one", "both", *black):
+                        yield flown(bag, name, cameras, world)
+            rendered(0, delay_ms={"cam1": APART_MS})
+            for name in BACKENDS:
+                yield flown(bag, name, "both, apart", 0)
+
+    settings = {"options": list(assignments), "start_s": START_S[flight], "black_s": BLACK_S, "apart_ms": APART_MS}
+    present(f"stereo_{flight}", f"{flight}: one camera and two", rows(), COLUMNS, settings, keep)
+
+
+if __name__ == "__main__":
+    main()
