@@ -318,6 +318,17 @@ def leaves_interrupts_to_its_parent(pid: str) -> bool:
 
 
 @pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="looks for processes in /proc")
+@pytest.mark.parametrize(("rig", "method"), [("mono", "dynamic"), ("stereo", "stereo")])
+def test_trials_fly_the_rig_they_are_told(rig, method):
+    """By two cameras they begin within a second, by one they do not."""
+    setup = Setup(rig=rig, duration_s=10.0)
+    cameras = setup.sequence(0).calibration.cameras
+    assert [camera.name for camera in cameras] == ["cam0", "cam1"][: len(cameras)]
+    trial = fly(setup, PartConfig(name="msckf"), 0)
+    assert trial.failure is None
+    assert (trial.figures["initialised_s"] < 1.0) == (method == "stereo")
+
+
 def test_ctrl_c_ends_all_processes_and_leaves_nothing(parts, tmp_path):
     command = [sys.executable, "-m", "vioframe", "montecarlo", "--backend", "drawn:pause_s=0.05", "--duration", "10"]
     process = subprocess.Popen(

@@ -7,6 +7,7 @@ initialises, diverges or crashes is kept and says so. What the NEES of many tria
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Literal
 
 import numpy as np
 from pydantic import Field
@@ -19,9 +20,11 @@ from vioframe.evaluation.alignment import align_first
 from vioframe.evaluation.consistency import PARTS, Trial
 from vioframe.evaluation.nees import nees
 from vioframe.geometry.trajectory import Trajectory
+from vioframe.io.calibration import packaged_calibration
 from vioframe.parts import registry
 from vioframe.parts.config import PartConfig, Section
 from vioframe.simulation import TrackSequence, simulated_sequence
+from vioframe.simulation.config import RIGS
 from vioframe.types import Float, Int
 
 SHORTEST_S = 10.0
@@ -32,9 +35,10 @@ _DIVERGED_FRACTION, _DIVERGED_M, _DIVERGED_DEG = 0.05, 0.5, 15.0
 
 
 class Setup(Section):
-    """What every trial flies through: an installed flight, EuRoC's camera and IMU noise, and what is tracked.
+    """What every trial flies through: an installed flight, EuRoC's cameras and IMU noise, and what is tracked.
 
-    ``pixel_sigma`` px is the noise of an observation, ``outlier_ratio`` the chance that one is 5 to 30 px off.
+    ``rig`` is one of :data:`~vioframe.simulation.config.RIGS`; ``pixel_sigma`` px is the noise of an observation,
+    ``outlier_ratio`` the chance that one is 5 to 30 px off.
     """
 
     flight: str = "figure_eight"
@@ -42,10 +46,13 @@ class Setup(Section):
     pixel_sigma: float = Field(default=1.0, ge=0.0, allow_inf_nan=False)
     outlier_ratio: float = Field(default=0.0, ge=0.0, lt=1.0)
     max_points: int = Field(default=150, ge=1)
+    rig: Literal["mono", "stereo"] = "mono"
 
     def sequence(self, seed: int) -> TrackSequence:
         """The flight with the noise of ``seed``."""
-        return simulated_sequence(self.flight, seed=seed, **self.model_dump(exclude={"flight"}))
+        calibration = packaged_calibration("euroc", cameras=RIGS[self.rig])
+        sensors = self.model_dump(exclude={"flight", "rig"})
+        return simulated_sequence(self.flight, seed=seed, calibration=calibration, **sensors)
 
 
 # The simulated IMU has the noise that its calibration states: there is no vibration.

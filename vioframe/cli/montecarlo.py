@@ -57,6 +57,13 @@ FILES = (MARKER, "nees.csv", "*trials.png")
     help="Observations that are 5-30 px off.",
 )
 @click.option("--max-points", type=int, default=150, show_default=True, help="Landmarks in view.")
+@click.option(
+    "--rig",
+    type=click.Choice(["mono", "stereo"]),
+    default="mono",
+    show_default=True,
+    help="EuRoC's left camera, or both.",
+)
 @workers_option
 @click.option("--out", type=FILE, help="Folder.  [default: runs/montecarlo]")
 @click.option("--overwrite", is_flag=True, help="Replace the results that are in --out.")
@@ -73,7 +80,7 @@ def montecarlo(
 ) -> None:
     """Fly simulated flights that differ by their noise alone, and compare errors with what back-ends say of them.
 
-    Landmarks instead of images, EuRoC's camera and IMU noise, true calibration, the back-end's own initialisation. A
+    Landmarks instead of images, EuRoC's cameras and IMU noise, true calibration, the back-end's own initialisation. A
     trial that fails counts and is shown.
     """
     from vioframe.bench.processes import map_in_processes
