@@ -133,7 +133,13 @@ class TestSources:
 
     def flown(self, name, folders, conditions=None, **changes):
         source = sources.find_source(name, folders, INSTALLED)
-        given = {"start_s": None, "duration_s": None, "conditions": conditions or {}, "seed": 0} | changes
+        given = {
+            "start_s": None,
+            "duration_s": None,
+            "conditions": conditions or {},
+            "rig": "mono",
+            "seed": 0,
+        } | changes
         return sources.flown(source, installed=INSTALLED, **given)
 
     def test_a_recording_is_found_and_taken_as_it_is(self, toy, tmp_path):
@@ -205,6 +211,19 @@ class TestSources:
 
 
 class TestPlan:
+    def test_a_back_end_flies_with_the_rig_it_is_given(self, tmp_path):
+        """Both on the same recording, one of them by its left camera alone."""
+        both = "[msckf, {name: msckf, label: by two, rig: stereo}]"
+        one, two = plan(read(tmp_path, TOY.replace("[msckf]", both).replace("TOY", "hover")), (), INSTALLED)
+        assert one.recording == two.recording
+        assert one.recording.config.rig == ("stereo",)
+        assert [task.config.dataset.options["cameras"] for task in (one, two)] == [["cam0"], ["cam0", "cam1"]]
+        assert one.about["config"] != two.about["config"]
+        (alone,) = plan(read(tmp_path, TOY.replace("TOY", "hover")), (), INSTALLED)
+        assert alone.recording.config.rig == ("mono",)
+        with pytest.raises(ConfigError, match="trials all fly the rig of their setup"):
+            read(tmp_path, "kind: trials\ntitle: toy\nbackends: [{name: msckf, rig: stereo}]\n")
+
     def test_a_task_for_each_place_in_the_grid(self, tmp_path):
         text = TOY.replace("[TOY]", "[hover]").replace("[fast]", "[fast, orb]")
         suite = read(tmp_path, text + "conditions: {fog: [0.5, 1.0]}\nseeds: 2\nseeds_vary: recording\n")

@@ -19,7 +19,7 @@ from vioframe.parts.config import Config, DatasetConfig, PartConfig
 from vioframe.parts.registry import BACKEND, DETECTOR, Registry
 from vioframe.runs.evaluated import create_metrics
 from vioframe.runs.results import CELL, CLEAR, Data
-from vioframe.simulation.config import SimulationConfig
+from vioframe.simulation.config import RIGS, SimulationConfig
 from vioframe.simulation.flights import flight as named_flight
 from vioframe.warming import warm_up
 
@@ -71,6 +71,7 @@ def _flights(suite: Suite, folders: Sequence[Path], installed: Registry) -> Iter
             # Whichever seed comes last, there is enough of it for all.
             duration_s=None if sequence.duration_s is None else sequence.duration_s + SEED_SHIFT_S * (suite.seeds - 1),
             conditions={condition: level} if level else {},
+            rig="stereo" if any(backend.rig == "stereo" for backend in suite.backends) else "mono",
             seed=seed if suite.seeds_vary == "recording" else 0,
             installed=installed,
         )
@@ -80,7 +81,7 @@ def _flights(suite: Suite, folders: Sequence[Path], installed: Registry) -> Iter
         seconds = sequence.duration_s or (flown.simulated.duration_s if flown.simulated else None) or 100.0
         for detector, backend in product(suite.detectors, suite.backends):
             config = Config(
-                dataset=DatasetConfig(path=flown.recording),
+                dataset=DatasetConfig(path=flown.recording, options={"cameras": list(RIGS[backend.rig])}),
                 detector=PartConfig(name=detector.name, options=detector.options),
                 backend=PartConfig(name=backend.name, options=backend.options),
                 loop_closure=backend.loop_closure,

@@ -105,10 +105,11 @@ def flown(
     start_s: float | None,
     duration_s: float | None,
     conditions: Mapping[str, float],
+    rig: str,
     seed: int,
     installed: Registry,
 ) -> Flown:
-    """What to fly ``source`` on. Under ``conditions`` images are rendered; the seed is that of what is simulated."""
+    """What to fly ``source`` on. Under ``conditions`` images are rendered; ``rig`` and ``seed`` are of what is."""
     name, known = source.name, EUROC.get(source.name)
     begin_s = start_s if start_s is not None else known.start_s if known else 0.0
     if source.recording is not None and (not conditions or source.kind is not Data.REAL):
@@ -124,7 +125,7 @@ def flown(
         note = f"{name}: {made_of[source.kind]}"
         return Flown(source.kind, note, begin_s, digest, source.recording, source.ground_truth)
     data, note = Data.SIMULATED, f"simulated flight {name}"
-    settings: dict[str, Any] = {"seed": seed, "conditions": dict(conditions)}
+    settings: dict[str, Any] = {"seed": seed, "rig": (rig,), "conditions": dict(conditions)}
     if source.motion is not None:
         data = Data.RENDERED
         note = f"{name}: its recorded IMU and motion, images rendered along them; not its own images"

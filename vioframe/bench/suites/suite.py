@@ -22,9 +22,10 @@ Level = Annotated[float, Field(gt=0.0, le=1.0)]
 
 
 class Estimator(LabelledPart):
-    """A back-end, and the loop closer behind it, if any."""
+    """A back-end, which of EuRoC's cameras it sees by, and the loop closer behind it, if any."""
 
     loop_closure: PartConfig | None = None
+    rig: Literal["mono", "stereo"] = "mono"
 
 
 class Sequence(Named):
@@ -79,6 +80,8 @@ class Suite(Section):
             raise ValueError("flights need detectors, backends and sequences")
         if self.kind == "trials" and not self.backends:
             raise ValueError("trials need backends")
+        if self.kind == "trials" and any(backend.rig != "mono" for backend in self.backends):
+            raise ValueError("backends: trials all fly the rig of their setup, as setup: {rig: stereo}")
         for what in ("detectors", "backends", "sequences"):
             names = [each.called for each in getattr(self, what)]
             if twice := next((name for name in names if names.count(name) > 1), None):
