@@ -5,6 +5,10 @@ from pathlib import Path
 
 import pytest
 
+from vioframe.io.calibration import packaged_calibration
+from vioframe.parts import registry
+from vioframe.warming import warm_up
+
 ROOT = Path(__file__).resolve().parents[1]
 
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
@@ -12,6 +16,16 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 SHARED_DATA = ROOT.parent / "shared" / "data"
+
+BACKENDS = ("msckf", "sliding_window", "loose_ekf")
+
+
+def pytest_sessionstart(session: pytest.Session) -> None:
+    """In a checkout that is new every worker would compile every kernel: each compiles a part ahead, for all."""
+    worker = getattr(session.config, "workerinput", None)
+    if worker is not None:
+        for name in BACKENDS[int(worker["workerid"].removeprefix("gw")) :: worker["workercount"]]:
+            warm_up(registry.load().create_backend(name), packaged_calibration("euroc", cameras=["cam0"]))
 
 
 @pytest.fixture(scope="session")

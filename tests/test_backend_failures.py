@@ -4,6 +4,7 @@ Simulated landmarks on a flight known exactly. Where an estimate is lost a new s
 against the truth by itself.
 """
 
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import cache
 
@@ -11,11 +12,11 @@ import numpy as np
 import pytest
 from threadpoolctl import threadpool_limits
 
-from vioframe.bench import run_backend
+from vioframe.bench import BackendRun, run_backend
 from vioframe.estimation.inertial.preintegration import join_segments
 from vioframe.evaluation import evaluate
 from vioframe.parts import registry
-from vioframe.simulation import TrackSequence, simulated_sequence
+from vioframe.simulation import Packet, TrackSequence, simulated_sequence
 from vioframe.simulation.tracks import TrackOptions, TrackSimulator
 from vioframe.types import NS_PER_S, FrameTracks, ImuSegment, Status
 
@@ -102,6 +103,22 @@ def torn(sequence):
         yield imu, tracks
 
 
+@cache
+def flown(failure: Callable[[TrackSequence], Iterator[Packet]], backend: str) -> tuple[TrackSequence, BackendRun]:
+    """What a back-end makes of the flight with a failure, and that flight."""
+    sequence = flight()
+    packets = tuple(failure(sequence))
+    truth = sequence.ground_truth
+    kept = np.isin(truth.t_ns, [tracks.t_ns for _, tracks in packets])
+    disturbed = replace(
+        sequence,
+        packets=packets,
+        ground_truth=replace(truth, t_ns=truth.t_ns[kept], R_WB=truth.R_WB[kept], p_WB=truth.p_WB[kept]),
+    )
+    with threadpool_limits(1):
+        return disturbed, run_backend(disturbed, registry.load().create_backend(backend))
+
+
 @pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize(
     ("failure", "good_again_s"),
@@ -116,23 +133,13 @@ def torn(sequence):
     ids=lambda value: getattr(value, "__name__", ""),
 )
 def test_it_goes_on_within_seconds(backend, failure, good_again_s):
-    sequence = flight()
-    packets = tuple(failure(sequence))
-    t_ns = np.array([tracks.t_ns for _, tracks in packets])
-    kept = np.isin(sequence.ground_truth.t_ns, t_ns)
-    truth = sequence.ground_truth
-    disturbed = replace(
-        sequence,
-        packets=packets,
-        ground_truth=replace(truth, t_ns=truth.t_ns[kept], R_WB=truth.R_WB[kept], p_WB=truth.p_WB[kept]),
-    )
-    with threadpool_limits(1):
-        run = run_backend(disturbed, registry.load().create_backend(backend))
+    disturbed, run = flown(failure, backend)
+    t_ns = np.array([tracks.t_ns for _, tracks in disturbed.packets])
     for state in run.states:
         values = (state.R_WB, state.p_WB, state.v_WB, state.bias_gyro_B, state.bias_accel_B, state.cov)
         assert all(np.isfinite(value).all() for value in values)
     tracking = np.array([estimate.status is Status.TRACKING for estimate in run.estimates])
-    good_ns = packets[0][1].t_ns + (FAILS_S + good_again_s) * NS_PER_S
+    good_ns = t_ns[0] + (FAILS_S + good_again_s) * NS_PER_S
     assert tracking[t_ns > good_ns + 5 * NS_PER_S].all()
     lost = [estimate for estimate in run.estimates if estimate.status is Status.LOST]
     assert len(lost) <= 2
@@ -144,10 +151,7 @@ def test_it_goes_on_within_seconds(backend, failure, good_again_s):
 
 
 def test_the_sliding_window_begins_anew_where_all_it_saw_changed_at_once():
-    sequence = flight()
-    disturbed = replace(sequence, packets=tuple(kidnapped(sequence)))
-    with threadpool_limits(1):
-        run = run_backend(disturbed, registry.load().create_backend("sliding_window"))
+    _, run = flown(kidnapped, "sliding_window")
     events = [event for estimate in run.estimates for event in estimate.events if event.startswith("lost")]
     assert events == ["lost: everything in sight changed at once, though the body hardly turned"]
     assert run.resets == 1

@@ -1,12 +1,14 @@
 """Cameras against OpenCV, against numeric derivatives and against their own inverse; the compiled twins likewise."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
 
 from vioframe.errors import CalibrationError
 from vioframe.geometry import kernels, so3
-from vioframe.geometry.cameras import Camera
+from vioframe.geometry.cameras import Camera, _determinants
 
 CAMERAS = {
     "radtan": Camera(458.654, 457.296, 367.215, 248.375, (-0.28340811, 0.07395907, 0.00019359, 1.76e-05), (752, 480)),
@@ -24,6 +26,15 @@ def _pixels(camera: Camera) -> np.ndarray:
 def test_undistort_inverts_distort_over_the_whole_image(camera):
     xy = _pixels(camera)
     np.testing.assert_allclose(camera.distort(camera.undistort(xy)), xy, atol=1e-8)
+
+
+@CASES
+def test_the_fold_of_the_distortion_is_where_numpy_says(camera):
+    folded = replace(camera, distortion=(-0.4, 0.0, 1e-3, -2e-3))
+    J = folded._distort_jacobian(np.random.default_rng(0).uniform(-4.0, 4.0, (5000, 2)))
+    before = _determinants(J) > 0.0
+    assert 0 < before.sum() < len(J)
+    np.testing.assert_array_equal(before, np.linalg.det(J) > 0.0)
 
 
 @CASES

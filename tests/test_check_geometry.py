@@ -13,7 +13,9 @@ from rendered_flight import CALIBRATION, rendered_flight
 
 from vioframe.diagnosis import Diagnosis, Finding, Recording, diagnose, gather
 from vioframe.diagnosis.recording import ImuSamples
+from vioframe.diagnosis.self_calibration import FOCAL, OFFSET, ROTATION, Pairs, start_at
 from vioframe.geometry import so3
+from vioframe.geometry.cameras import Camera
 from vioframe.types import Float
 
 
@@ -80,6 +82,18 @@ def test_the_remedy_is_the_line_to_write():
     written = np.fromstring(off.remedy.partition("data: [")[2].partition("]")[0], sep=",").reshape(4, 4)
     assert np.rad2deg(np.linalg.norm(so3.log(written[:3, :3].T @ CAMERA.R_BC))) < 1.5
     np.testing.assert_allclose(written[:3, 3], CAMERA.p_BC, atol=1e-5)
+
+
+def test_what_was_undistorted_already_is_what_would_be_undistorted_anew(monkeypatch):
+    imu = recording().imu.sorted()
+    pairs = Pairs(recording().stretches, CAMERA, imu, 0.1).half(later=False)
+    start = start_at(CAMERA, CAMERA.R_BC @ TILT, np.zeros(3), 0.0)
+    once = pairs.calibrate(start, (ROTATION, OFFSET, FOCAL))
+    monkeypatch.setattr(Camera, "__eq__", lambda self, other: False)
+    anew = pairs.calibrate(start, (ROTATION, OFFSET, FOCAL))
+    for name in ("R_BC", "bias_gyro_B", "cov"):
+        np.testing.assert_array_equal(getattr(anew, name), getattr(once, name))
+    assert (anew.offset_s, anew.log_focal, anew.cost) == (once.offset_s, once.log_focal, once.cost)
 
 
 def test_a_rotation_that_nobody_knows_is_not_called_wrong():

@@ -341,8 +341,9 @@ def test_a_real_recording(shared_data: Path, tmp_path: Path) -> None:
     assert [camera.name for camera in result.calibration.cameras] == ["cam0", "cam1"]
     assert_same_rig(result.calibration, source.calibration)
     assert_same_truth(result.ground_truth, source.ground_truth)
-    assert_equal(result.measurements(), source.measurements())
-    complete = [all(image is not None for image in m.images) for m in result.measurements() if isinstance(m, FrameSet)]
+    measured = list(result.measurements())
+    assert_equal(measured, source.measurements())
+    complete = [all(image is not None for image in m.images) for m in measured if isinstance(m, FrameSet)]
     assert complete == [True] * 200 + [False] * 100
     # Number for number as the files that it began with.
     for file in ("imu0/data.csv", "state_groundtruth_estimate0/data.csv"):

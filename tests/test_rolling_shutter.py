@@ -1,6 +1,8 @@
 """A rolling shutter costs no accuracy where its readout is known, and the readout is found where it is not."""
 
+from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -32,14 +34,15 @@ def sliding_window(calibrate: bool) -> Backend:
 BACKENDS = pytest.mark.parametrize("make", [msckf, sliding_window])
 
 
-def flown(backend: Backend, true_s: float, told_s: float) -> tuple[BackendRun, float]:
+@cache
+def flown(make: Callable[[bool], Backend], calibrate: bool, true_s: float, told_s: float) -> tuple[BackendRun, float]:
     """A short flight that turns fast, and its ATE m."""
     sequence = simulated_sequence(
         "aggressive", seed=2, duration_s=6.0, calibration=CALIBRATION.with_camera(0, readout_s=true_s)
     )
     start = drawn_start(sequence, 1, 2)
     sequence = replace(since(sequence, 1), calibration=CALIBRATION.with_camera(0, readout_s=told_s))
-    run = run_backend(sequence, backend, EXACT, start)
+    run = run_backend(sequence, make(calibrate), EXACT, start)
     assert run.completion == 1.0
     return run, _ate_m(run, sequence)
 
@@ -54,9 +57,9 @@ def _ate_m(run: BackendRun, sequence: TrackSequence) -> float:
 @BACKENDS
 def test_a_known_readout_costs_nothing_and_an_unknown_one_does(make):
     """Of a few seconds the error is mostly the noise's: more than twice another's it is not."""
-    _, still = flown(make(False), 0.0, 0.0)
-    run, known = flown(make(False), READOUT_S, READOUT_S)
-    _, unknown = flown(make(False), READOUT_S, 0.0)
+    _, still = flown(make, False, 0.0, 0.0)
+    run, known = flown(make, False, READOUT_S, READOUT_S)
+    _, unknown = flown(make, False, READOUT_S, 0.0)
     assert known < 2.0 * still
     assert unknown > 5.0 * known
     learned = run.estimates[-1].calibration
@@ -68,9 +71,9 @@ def test_a_known_readout_costs_nothing_and_an_unknown_one_does(make):
 @BACKENDS
 @pytest.mark.parametrize("told_s", [0.0, 0.015])
 def test_the_readout_is_found(make, told_s):
-    run, ate_m = flown(make(True), READOUT_S, told_s)
+    run, ate_m = flown(make, True, READOUT_S, told_s)
     learned = run.estimates[-1].calibration
     assert learned is not None
     assert learned.calibration.cameras[0].readout_s == pytest.approx(READOUT_S, abs=1e-3)
     assert 0.0 < learned.sigma[0].readout_s < 1e-3
-    assert ate_m < 2.0 * flown(make(False), READOUT_S, READOUT_S)[1]
+    assert ate_m < 2.0 * flown(make, False, READOUT_S, READOUT_S)[1]

@@ -12,7 +12,7 @@ import pytest
 from click.testing import CliRunner
 from recordings import assert_same_rig
 from rosbags.highlevel import AnyReader
-from simulation_helpers import INSTALLED, small_calibration, small_simulation
+from simulation_helpers import INSTALLED, drawn_textures, small_calibration, small_simulation, textures_drawn_once
 
 from vioframe.cli import main
 from vioframe.errors import ConfigError, DatasetError, TrajectoryError
@@ -56,14 +56,31 @@ def under(tmp_path, condition: str, level: float = 1.0, **settings):
     )
 
 
-@pytest.fixture
-def clear(tmp_path):
-    return small_simulation(tmp_path, duration_s=0.5)
+@pytest.fixture(scope="module", autouse=True)
+def remembered_textures():
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr("vioframe.simulation.textures.procedural_textures", textures_drawn_once)
+        yield
+
+
+@pytest.fixture(scope="module")
+def clear(tmp_path_factory):
+    return small_simulation(tmp_path_factory.mktemp("clear"), duration_s=0.5)
+
+
+@pytest.fixture(scope="module")
+def clear_content(clear):
+    return content(clear)
 
 
 def test_a_seed_gives_the_same_recording_and_another_seed_another(tmp_path):
     settings = {"duration_s": 0.3, "conditions": {"noise": 0.2, "moving_objects": 0.3, "vibration": 0.1}}
-    first, again, other = (content(small_simulation(tmp_path, seed=seed, **settings)) for seed in (3, 3, 4))
+
+    def made(seed):
+        drawn_textures.cache_clear()
+        return content(small_simulation(tmp_path, seed=seed, **settings))
+
+    first, again, other = map(made, (3, 3, 4))
     assert first == again
     assert first != other
 
@@ -85,10 +102,10 @@ def test_every_condition_has_a_level_and_an_explanation():
 
 
 @pytest.mark.parametrize("name", list(CONDITIONS))
-def test_level_zero_changes_nothing_and_a_level_changes_something(name, tmp_path, clear):
-    assert content(under(tmp_path, name, 0.0)) == content(clear)
+def test_level_zero_changes_nothing_and_a_level_changes_something(name, tmp_path, clear, clear_content):
+    assert content(under(tmp_path, name, 0.0)) == clear_content
     changed = under(tmp_path, name, 0.8)
-    assert content(changed) != content(clear) or changed.calibration != clear.calibration
+    assert content(changed) != clear_content or changed.calibration != clear.calibration
 
 
 def sharpness(pictures: np.ndarray) -> float:
@@ -402,6 +419,7 @@ def test_a_manifest_makes_the_same_recording_again(tmp_path, small):
     assert done.exit_code == 0, done.output
     assert "conditions: noise 0.3, fog 1" in done.output
     manifest = simulation_folder(tmp_path / "one.bag") / MANIFEST
+    drawn_textures.cache_clear()
     again = simulate(tmp_path / "two.bag", "--config", manifest, "--workers", 1)
     assert again.exit_code == 0, again.output
     assert (tmp_path / "one.bag").read_bytes() == (tmp_path / "two.bag").read_bytes()

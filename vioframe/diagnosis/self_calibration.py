@@ -108,14 +108,18 @@ class Pairs:
         H = np.eye(len(active))
         for cauchy, iterations in _STAGES:
             for _ in range(iterations):
-                rays, usable = self._rays(_moved(origin, x))
+                here = _moved(origin, x)
+                xy = self._undistorted(here.camera)
+                rays, usable = self._rays(here, xy)
                 t = likeliest_translations(*rays[:3], weight, usable)
                 r, by_t = self._residuals(rays, t, usable)
                 J = np.zeros((*r.shape, len(active)))
                 for column, k in enumerate(active):
                     d = np.zeros(_SIZE)
                     d[k] = _STEPS[k]
-                    moved, _ = self._rays(_moved(origin, x + d))
+                    there = _moved(origin, x + d)
+                    # Most parameters leave the lens as it is.
+                    moved, _ = self._rays(there, xy if there.camera == here.camera else self._undistorted(there.camera))
                     J[..., column] = (self._residuals(moved, t, usable)[0] - r) / _STEPS[k]
                 J = np.nan_to_num(J)
                 robust = usable / (1.0 + (r / cauchy) ** 2)
@@ -129,7 +133,8 @@ class Pairs:
                 weight = robust
                 if (np.abs(step) < _SETTLED * _LARGEST_STEP[active]).all():
                     break
-        rays, usable = self._rays(_moved(origin, x))
+        here = _moved(origin, x)
+        rays, usable = self._rays(here, self._undistorted(here.camera))
         r, _ = self._residuals(rays, likeliest_translations(*rays[:3], weight, usable), usable)
         squared = np.where(usable, r * r, 0.0)
         count = max(int(self.common.sum()), 1)
@@ -141,15 +146,17 @@ class Pairs:
         cov = np.zeros((_SIZE, _SIZE))
         # The same track is in several pairs: a third of the equations are taken for independent.
         cov[np.ix_(active, active)] = np.linalg.inv(H) * max(misfit, 0.3) ** 2 * 3.0
-        found = _moved(origin, x)
-        return replace(found, cov=cov, cost=cost, misfit_px=misfit * _PIXEL_SIGMA)
+        return replace(here, cov=cov, cost=cost, misfit_px=misfit * _PIXEL_SIGMA)
 
-    def _rays(self, x: SelfCalibration) -> tuple[tuple[Float, Float, Float, float], Bool]:
+    def _undistorted(self, camera: Camera) -> Float:
+        return camera.undistort(self.xy.reshape(-1, 2)).reshape(self.xy.shape)
+
+    def _rays(self, x: SelfCalibration, xy: Float) -> tuple[tuple[Float, Float, Float, float], Bool]:
         """Rays of the first frame, those of the second turned into it, R_C1C2 (P, 3, 3), the noise, and which are good.
 
-        Of a rolling shutter each ray is turned to the instant of the frame's stamp, which is that of its middle row.
+        ``xy`` are the points undistorted by the camera of ``x``. Of a rolling shutter each ray is turned to the instant
+        of the frame's stamp, which is that of its middle row.
         """
-        xy = x.camera.undistort(self.xy.reshape(-1, 2)).reshape(self.xy.shape)
         usable = self.common & np.isfinite(xy).all(axis=(0, 3))
         rays = np.concatenate([np.nan_to_num(xy), np.ones((*xy.shape[:-1], 1))], axis=-1)
         R, rate = GyroPath(self._imu_s, self._gyro_B - x.bias_gyro_B).at(self.t_s.T + x.offset_s)

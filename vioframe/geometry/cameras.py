@@ -95,14 +95,16 @@ class Camera:
             if np.all(np.abs(error) < 1e-12):
                 break
             J = self._distort_jacobian(guess)
-            det = J[:, 0, 0] * J[:, 1, 1] - J[:, 0, 1] * J[:, 1, 0]
+            det = _determinants(J)
             det = np.where(np.abs(det) < 1e-9, np.nan, det)
             guess[:, 0] -= (J[:, 1, 1] * error[:, 0] - J[:, 0, 1] * error[:, 1]) / det
             guess[:, 1] -= (J[:, 0, 0] * error[:, 1] - J[:, 1, 0] * error[:, 0]) / det
+        else:
+            error = self._distort(guess) - target
         with np.errstate(invalid="ignore"):
-            solved = (np.abs(self._distort(guess) - target) < 1e-6).all(axis=1)
+            solved = (np.abs(error) < 1e-6).all(axis=1)
             # Past the fold of the distortion the image is mirrored: a solution there is not where the camera looks.
-            solved &= np.linalg.det(self._distort_jacobian(guess)) > 0.0
+            solved &= _determinants(self._distort_jacobian(guess)) > 0.0
         guess[~solved] = np.nan
         return guess
 
@@ -155,3 +157,8 @@ class Camera:
         scale = np.where(small, 1.0, theta_d / safe)
         slope = np.where(small, 2.0 * (k1 - 1.0 / 3.0), (d_theta / (1.0 + r2) - scale) / safe**2)
         return scale, slope
+
+
+def _determinants(J: Float) -> Float:
+    """(N,) of (N, 2, 2): many times faster than numpy's, which factorises each."""
+    return J[:, 0, 0] * J[:, 1, 1] - J[:, 0, 1] * J[:, 1, 0]
