@@ -85,7 +85,7 @@ def judge(estimate: InitialEstimate, truth: Motion, start_ns: int) -> Errors:
     nees = float(e @ np.linalg.solve(pick @ state.cov @ pick.T, e)) / 5.0
     q = np.stack([s.p_WB for s in estimate.states])
     q, p = q - q.mean(axis=0), (p - p.mean(axis=0)) @ turn.T
-    scale = float((q * p).sum() / (p * p).sum()) - 1.0 if estimate.method != "static" else 0.0
+    scale = float((q * p).sum() / (p * p).sum()) - 1.0 if p.any() and estimate.method != "static" else 0.0
     seconds = (state.t_ns - start_ns) * 1e-9
     return Errors(float(np.linalg.norm(dv)), float(np.rad2deg(np.linalg.norm(tilt))), scale, nees, seconds)
 

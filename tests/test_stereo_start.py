@@ -11,6 +11,7 @@ from initialization_helpers import Motion, first_estimate, judge
 from msckf_helpers import CALIBRATION, STEREO
 from test_initialization import assert_sound, motion
 
+from vioframe.estimation.inertial.preintegration import join_segments
 from vioframe.estimation.initialization import Initializer
 from vioframe.frontend import Frontend, FrontendOptions
 from vioframe.geometry import so3
@@ -88,6 +89,20 @@ def test_a_pair_that_shares_nothing_begins_by_the_first_camera():
     estimate, _ = first_estimate(apart, STEREO)
     assert estimate is not None
     assert estimate.method == "dynamic"
+
+
+@pytest.mark.parametrize(("every", "seconds"), [(2, 0.65), (5, 1.5), (9, 4.0)])
+def test_slow_cameras_begin_when_there_are_frames_enough(every, seconds):
+    """At 10, 4 and 2 Hz; between their frames the readings are joined."""
+    sequence, pending, packets = flown("figure_eight", 2), [], []
+    for k, (imu, tracks) in enumerate(sequence.packets):
+        pending.append(imu)
+        if k % every == 0:
+            packets.append((join_segments(pending), tracks))
+            pending.clear()
+    estimate, _ = first_estimate(packets, STEREO)
+    assert estimate is not None
+    assert (estimate.states[-1].t_ns - packets[0][1].t_ns) * 1e-9 < seconds
 
 
 def test_frames_of_one_camera_alone_are_no_pair():

@@ -51,8 +51,8 @@ from vioframe.types import Calibration, CameraOnBody
 
 # Frames of the window that are estimated, tracks that are used, the longest first, views each of them needs.
 _KEYFRAMES, _MOST_LANDMARKS, _MIN_VIEWS = 8, 80, 4
-# Frames at the end that the rest has to predict.
-_HELD_OUT = 2
+# Frames that there must be, and those at the end that the rest has to predict.
+_FEWEST_FRAMES, _HELD_OUT = 6, 2
 _FARTHEST_M = 50.0
 # Times what a start in motion must know velocity and gravity to: what follows has the depth to find the rest soon.
 _LESS_SURE = 2.0
@@ -66,6 +66,7 @@ def initialise(packets: Sequence[Packet], calibration: Calibration, known: Float
     ``known`` (16 N, 16 N) is the covariance of the ``calibration``'s cameras if that is right, ``doubted`` if it may
     not be.
     """
+    refuse_unless(len(packets) >= _FEWEST_FRAMES, f"{len(packets)} frames, {_FEWEST_FRAMES} are needed")
     t_ns = np.array([tracks.t_ns for _, tracks in packets])
     cameras, noise = calibration.cameras, PIXEL_SIGMA / calibration.cameras[0].model.focal_px
     chosen = [*spread_indices(t_ns[:-_HELD_OUT], _KEYFRAMES), len(packets) - 1]
