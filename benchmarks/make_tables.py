@@ -154,6 +154,36 @@ def rendered() -> str:
     return markdown(shown) + source(rows)
 
 
+def one_or_two() -> str:
+    """Rendered flights by one camera and by both."""
+    rows = _in_m(recorded("stereo_*.json"))
+    shown = []
+    for (clip, backend), own in rows.groupby(["clip", "backend"]):
+        found = dict(iter(own.groupby("cameras")))
+        one, both = found["one"], found["both"]
+        first = float(both["ate_m"][both["world"] == 0].iloc[0])
+
+        def beside(cameras: str, found: dict[str, pd.DataFrame] = found, first: float = first) -> str:
+            ate_m = float(found[cameras]["ate_m"].iloc[0])
+            return f"{length(ate_m)}, {ate_m / first:.2f}"
+
+        shown.append(
+            {
+                "flight": clip,
+                "back-end": f"`{backend}`",
+                "one camera": _ate(one),
+                "both": _ate(both),
+                "of one's ATE": f"{both['ate_m'].mean() / one['ate_m'].mean():.2f}",
+                "both begin after": _range(both["initialised_s"], ".2f", "s"),
+                "each black for 5 s": beside("both, black in turn"),
+                "right one 20 ms later": beside("both, apart"),
+                "resets": f"{own['resets'].sum()}",
+                "of one's time": f"{both['frame_ms'].mean() / one['frame_ms'].mean():.2f}",
+            }
+        )
+    return markdown(shown) + source(rows)
+
+
 def april() -> str:
     """The AprilGrid board."""
     rows = recorded("april_*.json")
@@ -413,6 +443,7 @@ FIGURES: dict[str, Callable[[], str]] = {
             at_rest,
             landmarks,
             rendered,
+            one_or_two,
             april,
             frontend,
             whole_runs,
