@@ -71,6 +71,7 @@ def test_one_runtime_takes_images_of_several_sizes(runtime):
 
 
 @pytest.mark.parametrize("architecture", [COMPACT, QUICK, NARROW], ids=lambda a: a.name)
+@pytest.mark.usefixtures("integer_dot_products")
 def test_int8_is_near(architecture):
     pytest.importorskip("openvino")
     net = network(architecture)

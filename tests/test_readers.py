@@ -247,7 +247,7 @@ class TestAsl:
         assert not EurocDataset.accepts(tmp_path / "empty")
         with pytest.raises(DatasetError, match=r"empty holds no mav0/; name the folder of one sequence"):
             EurocDataset(tmp_path / "empty")
-        with pytest.raises(DatasetError, match=r"cam1/data.csv is missing; choose by -o .* among: cam0, imu0"):
+        with pytest.raises(DatasetError, match=r"cam1/data.csv is missing; choose by --cameras .* among: cam0, imu0"):
             EurocDataset(asl, cameras="cam1")
         mav0 = asl / "mav0"
         (mav0 / "imu0" / "sensor.yaml").rename(mav0 / "imu0" / "sensor.txt")
@@ -266,7 +266,7 @@ class TestAsl:
         with pytest.raises(DatasetError, match=r"'1.4e18,a.png' does not begin with a stamp in integer nanoseconds"):
             EurocDataset(asl)
         (mav0 / "imu0" / "data.csv").unlink()
-        with pytest.raises(DatasetError, match=r"imu0/data.csv is missing; choose by -o .* among: cam0"):
+        with pytest.raises(DatasetError, match=r"imu0/data.csv is missing; choose by --cameras .* among: cam0"):
             EurocDataset(asl)
 
 

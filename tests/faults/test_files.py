@@ -245,7 +245,7 @@ REFUSED = {
     "calibration with NaN": (
         asl(edited(CAMERA_YAML, "intrinsics: [229.0", "intrinsics: [.nan")),
         RUN_ASL,
-        "'intrinsics' should be 4 finite numbers",
+        "'intrinsics' should be 4 or 6 finite numbers",
     ),
     "calibration without rotation": (
         asl(edited(CAMERA_YAML, "data: [", "data: [9")),

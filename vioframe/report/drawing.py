@@ -51,8 +51,9 @@ def write_figures(
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with mpl.rc_context(dict(RC)):
-            for name, drawn in drawings(figures, names):
-                for ending in formats:
+            for ending in formats:
+                # Drawn anew for each: the layout of one leaves traces in the next.
+                for name, drawn in drawings(figures, names):
                     written.append(folder / f"{name}.{ending}")
                     # Without its date an SVG is the same file for the same results.
                     drawn.savefig(written[-1], dpi=_DPI, metadata={"Date": None} if ending == "svg" else None)
