@@ -9,7 +9,7 @@ from test_frontend import CAMERA, PERIOD_NS, SKY, texture
 
 from vioframe.frontend import Frontend, FrontendOptions
 from vioframe.frontend.flow import projected
-from vioframe.frontend.stereo import between, overlapping
+from vioframe.frontend.stereo import overlapping
 from vioframe.geometry import so3, two_view
 from vioframe.incidents import Incidents
 from vioframe.io.calibration import packaged_calibration
@@ -35,7 +35,7 @@ RIG = rig(beside())
 
 def shown(camera: CameraOnBody, moved_m: float = 0.0):
     """The wall, which stands before the left camera and moves along its x axis."""
-    R_C2C1, p_C2C1 = between(LEFT, camera)
+    R_C2C1, p_C2C1 = LEFT.seen_from(camera)
     wall_to_ray = np.array([[1 / 300.0, 0.0, -699.5 / 300.0], [0.0, 1 / 300.0, -499.5 / 300.0], [0.0, 0.0, 1.0]])
     wall_to_ray = np.array([[1.0, 0.0, moved_m / WALL_M], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]) @ wall_to_ray
     plane = R_C2C1 + np.outer(p_C2C1, [0.0, 0.0, 1.0]) / WALL_M
@@ -67,7 +67,7 @@ def flown(count: int, calibration=RIG):
 def test_what_both_cameras_see_has_one_id_and_lies_on_the_wall(model, median_px):
     calibration = rig(beside(model=model))
     steps = play(calibration, flown(6, calibration))
-    R_C2C1, p_C2C1 = between(*calibration.cameras)
+    R_C2C1, p_C2C1 = calibration.cameras[0].seen_from(calibration.cameras[1])
 
     def on_wall(xy_normalised):
         return WALL_M * two_view.rays(xy_normalised) @ R_C2C1.T + p_C2C1

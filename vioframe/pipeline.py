@@ -168,9 +168,10 @@ def _of_usable_cameras(registry: Registry, config: Config) -> tuple[Dataset, dic
     assert path is not None
     dataset = registry.open_dataset(path, reader, options)
     cameras = dataset.calibration.cameras
+    if len(cameras) == 1 or "cameras" not in options or options["cameras"] is not None:
+        return dataset, options, ()
     backend = registry.create_backend(config.backend.name, config.backend.options)
-    usable = getattr(backend, "takes_rigs", False) and all(camera.rotation_known for camera in cameras)
-    if len(cameras) > 1 and not usable and "cameras" in options and options["cameras"] is None:
+    if not (getattr(backend, "takes_rigs", False) and all(camera.rotation_known for camera in cameras)):
         options["cameras"] = [cameras[0].name]
         return registry.open_dataset(path, reader, options), options, tuple(camera.name for camera in cameras[1:])
     return dataset, options, ()

@@ -196,6 +196,10 @@ class CameraOnBody:
         """
         return (y + 0.5) / self.model.resolution[1] - 0.5
 
+    def seen_from(self, other: CameraOnBody) -> tuple[Float, Float]:
+        """R_C2C1 (3, 3) and p_C2C1 (3,) m, from the axes of this camera, C1, to those of the ``other``, C2."""
+        return other.R_BC.T @ self.R_BC, other.R_BC.T @ (self.p_BC - other.p_BC)
+
 
 @dataclass(frozen=True, slots=True)
 class Calibration:
@@ -265,6 +269,11 @@ class CameraSigma:
     def stacked(self) -> Float:
         """(16,) in the order [rotation position time_offset readout intrinsics]."""
         return np.concatenate([self.rotation, self.position, [self.time_offset_s, self.readout_s], self.intrinsics])
+
+    @classmethod
+    def of(cls, stacked: Float) -> CameraSigma:
+        """From what :meth:`stacked` gives."""
+        return cls(stacked[:3], stacked[3:6], float(stacked[6]), stacked[8:], float(stacked[7]))
 
 
 @dataclass(frozen=True, slots=True)

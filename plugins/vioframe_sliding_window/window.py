@@ -117,10 +117,7 @@ class Window:
                 time_offset_ns=self._given.cameras[0].time_offset_ns + round(x.offset_s[c] * NS_PER_S),
                 readout_s=float(x.readout_s[c]),
             )
-        return CalibrationEstimate(
-            learned,
-            tuple(CameraSigma(s[:3], s[3:6], float(s[OFFSET]), s[INTRINSICS], float(s[READOUT])) for s in sigmas),
-        )
+        return CalibrationEstimate(learned, tuple(map(CameraSigma.of, sigmas)))
 
     @property
     def prior(self) -> Prior:

@@ -7,7 +7,6 @@ initialises, diverges or crashes is kept and says so. What the NEES of many tria
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Literal
 
 import numpy as np
 from pydantic import Field
@@ -24,7 +23,7 @@ from vioframe.io.calibration import packaged_calibration
 from vioframe.parts import registry
 from vioframe.parts.config import PartConfig, Section
 from vioframe.simulation import TrackSequence, simulated_sequence
-from vioframe.simulation.config import RIGS
+from vioframe.simulation.config import RIGS, RigName
 from vioframe.types import Float, Int
 
 SHORTEST_S = 10.0
@@ -46,7 +45,7 @@ class Setup(Section):
     pixel_sigma: float = Field(default=1.0, ge=0.0, allow_inf_nan=False)
     outlier_ratio: float = Field(default=0.0, ge=0.0, lt=1.0)
     max_points: int = Field(default=150, ge=1)
-    rig: Literal["mono", "stereo"] = "mono"
+    rig: RigName = "mono"
 
     def sequence(self, seed: int) -> TrackSequence:
         """The flight with the noise of ``seed``."""

@@ -11,7 +11,7 @@ import numpy as np
 from vioframe.frontend.flow import follow, projected
 from vioframe.frontend.view import FORWARD_BACKWARD_PX, View
 from vioframe.geometry.two_view import essential_matrix, inverse_depths, rays, sampson_distance
-from vioframe.types import Bool, Calibration, CameraOnBody, Float, Int
+from vioframe.types import Bool, Calibration, Float, Int
 
 # Largest distance of a match from the epipolar geometry, px: the extrinsics are only known to so much.
 _EPIPOLAR_PX = 2.0
@@ -40,7 +40,7 @@ class Pair:
         self._images += 1
         if self._images % _AGAIN_IMAGES == 0:
             self._not_found = self._not_found[:0]
-        R_C2C1, p_C2C1 = between(calibration.cameras[self.first], calibration.cameras[self.second])
+        R_C2C1, p_C2C1 = calibration.cameras[self.first].seen_from(calibration.cameras[self.second])
         nearest = _EPIPOLAR_PX / other.camera.focal_px
         _, i, j = np.intersect1d(one.ids, other.ids, assume_unique=True, return_indices=True)
         right, rho = _agreement(one.xy_normalised[i], other.xy_normalised[j], R_C2C1, p_C2C1, nearest)
@@ -72,11 +72,6 @@ def overlapping(calibration: Calibration) -> tuple[Pair, ...]:
     return tuple(Pair(o, c) for c in count for o in count if o != c and _overlap(calibration, o, c))
 
 
-def between(first: CameraOnBody, second: CameraOnBody) -> tuple[Float, Float]:
-    """R_C2C1 (3, 3) and p_C2C1 (3,) m."""
-    return second.R_BC.T @ first.R_BC, second.R_BC.T @ (first.p_BC - second.p_BC)
-
-
 def _agreement(xy_1: Float, xy_2: Float, R_C2C1: Float, p_C2C1: Float, threshold: float) -> tuple[Bool, Float]:
     """Which pairs (N, 2) may be of one point, as near to each other's epipolar lines; and inverse depths (N,) 1/m."""
     rho = inverse_depths(xy_1, xy_2, R_C2C1, p_C2C1)
@@ -91,6 +86,6 @@ def _overlap(calibration: Calibration, first: int, second: int) -> bool:
     width, height = one.model.resolution
     grid = np.meshgrid(np.linspace(0.0, width - 1.0, _GRID), np.linspace(0.0, height - 1.0, _GRID))
     xy_normalised = one.model.undistort(np.column_stack([axis.ravel() for axis in grid]))
-    R_C2C1, p_C2C1 = between(one, other)
+    R_C2C1, p_C2C1 = one.seen_from(other)
     turned = rays(xy_normalised[np.isfinite(xy_normalised).all(axis=1)]) @ R_C2C1.T
     return any(projected(other.model, turned + p_C2C1 / m)[1].mean() > _LEAST_OVERLAP for m in _DISTANCES_M)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Annotated, Any, Self
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, model_validator
 
@@ -24,6 +24,7 @@ MANIFEST, TRUTH, MESH = SIMULATION_FILES = "manifest.yaml", "ground_truth.csv", 
 """Files of a simulation's folder: all settings, the exact states in EuRoC's format, and the mesh of the world in W."""
 
 
+RigName = Literal["mono", "stereo"]
 RIGS = {"mono": ("cam0",), "stereo": ("cam0", "cam1")}
 """EuRoC's cameras by the name of a rig of them."""
 

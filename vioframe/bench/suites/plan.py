@@ -19,7 +19,7 @@ from vioframe.parts.config import Config, DatasetConfig, PartConfig
 from vioframe.parts.registry import BACKEND, DETECTOR, Registry
 from vioframe.runs.evaluated import create_metrics
 from vioframe.runs.results import CELL, CLEAR, Data
-from vioframe.simulation.config import RIGS, SimulationConfig
+from vioframe.simulation.config import RIGS, RigName, SimulationConfig
 from vioframe.simulation.flights import flight as named_flight
 from vioframe.warming import warm_up
 
@@ -62,6 +62,7 @@ def _flights(suite: Suite, folders: Sequence[Path], installed: Registry) -> Iter
     code = fingerprints.of_code(installed)
     conditions = [(CLEAR, 0.0)] if suite.clear else []
     conditions += [(name, level) for name, levels in suite.conditions.items() for level in levels]
+    rig: RigName = "stereo" if any(backend.rig == "stereo" for backend in suite.backends) else "mono"
     found = {each.name: sources.find_source(each.name, folders, installed) for each in suite.sequences}
     create_metrics(suite.metrics, installed)  # says what is wrong with one before anything is flown
     for sequence, (condition, level), seed in product(suite.sequences, conditions, range(suite.seeds)):
@@ -71,7 +72,7 @@ def _flights(suite: Suite, folders: Sequence[Path], installed: Registry) -> Iter
             # Whichever seed comes last, there is enough of it for all.
             duration_s=None if sequence.duration_s is None else sequence.duration_s + SEED_SHIFT_S * (suite.seeds - 1),
             conditions={condition: level} if level else {},
-            rig="stereo" if any(backend.rig == "stereo" for backend in suite.backends) else "mono",
+            rig=rig,
             seed=seed if suite.seeds_vary == "recording" else 0,
             installed=installed,
         )

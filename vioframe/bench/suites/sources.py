@@ -14,7 +14,7 @@ from vioframe.parts.options import did_you_mean
 from vioframe.parts.registry import FLIGHT, Registry
 from vioframe.runs.results import Data
 from vioframe.simulation import config as simulation
-from vioframe.simulation.config import MANIFEST, SimulationConfig, simulation_folder
+from vioframe.simulation.config import MANIFEST, RigName, SimulationConfig, simulation_folder
 from vioframe.simulation.scenario import motion_files
 
 DEFAULT_STAND_IN_S = 30.0
@@ -105,11 +105,14 @@ def flown(
     start_s: float | None,
     duration_s: float | None,
     conditions: Mapping[str, float],
-    rig: str,
+    rig: RigName,
     seed: int,
     installed: Registry,
 ) -> Flown:
-    """What to fly ``source`` on. Under ``conditions`` images are rendered; ``rig`` and ``seed`` are of what is."""
+    """What to fly ``source`` on; under ``conditions`` images are rendered.
+
+    ``rig`` and ``seed`` are those of what is simulated or rendered.
+    """
     name, known = source.name, EUROC.get(source.name)
     begin_s = start_s if start_s is not None else known.start_s if known else 0.0
     if source.recording is not None and (not conditions or source.kind is not Data.REAL):

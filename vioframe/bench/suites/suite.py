@@ -16,6 +16,7 @@ from vioframe.parts.config import LabelledPart, Named, PartConfig, Section, read
 from vioframe.parts.options import did_you_mean, validate_options
 from vioframe.runs.results import Reference
 from vioframe.simulation.conditions import Conditions
+from vioframe.simulation.config import RigName
 
 Kind = Literal["flights", "detector_speed", "trials"]
 Level = Annotated[float, Field(gt=0.0, le=1.0)]
@@ -25,7 +26,7 @@ class Estimator(LabelledPart):
     """A back-end, which of EuRoC's cameras it sees by, and the loop closer behind it, if any."""
 
     loop_closure: PartConfig | None = None
-    rig: Literal["mono", "stereo"] = "mono"
+    rig: RigName = "mono"
 
 
 class Sequence(Named):

@@ -119,21 +119,7 @@ def initialise(
         # Only fast turns tell a readout; slow ones would have it make up for something else.
         doubted = doubted.copy()
         doubted[READOUT, READOUT] = known[READOUT, READOUT]
-    keep = explained(problem, solution.variables)
-    window = window.only(keep)
-    require_tracks(window, "tracks fit the bundle adjustment")
-    x = replace(solution.variables, landmarks=solution.variables.landmarks[keep])
-    problem, solution = adjusted_window(window.without_last(), x, calibration, doubted)
-    check_fit(problem, solution)
-
-    x = solution.variables
-    predicted = predicted_states(packets[-held_out:], x.states.unstack(window.t_ns[:-1])[-1], calibration)
-    p_WF = landmark_positions(problem, x)
-    check_lookahead(predicted, packets[-held_out:], x.cameras, window.ids, p_WF, calibration.cameras[0].model)
-
-    x = replace(x, states=x.states.append(StateArrays.stack(predicted[-1:])))
-    problem, solution = adjusted_window(window, x, calibration, doubted)
-    check_fit(problem, solution)
+    window, problem, solution = refined(window, problem, solution, packets[-held_out:], calibration, doubted)
     x = solution.variables
     cov = covariance(problem, x, doubted)
     check_uncertainty(x.states, cov, scale_sigma)
@@ -142,6 +128,35 @@ def initialise(
     keep = explained(problem, x)
     states, p_WF = from_zero(window.t_ns, x, cov, landmark_positions(problem, x)[keep])
     return InitialEstimate("dynamic", states, window.ids[keep], p_WF, x.cameras, _camera(cov))
+
+
+def refined(
+    window: Window,
+    problem: Problem,
+    rough: Solution,
+    held_out: Sequence[Packet],
+    calibration: Calibration,
+    known: Float,
+) -> tuple[Window, Problem, Solution]:
+    """What fits of ``window``, and its adjustment, from the ``rough`` one of all but the newest frame.
+
+    That must predict what the first camera sees in the packets ``held_out`` behind it, of which the newest is the last.
+    """
+    keep = explained(problem, rough.variables)
+    window = window.only(keep)
+    require_tracks(window, "tracks fit the bundle adjustment")
+    x = replace(rough.variables, landmarks=rough.variables.landmarks[keep])
+    problem, solution = adjusted_window(window.without_last(), x, calibration, known)
+    _check_fit(problem, solution)
+
+    x = solution.variables
+    predicted = _predicted_states(held_out, x.states.unstack(window.t_ns[:-1])[-1], calibration)
+    p_WF = landmark_positions(problem, x)
+    _check_lookahead(predicted, held_out, x.cameras, window.ids, p_WF, calibration.cameras[0].model)
+    x = replace(x, states=x.states.append(StateArrays.stack(predicted[-1:])))
+    problem, solution = adjusted_window(window, x, calibration, known)
+    _check_fit(problem, solution)
+    return window, problem, solution
 
 
 def _believed(
@@ -233,7 +248,7 @@ def landmark_positions(problem: Problem, x: Variables) -> Float:
     return positions(x.states, x.cameras, problem.sightings.seen.argmax(axis=1), x.landmarks)
 
 
-def predicted_states(packets: Sequence[Packet], last: NavState, calibration: Calibration) -> list[NavState]:
+def _predicted_states(packets: Sequence[Packet], last: NavState, calibration: Calibration) -> list[NavState]:
     """The state at each of ``packets``, of which the first follows ``last``, from readings alone."""
     out = []
     for imu, _ in packets:
@@ -266,7 +281,7 @@ def _check_parallax(window: Window, R_B0B: Float, calibration: Calibration) -> N
     refuse_unless(parallax >= _LEAST_PARALLAX_PX, f"parallax of {parallax:.1f} px, {_LEAST_PARALLAX_PX} px are needed")
 
 
-def check_fit(problem: Problem, solution: Solution) -> None:
+def _check_fit(problem: Problem, solution: Solution) -> None:
     """Observations, readings and biases must be as the noise and the priors have them."""
     refuse_unless(solution.converged, "the bundle adjustment did not converge")
     x, sightings = solution.variables, problem.sightings
@@ -283,7 +298,7 @@ def check_fit(problem: Problem, solution: Solution) -> None:
     refuse_unless(bias <= _MAX_BIAS_ACCEL, f"accelerometer bias of {bias:.2f} m/s^2 is not plausible")
 
 
-def check_lookahead(
+def _check_lookahead(
     predicted: Sequence[NavState],
     packets: Sequence[Packet],
     cameras: Calibrated,
@@ -297,6 +312,7 @@ def check_lookahead(
     """
     found = given.with_intrinsics(cameras.intrinsics[0])
     for state, (imu, tracks) in zip(predicted, packets, strict=True):
+        tracks = tracks.of_camera(0)
         _, a, b = np.intersect1d(ids, tracks.ids, return_indices=True)
         refuse_unless(len(a) >= _FEWEST_COMMON, f"only {len(a)} landmarks were still tracked in the frames held back")
         turned = so3.exp((imu.gyro_B[-1] - state.bias_gyro_B) * cameras.offset_s[0])

@@ -225,7 +225,7 @@ class Initializer:
         calibration = replace(self.calibration, imu=self._noise_in_motion())
         first, others = self._sigma(_WITHOUT_ITS_FRAMES), tuple(GIVEN for _ in calibration.cameras[1:])
         wrong = np.sqrt(np.diag(self._doubted(np.diag(first.stacked() ** 2))))
-        doubted = CameraSigma(wrong[:3], wrong[3:6], float(wrong[OFFSET]), wrong[INTRINSICS], first.readout_s)
+        doubted = replace(CameraSigma.of(wrong), readout_s=first.readout_s)
         known, doubted_cov = (
             rig.covariance(CalibrationEstimate(calibration, (sigma, *others))) for sigma in (first, doubted)
         )

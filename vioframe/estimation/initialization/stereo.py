@@ -9,13 +9,13 @@ leaves it to the slower methods where anything speaks against it.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
 
 from vioframe.arrays import Bool, Float
 from vioframe.estimation.factors.inertial import StateArrays
+from vioframe.estimation.factors.landmarks import in_hosts
 from vioframe.estimation.factors.problem import Variables
 from vioframe.estimation.factors.reprojection import Calibrated
 from vioframe.estimation.initialization.bundle_adjustment import covariance
@@ -23,14 +23,12 @@ from vioframe.estimation.initialization.closed_form import align, rotations
 from vioframe.estimation.initialization.dynamic import (
     CONTRADICTED,
     adjusted_window,
-    check_fit,
-    check_lookahead,
     check_uncertainty,
     explained,
     from_zero,
     landmark_positions,
-    predicted_states,
     preintegrated,
+    refined,
     require_tracks,
     variance_of,
     with_gyro_bias,
@@ -83,28 +81,16 @@ def initialise(packets: Sequence[Packet], calibration: Calibration, known: Float
     arm = cameras[0].p_BC
     at_camera = p_B0B + R_B0B[:-1] @ arm - arm
     alignment = align(at_camera, imu[:-1], arm, BIAS_ACCEL_SIGMA, in_metres=True)
-    R_WB0 = level_rotation(-alignment.g_B0)
-    landmarks, ahead = _in_first_views(window, R_B0B, p_B0B, p_F, cameras)
+    hosts, calibrated = window.seen.argmax(axis=0), Calibrated.of(*cameras)
+    path = StateArrays(R_B0B[:-1], p_B0B, *np.zeros((3, len(p_B0B), 3)))
+    landmarks, ahead = in_hosts(path, calibrated, hosts, p_F)
+    landmarks[:, :2] = window.xy[hosts, np.arange(len(hosts))]
     window, landmarks = window.only(ahead), landmarks[ahead]
     require_tracks(window, "tracks lie ahead")
 
-    x = Variables(alignment.states.turned(R_WB0), Calibrated.of(*cameras), landmarks)
+    x = Variables(alignment.states.turned(level_rotation(-alignment.g_B0)), calibrated, landmarks)
     problem, solution = adjusted_window(window.without_last(), x, calibration, known, roughly=True)
-    keep = explained(problem, solution.variables)
-    window = window.only(keep)
-    require_tracks(window, "tracks fit the bundle adjustment")
-    x = replace(solution.variables, landmarks=solution.variables.landmarks[keep])
-    problem, solution = adjusted_window(window.without_last(), x, calibration, known)
-    check_fit(problem, solution)
-
-    x = solution.variables
-    held_out = [(imu, tracks.of_camera(0)) for imu, tracks in packets[chosen[-2] + 1 :]]
-    predicted = predicted_states(held_out, x.states.unstack(window.t_ns[:-1])[-1], calibration)
-    p_WF = landmark_positions(problem, x)
-    check_lookahead(predicted, held_out, x.cameras, window.ids, p_WF, cameras[0].model)
-    x = replace(x, states=x.states.append(StateArrays.stack(predicted[-1:])))
-    problem, solution = adjusted_window(window, x, calibration, known)
-    check_fit(problem, solution)
+    window, problem, solution = refined(window, problem, solution, packets[-_HELD_OUT:], calibration, known)
     x = solution.variables
     _, other = adjusted_window(window, x, calibration, doubted)
     contradicted = not solution.cost < other.cost + CONTRADICTED * variance_of(problem, x)
@@ -130,9 +116,8 @@ def _placed(window: Window, R_B0B: Float, cameras: Sequence[CameraOnBody], sigma
         if k:
             p_B0B[k] = _place(R, p_B0B[k - 1], seen & known, xy, p_F, cameras, sigma)
         for a, b in combinations(range(N), 2):
-            one, other, rows = cameras[a], cameras[b], np.flatnonzero(seen[a] & seen[b] & ~known)
-            R_ba, p_ba = other.R_BC.T @ one.R_BC, other.R_BC.T @ (one.p_BC - other.p_BC)
-            rho = inverse_depths(xy[a, rows], xy[b, rows], R_ba, p_ba)
+            one, rows = cameras[a], np.flatnonzero(seen[a] & seen[b] & ~known)
+            rho = inverse_depths(xy[a, rows], xy[b, rows], *one.seen_from(cameras[b]))
             near = rho > 1.0 / _FARTHEST_M
             p_C = rays(xy[a, rows[near]]) / rho[near, None]
             p_F[rows[near]] = (p_C @ one.R_BC.T + one.p_BC) @ R.T + p_B0B[k]
@@ -162,18 +147,3 @@ def _place(
             b += (weight[:, None] * off).sum(axis=0)
         p = p + np.linalg.solve(H, b)
     return p
-
-
-def _in_first_views(
-    window: Window, R_B0B: Float, p_B0B: Float, p_F: Float, cameras: Sequence[CameraOnBody]
-) -> tuple[Float, Bool]:
-    """[x y rho] (L, 3) of the landmarks in the first view that sees each, where they were seen, and which lie ahead."""
-    host = window.seen.argmax(axis=0)
-    k, c = host // len(cameras), host % len(cameras)
-    R_BC, p_BC = np.stack([camera.R_BC for camera in cameras])[c], np.stack([camera.p_BC for camera in cameras])[c]
-    k = np.minimum(k, len(p_B0B) - 1)
-    p_B = (np.swapaxes(R_B0B[k], -1, -2) @ (p_F - p_B0B[k])[..., None])[..., 0]
-    z = (np.swapaxes(R_BC, -1, -2) @ (p_B - p_BC)[..., None])[:, 2, 0]
-    ahead = (z > 1.0 / _FARTHEST_M) & (host < len(cameras) * len(p_B0B))
-    xy = window.xy[host, np.arange(len(host))]
-    return np.column_stack([xy, 1.0 / np.where(ahead, z, 1.0)]), ahead
