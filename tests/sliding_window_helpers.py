@@ -24,8 +24,7 @@ from vioframe.estimation.factors.reprojection import (
 from vioframe.estimation.inertial.preintegration import join_segments, preintegrate
 from vioframe.estimation.standstill import Standstill
 from vioframe.geometry import so3
-from vioframe.geometry.cameras import Camera
-from vioframe.geometry.kernels import intrinsics_of
+from vioframe.geometry.cameras import Camera, intrinsics_of
 from vioframe.io.calibration import packaged_calibration
 from vioframe.simulation import simulated_sequence
 from vioframe.types import Float

@@ -7,8 +7,8 @@ import pytest
 from msckf_helpers import CALIBRATION, STEREO, random_covariance, seeing_state, sighting_rows
 from scipy.stats import chi2
 
-from vioframe.geometry import kernels, so3
-from vioframe.geometry.cameras import Camera
+from vioframe.geometry import so3
+from vioframe.geometry.cameras import Camera, intrinsics_of
 from vioframe_msckf.measurement import Window, landmark_blocks, mahalanobis, observations, reduce_landmark, track_rows
 from vioframe_msckf.options import MsckfOptions
 from vioframe_msckf.state import IMU, OFFSET, READOUT
@@ -24,7 +24,7 @@ CAMERAS = {
 @pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS.keys())
 def test_observation_jacobian_is_the_derivative_on_the_manifold(camera, readout_s):
     rng = np.random.default_rng(3)
-    model, k = kernels.intrinsics_of(camera)
+    model, k = intrinsics_of(camera)
     R_BC, p_BC = so3.exp(rng.normal(size=3)), 0.1 * rng.normal(size=3)
     R_WB, p_WB = so3.exp(rng.normal(size=3)), rng.normal(size=3)
     p_WF = p_WB + R_WB @ (R_BC @ np.array([0.7, -0.4, 3.0]) + p_BC)

@@ -28,8 +28,7 @@ from vioframe.estimation.factors.problem import Prior, Problem, Variables, pose_
 from vioframe.estimation.factors.reprojection import CALIBRATION_SIZE, OFFSET, READOUT, Poses, Sightings
 from vioframe.estimation.factors.solver import covariance
 from vioframe.geometry import so3
-from vioframe.geometry.cameras import Camera
-from vioframe.geometry.kernels import intrinsics_of
+from vioframe.geometry.cameras import Camera, intrinsics_of
 from vioframe.types import Float, Int
 
 CAMERAS = {
@@ -286,16 +285,6 @@ def test_prior_on_one_state_is_its_covariance():
     np.testing.assert_allclose(np.diag(prior.H)[15:], 1.0 / np.arange(1.0, 17.0))
     assert not prior.H[:15, 15:].any()
     assert prior.frozen.tolist() == [True]
-
-
-@pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS.keys())
-def test_points_are_undistorted_anew_from_where_another_lens_has_them(camera):
-    xy = np.random.default_rng(0).uniform([5.0, 5.0], [747.0, 475.0], (50, 2))
-    other = camera.with_intrinsics(intrinsics_of(camera)[1] + [4.0, -3.0, 2.0, 1.0, 0.01, -0.01, 0.001, 0.002])
-    expected, guess = other.undistort(xy), camera.undistort(xy)
-    assert np.abs(expected - guess).max() > 1e-3
-    np.testing.assert_allclose(reprojection.undistorted(*intrinsics_of(other), xy, guess), expected, atol=1e-9)
-    assert np.isnan(reprojection.undistorted(*intrinsics_of(other), xy + 1e4, guess)).any(axis=1).all()
 
 
 def test_covariance_of_the_last_unknowns_is_their_part_of_the_whole():

@@ -18,6 +18,7 @@ from vioframe.errors import DivergedError
 from vioframe.estimation import rig
 from vioframe.estimation.inertial.propagation import propagate, yaw_consistent_transition
 from vioframe.geometry import kernels
+from vioframe.geometry.cameras import intrinsics_of
 from vioframe.types import (
     DBA,
     DBG,
@@ -119,7 +120,7 @@ class FilterState:
         # Beyond the first camera's time offset as given, which readings were cut by.
         self.offset_s = np.array([(c.time_offset_ns - cameras[0].time_offset_ns) / NS_PER_S for c in cameras])
         self.readout_s = np.array([c.readout_s for c in cameras])
-        models, intrinsics_of_each = zip(*(kernels.intrinsics_of(c.model) for c in cameras), strict=True)
+        models, intrinsics_of_each = zip(*(intrinsics_of(c.model) for c in cameras), strict=True)
         self.camera_models, self.intrinsics = np.array(models), np.stack(intrinsics_of_each)
         self.image_heights = np.array([c.model.resolution[1] for c in cameras])
         self.clones = Poses.none()

@@ -33,14 +33,14 @@ from vioframe.estimation.factors.reprojection import (
     Sightings,
     pixels_by_intrinsics,
     pixels_by_residual,
-    undistorted,
 )
 from vioframe.estimation.factors.solver import covariance, solve
 from vioframe.estimation.factors.tracks import LandmarkTable, TrackTable
 from vioframe.estimation.inertial.noise import noise_over
 from vioframe.estimation.inertial.preintegration import Preintegrated, join_segments, preintegrate
 from vioframe.estimation.standstill import Standstill
-from vioframe.geometry.kernels import intrinsics_of
+from vioframe.geometry.cameras import intrinsics_of
+from vioframe.geometry.kernels import undistorted
 from vioframe.geometry.two_view import rays
 from vioframe.types import (
     NS_PER_S,
@@ -151,8 +151,7 @@ class Window:
             xy_normalised = np.empty_like(tracks.xy_normalised)
             for c, lens in lenses:
                 own = tracks.camera == c
-                guess = tracks.xy_normalised[own]
-                xy_normalised[own] = undistorted(int(self._models[c]), lens, tracks.xy[own], guess)
+                xy_normalised[own] = undistorted(int(self._models[c]), lens, tracks.xy[own])
             tracks = replace(tracks, xy_normalised=xy_normalised).finite()
         self._undistorted_with = np.concatenate([self._undistorted_with, self._cameras.intrinsics])
         to_px = np.empty((len(tracks.ids), 2, 2))

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -17,6 +17,7 @@ from vioframe.arrays import Float
 from vioframe.errors import CalibrationError
 
 DistortionModel = Literal["radtan", "equidistant"]
+_MODELS = get_args(DistortionModel)
 
 # Of an image a side; it is what OpenCV can address.
 _MOST_PX = 32_767
@@ -35,7 +36,7 @@ class Camera:
     distortion_model: DistortionModel = "radtan"
 
     def __post_init__(self) -> None:
-        if self.distortion_model not in ("radtan", "equidistant"):
+        if self.distortion_model not in _MODELS:
             raise CalibrationError(f"unknown distortion model {self.distortion_model!r}; use radtan or equidistant")
         numbers = [self.fx, self.fy, self.cx, self.cy, *self.distortion]
         if len(self.distortion) != 4 or not np.all(np.isfinite(numbers)) or self.fx <= 0.0 or self.fy <= 0.0:
@@ -84,29 +85,9 @@ class Camera:
 
         Points so far outside the image that the model cannot be inverted come back as NaN.
         """
-        target = (np.asarray(xy, dtype=np.float64).reshape(-1, 2) - self._centre) / self._focal
-        guess = target.copy()
-        if self.distortion_model == "equidistant":
-            # The distorted radius is nearly the angle from the axis; start from the undistorted tangent.
-            theta = np.linalg.norm(target, axis=1, keepdims=True)
-            guess *= np.tan(np.minimum(theta, 1.5)) / np.where(theta < 1e-9, 1.0, theta)
-        for _ in range(20):
-            error = self._distort(guess) - target
-            if np.all(np.abs(error) < 1e-12):
-                break
-            J = self._distort_jacobian(guess)
-            det = _determinants(J)
-            det = np.where(np.abs(det) < 1e-9, np.nan, det)
-            guess[:, 0] -= (J[:, 1, 1] * error[:, 0] - J[:, 0, 1] * error[:, 1]) / det
-            guess[:, 1] -= (J[:, 0, 0] * error[:, 1] - J[:, 1, 0] * error[:, 0]) / det
-        else:
-            error = self._distort(guess) - target
-        with np.errstate(invalid="ignore"):
-            solved = (np.abs(error) < 1e-6).all(axis=1)
-            # Past the fold of the distortion the image is mirrored: a solution there is not where the camera looks.
-            solved &= _determinants(self._distort_jacobian(guess)) > 0.0
-        guess[~solved] = np.nan
-        return guess
+        from vioframe.geometry.kernels import undistorted  # loads numba
+
+        return undistorted(*intrinsics_of(self), np.asarray(xy, dtype=np.float64).reshape(-1, 2))
 
     def contains(self, xy: ArrayLike, border_px: float = 0.0) -> NDArray[np.bool_]:
         """(N,) whether pixels lie in the image, at least ``border_px`` from its outermost pixel centres."""
@@ -117,7 +98,7 @@ class Camera:
     def _distort(self, xy: Float) -> Float:
         x, y = xy[:, 0], xy[:, 1]
         r2 = x * x + y * y
-        scale, _ = self._radial(r2)
+        scale = self._radial(r2)
         p1, p2 = self._tangential
         return np.stack(
             [
@@ -127,25 +108,15 @@ class Camera:
             axis=1,
         )
 
-    def _distort_jacobian(self, xy: Float) -> Float:
-        x, y = xy[:, 0], xy[:, 1]
-        scale, slope = self._radial(x * x + y * y)
-        p1, p2 = self._tangential
-        J = np.empty((len(xy), 2, 2))
-        J[:, 0, 0] = scale + slope * x * x + 2.0 * p1 * y + 6.0 * p2 * x
-        J[:, 1, 1] = scale + slope * y * y + 6.0 * p1 * y + 2.0 * p2 * x
-        J[:, 0, 1] = J[:, 1, 0] = slope * x * y + 2.0 * p1 * x + 2.0 * p2 * y
-        return J
-
     @property
     def _tangential(self) -> tuple[float, float]:
         return self.distortion[2:] if self.distortion_model == "radtan" else (0.0, 0.0)
 
-    def _radial(self, r2: Float) -> tuple[Float, Float]:
-        """How far out a point is moved, as a factor of its radius r, and the factor's derivative by r divided by r."""
+    def _radial(self, r2: Float) -> Float:
+        """How far out a point is moved, as a factor of its radius r."""
         k1, k2, k3, k4 = self.distortion
         if self.distortion_model == "radtan":
-            return 1.0 + r2 * (k1 + k2 * r2), 2.0 * (k1 + 2.0 * k2 * r2)
+            return 1.0 + r2 * (k1 + k2 * r2)
         # theta_d / r (Kannala and Brandt 2006).
         r = np.sqrt(r2)
         small = r < 1e-6
@@ -153,12 +124,10 @@ class Camera:
         theta = np.arctan(r)
         t2 = theta * theta
         theta_d = theta * (1.0 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4))))
-        d_theta = 1.0 + t2 * (3.0 * k1 + t2 * (5.0 * k2 + t2 * (7.0 * k3 + t2 * 9.0 * k4)))
-        scale = np.where(small, 1.0, theta_d / safe)
-        slope = np.where(small, 2.0 * (k1 - 1.0 / 3.0), (d_theta / (1.0 + r2) - scale) / safe**2)
-        return scale, slope
+        return np.where(small, 1.0, theta_d / safe)
 
 
-def _determinants(J: Float) -> Float:
-    """(N,) of (N, 2, 2): many times faster than numpy's, which factorises each."""
-    return J[:, 0, 0] * J[:, 1, 1] - J[:, 0, 1] * J[:, 1, 0]
+def intrinsics_of(camera: Camera) -> tuple[int, Float]:
+    """The camera as :mod:`kernels` takes it: model number and (8,) [fx fy cx cy d1 d2 d3 d4]."""
+    intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy, *camera.distortion])
+    return _MODELS.index(camera.distortion_model), intrinsics

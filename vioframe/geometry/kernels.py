@@ -8,16 +8,10 @@ import math
 import numpy as np
 
 from vioframe.arrays import Float
-from vioframe.geometry.cameras import Camera
 from vioframe.jit import kernel
 
 RADTAN, EQUIDISTANT = 0, 1
-
-
-def intrinsics_of(camera: Camera) -> tuple[int, Float]:
-    """The camera as the kernels take it: model number and (8,) [fx fy cx cy d1 d2 d3 d4]."""
-    number = RADTAN if camera.distortion_model == "radtan" else EQUIDISTANT
-    return number, np.array([camera.fx, camera.fy, camera.cx, camera.cy, *camera.distortion])
+"""Numbers of the models, as :func:`cameras.intrinsics_of` gives them."""
 
 
 @kernel
@@ -213,3 +207,31 @@ def undistort(model: int, k: Float, px: float, py: float, x: float, y: float) ->
         x -= (J[1, 1] * ex - J[0, 1] * ey) / det
         y -= (J[0, 0] * ey - J[1, 0] * ex) / det
     return x, y
+
+
+@kernel
+def undistorted(model: int, k: Float, xy: Float) -> Float:
+    """(N, 2) px -> (N, 2) on the z = 1 plane, by Newton's method; NaN where the model cannot be inverted."""
+    plane = k.copy()  # of a camera that draws on the z = 1 plane itself
+    plane[:4] = 1.0, 1.0, 0.0, 0.0
+    out = np.full(xy.shape, np.nan)
+    for i in range(len(xy)):
+        u, v = (xy[i, 0] - k[2]) / k[0], (xy[i, 1] - k[3]) / k[1]
+        x, y = u, v
+        if model == EQUIDISTANT:
+            # The distorted radius is nearly the angle from the axis; start from the undistorted tangent.
+            theta = math.sqrt(u * u + v * v)
+            stretch = math.tan(min(theta, 1.5)) / theta if theta > 1e-9 else 1.0
+            x, y = stretch * u, stretch * v
+        for _ in range(20):
+            uv, J = distort(model, plane, x, y)
+            ex, ey = uv[0] - u, uv[1] - v
+            det = J[0, 0] * J[1, 1] - J[0, 1] * J[1, 0]
+            if abs(ex) < 1e-12 and abs(ey) < 1e-12:
+                break
+            x -= (J[1, 1] * ex - J[0, 1] * ey) / det
+            y -= (J[0, 0] * ey - J[1, 0] * ex) / det
+        # Past the fold of the distortion the image is mirrored: a solution there is not where the camera looks.
+        if abs(ex) < 1e-6 and abs(ey) < 1e-6 and det > 0.0:
+            out[i, 0], out[i, 1] = x, y
+    return out

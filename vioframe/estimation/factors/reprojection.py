@@ -21,7 +21,8 @@ from typing import NamedTuple
 import numpy as np
 
 from vioframe.arrays import Bool, Float, Int
-from vioframe.geometry.kernels import distort, exp, intrinsics_jacobian, intrinsics_of, undistort
+from vioframe.geometry.cameras import intrinsics_of
+from vioframe.geometry.kernels import distort, exp, intrinsics_jacobian
 from vioframe.jit import kernel
 from vioframe.types import CameraOnBody
 
@@ -160,19 +161,6 @@ def relative_poses(R_WB: Float, p_WB: Float) -> tuple[Float, Float, Float]:
                 for k in range(3):
                     R_fh[f, h, i, k] = R[0, i] * R_WB[h, 0, k] + R[1, i] * R_WB[h, 1, k] + R[2, i] * R_WB[h, 2, k]
     return R_WB, R_fh, t_fh
-
-
-@kernel
-def undistorted(model: int, k: Float, xy: Float, guess: Float) -> Float:
-    """(N, 2) px -> (N, 2) on the z = 1 plane, from a ``guess`` (N, 2) by nearly the same camera; NaN where it fails."""
-    out = np.empty(xy.shape)
-    for i in range(len(xy)):
-        out[i, 0], out[i, 1] = undistort(model, k, xy[i, 0], xy[i, 1], guess[i, 0], guess[i, 1])
-        px, J = distort(model, k, out[i, 0], out[i, 1])
-        # Past the fold of the distortion the image is mirrored.
-        if not (abs(px[0] - xy[i, 0]) + abs(px[1] - xy[i, 1]) < 1e-3 and J[0, 0] * J[1, 1] > J[0, 1] * J[1, 0]):
-            out[i] = np.nan
-    return out
 
 
 @kernel

@@ -30,7 +30,7 @@ from vioframe.estimation.factors.reprojection import (
 from vioframe.estimation.factors.solver import Solution, solve
 from vioframe.estimation.inertial.preintegration import Preintegrated
 from vioframe.estimation.initialization.window import BIAS_ACCEL_SIGMA, BIAS_GYRO_SIGMA, PIXEL_SIGMA, Window
-from vioframe.geometry.kernels import intrinsics_of
+from vioframe.geometry.cameras import intrinsics_of
 from vioframe.types import DBA, DBG, DP, DTHETA, CameraOnBody
 
 _CAUCHY = 2.0  # standard deviations
