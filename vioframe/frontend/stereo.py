@@ -51,7 +51,9 @@ class Pair:
             self._not_found = np.append(self._not_found, one.ids[i[wrong]])
             other.keep(keep)
 
-        new = np.flatnonzero(~np.isin(one.ids, other.ids) & ~np.isin(one.ids, self._not_found))
+        tried = np.isin(one.ids, self._not_found)
+        tried[i] = True
+        new = np.flatnonzero(~tried)
         p_C2 = rays(one.xy_normalised[new]) @ R_C2C1.T + max(typical, 0.0) * p_C2C1
         guess, in_view = projected(other.camera, p_C2)
         new, guess = new[in_view], guess[in_view]

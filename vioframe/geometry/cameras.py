@@ -7,7 +7,6 @@ distorted point. Pixels are (x, y) with integers at pixel centres.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import Literal, get_args
 
 import numpy as np
@@ -63,14 +62,6 @@ class Camera:
         fx, fy, cx, cy, *distortion = intrinsics.tolist()
         return replace(self, fx=fx, fy=fy, cx=cx, cy=cy, distortion=tuple(distortion))
 
-    @cached_property
-    def _focal(self) -> Float:
-        return np.array([self.fx, self.fy])
-
-    @cached_property
-    def _centre(self) -> Float:
-        return np.array([self.cx, self.cy])
-
     def project(self, p_C: ArrayLike) -> Float:
         """(N, 3) points in the camera frame, z > 0 -> (N, 2) px."""
         p_C = np.asarray(p_C, dtype=np.float64)
@@ -78,7 +69,9 @@ class Camera:
 
     def distort(self, xy_normalised: ArrayLike) -> Float:
         """(N, 2) undistorted points on the z = 1 plane -> (N, 2) px."""
-        return self._distort(np.asarray(xy_normalised, dtype=np.float64)) * self._focal + self._centre
+        from vioframe.geometry.kernels import distorted  # loads numba
+
+        return distorted(*intrinsics_of(self), np.ascontiguousarray(xy_normalised, dtype=np.float64).reshape(-1, 2))
 
     def undistort(self, xy: ArrayLike) -> Float:
         """(N, 2) px -> (N, 2) undistorted points with z = 1, by Newton's method; the inverse of :meth:`distort`.
@@ -87,44 +80,13 @@ class Camera:
         """
         from vioframe.geometry.kernels import undistorted  # loads numba
 
-        return undistorted(*intrinsics_of(self), np.asarray(xy, dtype=np.float64).reshape(-1, 2))
+        return undistorted(*intrinsics_of(self), np.ascontiguousarray(xy, dtype=np.float64).reshape(-1, 2))
 
     def contains(self, xy: ArrayLike, border_px: float = 0.0) -> NDArray[np.bool_]:
         """(N,) whether pixels lie in the image, at least ``border_px`` from its outermost pixel centres."""
         xy = np.asarray(xy, dtype=np.float64).reshape(-1, 2)
         limit = np.array(self.resolution) - 1.0 - border_px
         return np.asarray(((xy >= border_px) & (xy <= limit)).all(axis=1))
-
-    def _distort(self, xy: Float) -> Float:
-        x, y = xy[:, 0], xy[:, 1]
-        r2 = x * x + y * y
-        scale = self._radial(r2)
-        p1, p2 = self._tangential
-        return np.stack(
-            [
-                x * scale + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x),
-                y * scale + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y,
-            ],
-            axis=1,
-        )
-
-    @property
-    def _tangential(self) -> tuple[float, float]:
-        return self.distortion[2:] if self.distortion_model == "radtan" else (0.0, 0.0)
-
-    def _radial(self, r2: Float) -> Float:
-        """How far out a point is moved, as a factor of its radius r."""
-        k1, k2, k3, k4 = self.distortion
-        if self.distortion_model == "radtan":
-            return 1.0 + r2 * (k1 + k2 * r2)
-        # theta_d / r (Kannala and Brandt 2006).
-        r = np.sqrt(r2)
-        small = r < 1e-6
-        safe = np.where(small, 1.0, r)
-        theta = np.arctan(r)
-        t2 = theta * theta
-        theta_d = theta * (1.0 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4))))
-        return np.where(small, 1.0, theta_d / safe)
 
 
 def intrinsics_of(camera: Camera) -> tuple[int, Float]:

@@ -1,6 +1,6 @@
-"""Compiled scalar twins of :mod:`so3` and :mod:`cameras`, for the hot loops of the back-ends.
+"""Compiled scalar twins of :mod:`so3`, which tests hold equal to it, and the lenses of :mod:`cameras`.
 
-Importing this module loads numba; only back-ends do. Tests hold every function equal to its readable twin.
+Importing this module loads numba.
 """
 
 import math
@@ -207,6 +207,15 @@ def undistort(model: int, k: Float, px: float, py: float, x: float, y: float) ->
         x -= (J[1, 1] * ex - J[0, 1] * ey) / det
         y -= (J[0, 0] * ey - J[1, 0] * ex) / det
     return x, y
+
+
+@kernel
+def distorted(model: int, k: Float, xy_normalised: Float) -> Float:
+    """(N, 2) on the z = 1 plane -> (N, 2) px."""
+    out = np.empty(xy_normalised.shape)
+    for i in range(len(out)):
+        out[i] = distort(model, k, xy_normalised[i, 0], xy_normalised[i, 1])[0]
+    return out
 
 
 @kernel
