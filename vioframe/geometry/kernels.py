@@ -214,16 +214,19 @@ def distorted(model: int, k: Float, xy_normalised: Float) -> Float:
     """(N, 2) on the z = 1 plane -> (N, 2) px."""
     out = np.empty(xy_normalised.shape)
     for i in range(len(out)):
-        out[i] = distort(model, k, xy_normalised[i, 0], xy_normalised[i, 1])[0]
+        px, _ = distort(model, k, xy_normalised[i, 0], xy_normalised[i, 1])
+        out[i, 0], out[i, 1] = px[0], px[1]
     return out
 
 
 @kernel
 def undistorted(model: int, k: Float, xy: Float) -> Float:
     """(N, 2) px -> (N, 2) on the z = 1 plane, by Newton's method; NaN where the model cannot be inverted."""
-    plane = k.copy()  # of a camera that draws on the z = 1 plane itself
-    plane[:4] = 1.0, 1.0, 0.0, 0.0
-    out = np.full(xy.shape, np.nan)
+    plane = np.zeros(8)  # of a camera that draws on the z = 1 plane itself
+    plane[0] = plane[1] = 1.0
+    for i in range(4, 8):
+        plane[i] = k[i]
+    out = np.empty(xy.shape)
     for i in range(len(xy)):
         u, v = (xy[i, 0] - k[2]) / k[0], (xy[i, 1] - k[3]) / k[1]
         x, y = u, v
@@ -241,6 +244,6 @@ def undistorted(model: int, k: Float, xy: Float) -> Float:
             x -= (J[1, 1] * ex - J[0, 1] * ey) / det
             y -= (J[0, 0] * ey - J[1, 0] * ex) / det
         # Past the fold of the distortion the image is mirrored: a solution there is not where the camera looks.
-        if abs(ex) < 1e-6 and abs(ey) < 1e-6 and det > 0.0:
-            out[i, 0], out[i, 1] = x, y
+        solved = abs(ex) < 1e-6 and abs(ey) < 1e-6 and det > 0.0
+        out[i, 0], out[i, 1] = (x, y) if solved else (math.nan, math.nan)
     return out
