@@ -1,10 +1,11 @@
 """The filter as a whole: its window, its events, what it does when it is lost, and that it repeats itself exactly."""
 
+from collections import Counter
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from msckf_helpers import drawn_start, random_covariance, since
+from msckf_helpers import STEREO, drawn_start, random_covariance, since
 
 from vioframe.bench import BackendRun, run_backend
 from vioframe.errors import ConfigError
@@ -17,7 +18,7 @@ from vioframe.simulation import simulated_sequence
 from vioframe.types import Float, FrameTracks, NavState, Status
 from vioframe_msckf.backend import Msckf
 from vioframe_msckf.options import MsckfOptions
-from vioframe_msckf.updates import select_tracks
+from vioframe_msckf.updates import InSight, select_tracks
 
 
 def tracks(t_ns: int, ids: list[int]) -> FrameTracks:
@@ -54,6 +55,41 @@ def test_observations_are_filed_by_track_and_clone():
     assert table.seen.tolist() == [[True], [True]]
     table.drop(np.array([0]))
     assert table.ids.tolist() == [7]
+
+
+def test_what_a_camera_that_takes_its_turn_in_other_frames_saw_last_is_in_sight():
+    def seen(*by_camera: list[int]) -> FrameTracks:
+        frames = [tracks(0, ids) for ids in by_camera]
+        camera = np.repeat(np.arange(len(frames)), [len(frame.ids) for frame in frames])
+        return replace(tracks(0, [i for ids in by_camera for i in ids]), camera=camera)
+
+    sight = InSight(2, frames=2)
+    assert sorted(sight.ids(seen([1, 2], [2, 3]))) == [1, 2, 2, 3]
+    assert sorted(sight.ids(seen([], [3, 4]))) == [1, 2, 3, 4]
+    assert sorted(sight.ids(seen([2, 5], []))) == [2, 3, 4, 5]
+    assert sorted(sight.ids(seen([5], []))) == [3, 4, 5]
+    assert sorted(sight.ids(seen([5], []))) == [5]
+    assert not len(sight.ids(seen([], [])))
+
+
+def test_landmarks_of_cameras_that_take_turns_stay_in_the_state():
+    sequence = simulated_sequence("figure_eight", duration_s=3.0, calibration=STEREO)
+    packets = []
+    for k, (imu, seen) in enumerate(sequence.packets):
+        own = seen.of_camera(k % 2)
+        packets.append((imu, replace(own, ids=2 * own.ids + own.camera)))  # nothing is seen by both
+    lives: Counter[int] = Counter()
+
+    class Counting(Msckf):
+        def process(self, *packet):
+            estimate = super().process(*packet)
+            lives.update(self.state.landmark_ids.tolist())
+            return estimate
+
+    run_backend(
+        since(replace(sequence, packets=tuple(packets)), 1), Counting(), initial_state=drawn_start(sequence, 1, 0)
+    )
+    assert np.median(list(lives.values())) >= 10
 
 
 class Clones:

@@ -15,7 +15,14 @@ from vioframe.stopwatch import Stopwatch
 from vioframe.types import Estimate, FrameTracks, ImuSegment, Start, Status
 from vioframe_msckf.options import MsckfOptions
 from vioframe_msckf.state import FilterState
-from vioframe_msckf.updates import hold_still, promote_tracks, select_tracks, update_from_landmarks, update_from_tracks
+from vioframe_msckf.updates import (
+    InSight,
+    hold_still,
+    promote_tracks,
+    select_tracks,
+    update_from_landmarks,
+    update_from_tracks,
+)
 
 
 class Msckf:
@@ -39,7 +46,7 @@ class Msckf:
         )
         self._noise, self._noise_at_rest = start.calibration.calibration.imu, start.noise_at_rest
         cameras = len(start.calibration.calibration.cameras)
-        self._observations = TrackTable(cameras)
+        self._observations, self._in_sight = TrackTable(cameras), InSight(cameras, options.max_clones)
         dof = np.arange(1, 2 * cameras * options.max_clones + 3)
         self._gate = np.concatenate([[0.0], chi2_quantile(options.gate_quantile, dof)])
 
@@ -64,7 +71,7 @@ class Msckf:
         selection = select_tracks(observations, state, options)
         ids, p_WF = update_from_tracks(state, observations, selection.finished, options, self._gate)
         watch.lap("msckf_update")
-        used = update_from_landmarks(state, tracks, options, self._gate)
+        used = update_from_landmarks(state, tracks, self._in_sight.ids(tracks), options, self._gate)
         watch.lap("landmark_update")
         promoted = promote_tracks(state, observations, selection.promoted, options, self._gate)
         watch.lap("delayed_init")

@@ -89,16 +89,40 @@ def update_from_tracks(
     return observations.ids[rows[accepted]], p_WF[accepted]
 
 
-def update_from_landmarks(state: FilterState, tracks: FrameTracks, options: MsckfOptions, gate: Float) -> int:
-    """Update with the landmarks of the state seen in the newest frame; unseen and implausible ones leave the state.
+class InSight:
+    """What the cameras of a rig see, each in the newest frame it has a part in, as :meth:`TrackTable.in_sight` has it.
+
+    One that has no part in a frame, while others do, takes its turn in others; not for longer than ``frames``.
+    """
+
+    def __init__(self, cameras: int, frames: int) -> None:
+        self._newest: list[Int] = [np.empty(0, np.int64)] * cameras
+        self._frames, self._ago = frames, [0] * cameras
+
+    def ids(self, tracks: FrameTracks) -> Int:
+        """(N,) of what is in sight, ``tracks`` being the newest frame."""
+        for c, ago in enumerate(self._ago):
+            own = tracks.ids[tracks.camera == c]
+            self._ago[c] = ago + 1
+            if len(own) or not len(tracks.ids) or ago >= self._frames:
+                self._newest[c], self._ago[c] = own, 0
+        return np.concatenate(self._newest)
+
+
+def update_from_landmarks(
+    state: FilterState, tracks: FrameTracks, in_sight: Int, options: MsckfOptions, gate: Float
+) -> int:
+    """Update with the landmarks of the state seen in the newest frame; implausible ones leave, and all not in sight.
 
     Returns how many were used.
     """
-    state.keep_landmarks(np.isin(state.landmark_ids, tracks.ids))
+    state.keep_landmarks(np.isin(state.landmark_ids, in_sight))
     if not len(state.landmark_ids):
         return 0
     state.slide_landmarks(options.landmark_drift_px)
     landmarks, rows = np.nonzero(state.landmark_ids[:, None] == tracks.ids)
+    if not len(landmarks):
+        return 0
     cameras, newest = tracks.camera[rows], len(state.clones) - 1
     blocks, residual = landmark_blocks(
         state, newest, landmarks, cameras, tracks.xy[rows], options.first_estimate_jacobians
@@ -108,7 +132,8 @@ def update_from_landmarks(state: FilterState, tracks: FrameTracks, options: Msck
     if accepted.any():
         use = np.repeat(accepted, 2)
         state.update_by(HP[use], S[np.ix_(use, use)], residual[use])
-    state.keep_landmarks(np.isin(state.landmark_ids, tracks.ids[rows[accepted]]))
+    implausible = np.setdiff1d(tracks.ids[rows[~accepted]], tracks.ids[rows[accepted]])
+    state.keep_landmarks(~np.isin(state.landmark_ids, implausible))
     return int(accepted.sum())
 
 
