@@ -34,12 +34,3 @@ def shared_data() -> Path:
     if not SHARED_DATA.is_dir():
         pytest.skip("needs the real recordings in ../shared/data, which are not here")
     return SHARED_DATA
-
-
-@pytest.fixture
-def integer_dot_products() -> None:
-    """Skips where the processor lacks instructions for them: on x86 sums of eight-bit products then overflow."""
-    info = Path("/proc/cpuinfo")
-    flags = info.read_text(encoding="utf-8") if info.exists() else "vnni"
-    if not any(flag in flags for flag in ("vnni", "amx_int8", "asimddp")):
-        pytest.skip("int8 is only exact enough with a processor's integer dot products (VNNI), which this one lacks")

@@ -239,7 +239,6 @@ def test_weights_that_ship_conform_and_say_what_they_are(name):
 
 
 @pytest.mark.parametrize("name", weights_file.shipped())
-@pytest.mark.usefixtures("integer_dot_products")
 def test_int8_costs_weights_that_ship_little_repeatability(name, shared_data):
     """At most 0.02, on photographs that none were trained on, as seen under homographies."""
     pytest.importorskip("openvino")

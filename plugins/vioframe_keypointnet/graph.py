@@ -2,8 +2,9 @@
 
 Made by hand, so that it needs no torch. In int8 it stays a graph of floats, quantised and dequantised where values have
 8 bits, which OpenVINO recognises and turns into integer convolutions: outputs of the layers by one range each,
-unsigned, weights by one each channel, signed. LeakyReLU becomes ReLU there: most of what it lets through below zero is
-less than a step.
+unsigned, weights by one each channel, signed and of seven bits: processors without instructions for dot products add
+two products in 16 bits, which larger ones overflow. LeakyReLU becomes ReLU there: most of what it lets through below
+zero is less than a step.
 """
 
 from __future__ import annotations
@@ -32,6 +33,8 @@ _NEUTRAL_GREY = 127.5
 """The grey that the network sees as 0; also what lies around the image."""
 _SCALE = 0.225 / 255.0
 _BATCH_NORM_EPSILON = 1e-5
+_LARGEST_WEIGHT = np.float32(63.0)
+"""In int8; two products with 255 are less than 2^15."""
 
 
 class _Values(NamedTuple):
@@ -149,7 +152,7 @@ def _convolve(layer: _Convolution, x: _Values, ranges: Mapping[str, float]) -> _
     weight, bias = layer.weight, layer.bias[None, :, None, None]
     if x.step is not None and (layer.name in ranges or layer.name in _LAST):
         # Weights have a step for each channel, the bias that of the products.
-        steps = np.maximum(np.abs(weight).max(axis=(1, 2, 3)), np.finfo(np.float32).tiny) / np.float32(127.0)
+        steps = np.maximum(np.abs(weight).max(axis=(1, 2, 3)), np.finfo(np.float32).tiny) / _LARGEST_WEIGHT
         steps = steps[:, None, None, None]
         weight = ops.multiply(ops.convert(ops.constant(np.round(weight / steps).astype(np.int8)), np.float32), steps)
         products = (steps * x.step).reshape(bias.shape)
