@@ -50,7 +50,7 @@ class TestFiles:
     def test_the_stress_suite_is_as_large_as_promised(self):
         stress = suites.read(suites.find("stress"))
         assert [len(levels) for levels in stress.conditions.values()] == [3, 3, 3, 3]
-        assert (len(stress.detectors), len(stress.backends), stress.seeds) == (3, 2, 2)
+        assert (len(stress.detectors), len(stress.backends), stress.seeds) == (3, 4, 2)
 
     def test_a_suite_survives_being_written(self, tmp_path):
         for path in suites.shipped().values():
