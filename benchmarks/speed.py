@@ -1,4 +1,4 @@
-"""Milliseconds a frame of whole runs, on one core and on two, against a yardstick measured in the same minutes.
+"""Milliseconds a frame of whole runs by one camera, on one core and on two, against a yardstick of the same minutes.
 
     python benchmarks/speed.py [--record] [--rounds 5] [--against CHECKOUT]
 
@@ -114,7 +114,7 @@ def _run(data: Path, run: str, checkout: Path | None, cores: int, out: Path) -> 
     """One run of the command line, by the code of ``checkout``."""
     detector, backend = run.split("+")
     command = [sys.executable, "-m", "vioframe", "run", str(data), "--detector", detector, "--backend", backend]
-    command += ["--quiet", "--overwrite", "--out", str(out)]
+    command += ["-o", "cameras=cam0", "--quiet", "--overwrite", "--out", str(out)]
     code = {}
     if checkout is not None:  # its own, though another vioframe may lie in the folder that this was begun in
         code = {"PYTHONPATH": f"{checkout}{os.pathsep}{checkout / 'plugins'}", "PYTHONSAFEPATH": "1"}
