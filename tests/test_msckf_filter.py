@@ -18,7 +18,7 @@ from vioframe.simulation import simulated_sequence
 from vioframe.types import Float, FrameTracks, NavState, Status
 from vioframe_msckf.backend import Msckf
 from vioframe_msckf.options import MsckfOptions
-from vioframe_msckf.updates import InSight, select_tracks
+from vioframe_msckf.updates import Turns, select_tracks
 
 
 def tracks(t_ns: int, ids: list[int]) -> FrameTracks:
@@ -63,13 +63,31 @@ def test_what_a_camera_that_takes_its_turn_in_other_frames_saw_last_is_in_sight(
         camera = np.repeat(np.arange(len(frames)), [len(frame.ids) for frame in frames])
         return replace(tracks(0, [i for ids in by_camera for i in ids]), camera=camera)
 
-    sight = InSight(2, frames=2)
-    assert sorted(sight.ids(seen([1, 2], [2, 3]))) == [1, 2, 2, 3]
-    assert sorted(sight.ids(seen([], [3, 4]))) == [1, 2, 3, 4]
-    assert sorted(sight.ids(seen([2, 5], []))) == [2, 3, 4, 5]
-    assert sorted(sight.ids(seen([5], []))) == [3, 4, 5]
-    assert sorted(sight.ids(seen([5], []))) == [5]
-    assert not len(sight.ids(seen([], [])))
+    turns = Turns(2)
+    expected = [
+        (seen([1, 2], [2, 3]), [1, 2, 2, 3], 1),
+        (seen([], [3, 4]), [1, 2, 3, 4], 2),
+        (seen([2, 5], []), [2, 3, 4, 5], 2),
+        (seen([5], []), [3, 4, 5], 3),
+        (seen([], []), [], 4),
+    ]
+    for tracks_, in_sight, most in expected:
+        turns.add_frame(tracks_)
+        assert sorted(turns.in_sight) == in_sight
+        assert turns.most == most
+    turns.drop_oldest()
+    assert turns.most == 3
+
+
+def test_a_camera_whose_turn_does_not_come_within_a_window_has_none():
+    turns, left, both = Turns(2), tracks(0, [1]), replace(tracks(0, [1, 2]), camera=np.array([0, 1]))
+    turns.add_frame(both)
+    for _ in range(3):
+        turns.add_frame(left)
+        assert sorted(turns.in_sight) == [1, 2]
+    turns.drop_oldest()
+    turns.add_frame(left)
+    assert sorted(turns.in_sight) == [1]
 
 
 def test_landmarks_of_cameras_that_take_turns_stay_in_the_state():
@@ -92,11 +110,11 @@ def test_landmarks_of_cameras_that_take_turns_stay_in_the_state():
     assert np.median(list(lives.values())) >= 10
 
 
-class Clones:
+class Room:
     """All that the selection looks at of a state."""
 
-    def __init__(self, clones: int, landmarks: int) -> None:
-        self.clones, self.landmark_ids = range(clones), range(landmarks)
+    def __init__(self, landmarks: int) -> None:
+        self.landmark_ids = range(landmarks)
 
 
 def test_selection_takes_lost_tracks_first_and_full_ones_as_landmarks_while_there_is_room():
@@ -105,16 +123,16 @@ def test_selection_takes_lost_tracks_first_and_full_ones_as_landmarks_while_ther
     for t_ns, ids in enumerate(([1, 2, 3, 5, 6], [1, 2, 3, 4, 5], [1, 2, 3, 4, 5], [1, 2, 4, 5, 3], [1, 2, 3, 7])):
         table.add_frame(tracks(t_ns, ids))
     options = MsckfOptions(max_clones=5, min_track_length=3, max_slam_features=2, max_features=2)
-    selection = select_tracks(table, Clones(5, landmarks=1), options)
+    selection = select_tracks(table, Room(landmarks=1), options, True)
     assert table.ids.tolist() == [1, 2, 3, 4, 5, 7]
     assert table.ids[selection.promoted].tolist() == [1]
     assert table.ids[selection.finished].tolist() == [5, 4]
 
     more = replace(options, max_features=10)
-    assert table.ids[select_tracks(table, Clones(5, landmarks=1), more).finished].tolist() == [5, 4, 2, 3]
-    assert table.ids[select_tracks(table, Clones(5, landmarks=2), more).promoted].tolist() == []
+    assert table.ids[select_tracks(table, Room(landmarks=1), more, True).finished].tolist() == [5, 4, 2, 3]
+    assert table.ids[select_tracks(table, Room(landmarks=2), more, True).promoted].tolist() == []
     # A window that is not full yet lets go of nothing that can still be seen.
-    assert table.ids[select_tracks(table, Clones(4, landmarks=0), more).finished].tolist() == [5, 4]
+    assert table.ids[select_tracks(table, Room(landmarks=0), more, False).finished].tolist() == [5, 4]
 
 
 @pytest.fixture(scope="module")

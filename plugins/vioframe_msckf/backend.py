@@ -16,7 +16,7 @@ from vioframe.types import Estimate, FrameTracks, ImuSegment, Start, Status
 from vioframe_msckf.options import MsckfOptions
 from vioframe_msckf.state import FilterState
 from vioframe_msckf.updates import (
-    InSight,
+    Turns,
     hold_still,
     promote_tracks,
     select_tracks,
@@ -46,7 +46,7 @@ class Msckf:
         )
         self._noise, self._noise_at_rest = start.calibration.calibration.imu, start.noise_at_rest
         cameras = len(start.calibration.calibration.cameras)
-        self._observations, self._in_sight = TrackTable(cameras), InSight(cameras, options.max_clones)
+        self._observations, self._turns = TrackTable(cameras), Turns(cameras)
         dof = np.arange(1, 2 * cameras * options.max_clones + 3)
         self._gate = np.concatenate([[0.0], chi2_quantile(options.gate_quantile, dof)])
 
@@ -66,20 +66,23 @@ class Msckf:
         state.propagate(imu, noise_over(imu, self._noise_at_rest, self._noise), options.first_estimate_jacobians)
         state.augment_clone(imu.gyro_B[-1] - state.bias_gyro_B)
         observations.add_frame(tracks.only(~np.isin(tracks.ids, state.landmark_ids)))
+        self._turns.add_frame(tracks)
+        full = self._turns.most >= options.max_clones
         watch.lap("propagate")
 
-        selection = select_tracks(observations, state, options)
+        selection = select_tracks(observations, state, options, full)
         ids, p_WF = update_from_tracks(state, observations, selection.finished, options, self._gate)
         watch.lap("msckf_update")
-        used = update_from_landmarks(state, tracks, self._in_sight.ids(tracks), options, self._gate)
+        used = update_from_landmarks(state, tracks, self._turns.in_sight, options, self._gate)
         watch.lap("landmark_update")
         promoted = promote_tracks(state, observations, selection.promoted, options, self._gate)
         watch.lap("delayed_init")
 
         observations.drop(np.concatenate([selection.finished, promoted]))
-        if len(state.clones) >= options.max_clones:
+        if full:
             state.drop_oldest_clone()
             observations.drop_frame(0)
+            self._turns.drop_oldest()
         watch.lap("marginalise")
 
         return Estimate(

@@ -11,7 +11,7 @@ class MsckfOptions:
     """Defaults follow the published settings of OpenVINS for EuRoC where they name one."""
 
     max_clones: Annotated[int, Field(ge=3)] = 11
-    """Past poses kept in the state."""
+    """Past poses kept in the state, of each camera where they take turns."""
     max_features: PositiveInt = 40
     """Features used at most in one update; the longest tracks go first."""
     min_track_length: Annotated[int, Field(ge=2)] = 4

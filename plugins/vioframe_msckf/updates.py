@@ -47,14 +47,14 @@ def hold_still(state: FilterState, imu: ImuSegment, noise: ImuNoise, first_estim
     return True
 
 
-def select_tracks(observations: TrackTable, state: FilterState, options: MsckfOptions) -> Selection:
+def select_tracks(observations: TrackTable, state: FilterState, options: MsckfOptions, full_window: bool) -> Selection:
     """Tracks that were lost or reach back to the oldest clone of a full window, the longest first.
 
     Lost tracks too short to be used are dropped from the table. Full tracks fill the free landmark slots first.
     """
     lengths = observations.lengths()
     lost = ~observations.in_sight()
-    full = observations.reach_back() & ~lost & (len(state.clones) >= options.max_clones)
+    full = observations.reach_back() & ~lost & full_window
     too_short = lost & (lengths < options.min_track_length)
     if too_short.any():
         observations.drop(np.flatnonzero(too_short))
@@ -89,24 +89,38 @@ def update_from_tracks(
     return observations.ids[rows[accepted]], p_WF[accepted]
 
 
-class InSight:
-    """What the cameras of a rig see, each in the newest frame it has a part in, as :meth:`TrackTable.in_sight` has it.
+class Turns:
+    """Which of a rig's cameras have a part in each of the frames of the window, and what each sees in its newest.
 
-    One that has no part in a frame, while others do, takes its turn in others; not for longer than ``frames``.
+    One that sees nothing, while others do, takes its turn in other frames, as :meth:`TrackTable.in_sight` has it.
     """
 
-    def __init__(self, cameras: int, frames: int) -> None:
+    def __init__(self, cameras: int) -> None:
         self._newest: list[Int] = [np.empty(0, np.int64)] * cameras
-        self._frames, self._ago = frames, [0] * cameras
+        self._taken = np.empty((0, cameras), dtype=bool)
 
-    def ids(self, tracks: FrameTracks) -> Int:
-        """(N,) of what is in sight, ``tracks`` being the newest frame."""
-        for c, ago in enumerate(self._ago):
-            own = tracks.ids[tracks.camera == c]
-            self._ago[c] = ago + 1
-            if len(own) or not len(tracks.ids) or ago >= self._frames:
-                self._newest[c], self._ago[c] = own, 0
+    def add_frame(self, tracks: FrameTracks) -> None:
+        """Append a frame."""
+        cameras = np.arange(len(self._newest))
+        taking = np.isin(cameras, tracks.camera) if len(tracks.ids) else np.ones(len(cameras), bool)
+        self._taken = np.vstack([self._taken, taking])
+        # Whose turn does not come within a window has none.
+        for c in np.flatnonzero(taking | ~self._taken.any(axis=0)):
+            self._newest[c] = tracks.ids[tracks.camera == c]
+
+    def drop_oldest(self) -> None:
+        """Forget the oldest frame."""
+        self._taken = self._taken[1:]
+
+    @property
+    def in_sight(self) -> Int:
+        """(N,) ids of what is in sight."""
         return np.concatenate(self._newest)
+
+    @property
+    def most(self) -> int:
+        """Frames that one camera has a part in, the one that has in most."""
+        return int(self._taken.sum(axis=0).max(initial=0))
 
 
 def update_from_landmarks(
