@@ -54,6 +54,11 @@ class Odometry:
         var_yaw[broken] = _LOST_YAW**2
         return cls(p, var_p, var_yaw)
 
+    def at(self, which: Int) -> Odometry:
+        """The keyframes ``which`` (M,), in their order: a walk of fewer and longer steps."""
+        var_p, var_yaw = (np.diff(np.cumsum(var)[which], prepend=0.0) for var in (self.var_p, self.var_yaw))
+        return Odometry(self.p[which], var_p, var_yaw)
+
     def edges(self) -> Edges:
         """Edges from every keyframe to the four before it.
 
