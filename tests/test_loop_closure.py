@@ -306,6 +306,10 @@ def test_a_run_writes_its_loops(tmp_path):
     with (out / "loops.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert sum(int(row["accepted"]) for row in rows) == summary["loop_closure"]["loops"]
+    with (out / "loop_corrections.csv").open() as file:
+        corrections = list(csv.DictReader(file))
+    assert corrections[0] == {**dict.fromkeys(corrections[0], "0"), "t_ns": str(summary["first_frame_t_ns"])}
+    assert len(corrections) > 1, "no loop was believed while flying"
     assert "min_gap_s: 5.0" in (out / "config.yaml").read_text()
     again = CliRunner().invoke(main, ["evaluate", str(out), "--format", "csv"])
     assert "run with loop closure" in again.output
