@@ -25,6 +25,7 @@ from vioframe.testing import check_loop_closer
 from vioframe.types import CalibrationEstimate, CameraSigma, Estimate, FrameSet, FrameTracks, NavState, Status, Step
 from vioframe_pose_graph import vioframe_loop_closers
 from vioframe_pose_graph.closer import PoseGraph
+from vioframe_pose_graph.consistency import agreed, measured
 from vioframe_pose_graph.keyframes import KeyframeSelector
 from vioframe_pose_graph.matching import DescriptorIndex, distance, match
 from vioframe_pose_graph.place import image_angle_deg
@@ -242,6 +243,17 @@ def test_the_correction_does_not_depend_on_time(revisit, monkeypatch):
     for first, second in zip(at_once, corrections_of(revisit), strict=True):
         assert np.array_equal(first.R_MW, second.R_MW)
         assert np.array_equal(first.p_MW, second.p_MW)
+
+
+def test_what_is_settled_while_flying_is_what_asking_again_would_say(revisit):
+    closer = PoseGraph(CALIBRATION)
+    for step in revisit.steps:
+        closer.add(step)
+    closer.finish()
+    t_ns, _, odometry = closer._keyframes()
+    sightings = closer._recogniser.sightings[: closer._weighed]
+    assert len(closer._sound) > 5
+    assert closer._sound.tolist() == np.flatnonzero(agreed(measured(sightings), odometry, t_ns)).tolist()
 
 
 def test_a_reset_in_between_is_joined_by_loops(revisit):

@@ -6,6 +6,7 @@ Qin, Li, Shen, "VINS-Mono" (T-RO 2018), sections VII and VIII, with other means 
 from __future__ import annotations
 
 from array import array
+from bisect import bisect_left
 from collections import deque
 from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -17,7 +18,7 @@ from vioframe.geometry.so3 import rotation_z, yaw_of
 from vioframe.geometry.trajectory import Trajectory
 from vioframe.stopwatch import working_s
 from vioframe.types import NS_PER_S, Calibration, Float, Int, Loop, LoopClosure, MapCorrection, Status, Step
-from vioframe_pose_graph.consistency import Odometry, agreed, measured, within_drift
+from vioframe_pose_graph.consistency import REPEAT_NS, Odometry, agreed, measured, within_drift
 from vioframe_pose_graph.graph import solve_robustly, wrapped
 from vioframe_pose_graph.keyframes import Keyframe, KeyframeSelector
 from vioframe_pose_graph.matching import DescriptorIndex, match
@@ -47,6 +48,7 @@ class PoseGraph:
         self._correction = MapCorrection()
         # The thread's own: what it has solved, for how many sightings and until when, and how long it took.
         self._newest, self._weighed, self._solved_ns, self._solving_s = self._correction, 0, 0, 0.0
+        self._sound = np.empty(0, np.int64)
         # Of every tracked frame: an hour of them takes 10 MB like this.
         self._t_ns, self._segments = array("q"), array("q")
         self._R_WB, self._p_WB = array("d"), array("d")
@@ -91,9 +93,16 @@ class PoseGraph:
     def _corrected_newest(self) -> MapCorrection:
         """How the newest keyframe moves in a graph of those that the loops so far, or some of them, tie together."""
         t_ns, _, odometry = self._keyframes()
-        said = measured(self._recogniser.sightings)
-        sound = np.flatnonzero(agreed(said, odometry, t_ns))
-        loops = said.select(sound[np.linspace(0, len(sound) - 1, min(len(sound), _MOST_LOOPS)).astype(int)])
+        sightings = self._recogniser.sightings
+        # Whether others agree with a sighting is settled after a while, and not asked again.
+        asked, open_ = (
+            bisect_left(sightings, self._solved_ns - ago_ns, key=lambda s: t_ns[s.later])
+            for ago_ns in (2 * REPEAT_NS, REPEAT_NS)
+        )
+        sound = asked + np.flatnonzero(agreed(measured(sightings[asked:]), odometry, t_ns))
+        self._sound = np.concatenate([self._sound[self._sound < open_], sound[sound >= open_]])
+        spread = np.linspace(0, len(self._sound) - 1, min(len(self._sound), _MOST_LOOPS)).astype(int)
+        loops = measured([sightings[k] for k in self._sound[spread].tolist()])
         likely = within_drift(loops, odometry)
         nodes = np.concatenate([[0], loops.i, loops.j, [len(t_ns) - 1]])
         nodes, number = np.unique(nodes, return_inverse=True)
