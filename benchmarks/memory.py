@@ -21,10 +21,8 @@ from common import present
 
 from vioframe.bench import Row
 from vioframe.incidents import Incidents
-from vioframe.interfaces import LoopCloser
 from vioframe.io.calibration import packaged_calibration
 from vioframe.odometry import Odometry, limited_threads
-from vioframe.parts import registry
 from vioframe.runs.recorder import Recorder
 from vioframe.simulation import TrackOptions, simulated_stream
 from vioframe.types import FrameTracks, ImuSample
@@ -64,10 +62,7 @@ def _rows(cases: list[tuple[str, str | None]], minutes: float) -> Iterator[Row]:
 def fly(backend: str, loop_closer: str | None, minutes: float) -> Row:
     """A row of the table; memory is what the process has in use, not its peak."""
     calibration = packaged_calibration("euroc", cameras=["cam0"])
-    odometry = Odometry(calibration, backend=backend)
-    closer = None
-    if loop_closer is not None:
-        closer = registry.load().create_loop_closer(loop_closer, calibration)
+    odometry = Odometry(calibration, backend=backend, loop_closer=loop_closer)
     stream = simulated_stream(
         "figure_eight", options=TrackOptions(max_points=POINTS), duration_s=60.0 * minutes, frame_rate_hz=FRAME_RATE_HZ
     )
@@ -77,12 +72,11 @@ def fly(backend: str, loop_closer: str | None, minutes: float) -> Row:
     with TemporaryDirectory() as folder, limited_threads():
         with Recorder(Path(folder), {}, Incidents(), begin_s) as recorder:
             for item in stream:
-                steps = odometry.add(item) if isinstance(item, ImuSample) else _add(odometry, item, closer)
+                pictured = loop_closer is not None
+                steps = odometry.add(item) if isinstance(item, ImuSample) else _add(odometry, item, pictured)
                 for step in steps:
                     frames += 1
                     recorder.add(step)
-                    if closer is not None:
-                        closer.add(step)
                     if frames == round(60.0 * FRAME_RATE_HZ):
                         first_minute = process.memory_info().rss
             grown = process.memory_info().rss - first_minute
@@ -100,9 +94,9 @@ def fly(backend: str, loop_closer: str | None, minutes: float) -> Row:
     }
 
 
-def _add(odometry: Odometry, tracks: FrameTracks, closer: LoopCloser | None) -> list:
+def _add(odometry: Odometry, tracks: FrameTracks, pictured: bool) -> list:
     """The landmarks of a frame, with a picture of noise where somebody looks at it."""
-    if closer is None:
+    if not pictured:
         return odometry.add_tracks(tracks)
     width, height = odometry.calibration.cameras[0].model.resolution
     rng = np.random.default_rng(tracks.t_ns)

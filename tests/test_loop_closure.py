@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 from dataclasses import replace
+from time import sleep
 
 import numpy as np
 import pytest
@@ -24,9 +25,11 @@ from vioframe.testing import check_loop_closer
 from vioframe.types import CalibrationEstimate, CameraSigma, Estimate, FrameSet, FrameTracks, NavState, Status, Step
 from vioframe_pose_graph import vioframe_loop_closers
 from vioframe_pose_graph.closer import PoseGraph
+from vioframe_pose_graph.consistency import agreed, measured
 from vioframe_pose_graph.keyframes import KeyframeSelector
 from vioframe_pose_graph.matching import DescriptorIndex, distance, match
 from vioframe_pose_graph.place import image_angle_deg
+from vioframe_pose_graph.recognition import Recogniser
 from vioframe_pose_graph.verification import Correspondences, hypotheses, ransac, residuals
 
 FOCAL_PX = CAMERA.model.focal_px
@@ -162,6 +165,16 @@ def closure_of(flown, steps=None):
     return closer.finish()
 
 
+def corrections_of(flown):
+    """What is known with each step of where the map has it."""
+    closer = PoseGraph(CALIBRATION)
+    return [closer.add(step) for step in flown.steps]
+
+
+def is_identity(correction):
+    return np.array_equal(correction.R_MW, np.eye(3)) and not correction.p_MW.any()
+
+
 def there_and_back(frames=22):
     """12 m ahead and back again, the camera ahead all the time: every place is seen twice."""
     x = np.concatenate([np.linspace(0.0, 12.0, frames), np.linspace(11.8, 0.2, frames)])
@@ -200,6 +213,49 @@ def test_the_result_does_not_depend_on_time(revisit):
     assert [loop.earlier_t_ns for loop in first.loops] == [loop.earlier_t_ns for loop in second.loops]
 
 
+def test_the_drift_is_taken_out_while_flying(revisit):
+    """Once places are seen again, at the earliest 10 s after, the newest pose is put by them.
+
+    It is put no better than the odometry had that place when it saw it first: the farther back, the better.
+    """
+    corrections, truth, odometry = corrections_of(revisit), revisit.truth, revisit.odometry
+    corrected = np.array([not is_identity(correction) for correction in corrections])
+    first = int(np.argmax(corrected))
+    assert corrected[first:].all()
+    assert 10.0 < (truth.t_ns[first] - truth.t_ns[0]) * 1e-9 < 30.0
+    for k in range(first, len(truth)):
+        R_MW, p_MW = corrections[k].R_MW, corrections[k].p_MW
+        R_MB, p_MB = R_MW @ odometry.R_WB[k], R_MW @ odometry.p_WB[k] + p_MW
+        assert np.linalg.norm(p_MB - truth.p_WB[k]) < 0.75 * np.linalg.norm(odometry.p_WB[k] - truth.p_WB[k])
+        assert np.linalg.norm(so3.log(truth.R_WB[k].T @ R_MB)) < np.radians(0.7)
+    assert np.linalg.norm(odometry.p_WB[-1] - truth.p_WB[-1]) > 0.6
+    assert np.linalg.norm(p_MB - truth.p_WB[-1]) < 0.15
+
+
+def test_the_correction_does_not_depend_on_time(revisit, monkeypatch):
+    at_once, add = corrections_of(revisit), Recogniser.add
+
+    def slowly(self, keyframe):
+        sleep(0.05)
+        add(self, keyframe)
+
+    monkeypatch.setattr(Recogniser, "add", slowly)
+    for first, second in zip(at_once, corrections_of(revisit), strict=True):
+        assert np.array_equal(first.R_MW, second.R_MW)
+        assert np.array_equal(first.p_MW, second.p_MW)
+
+
+def test_what_is_settled_while_flying_is_what_asking_again_would_say(revisit):
+    closer = PoseGraph(CALIBRATION)
+    for step in revisit.steps:
+        closer.add(step)
+    closer.finish()
+    t_ns, _, odometry = closer._keyframes()
+    sightings = closer._recogniser.sightings[: closer._weighed]
+    assert len(closer._sound) > 5
+    assert closer._sound.tolist() == np.flatnonzero(agreed(measured(sightings), odometry, t_ns)).tolist()
+
+
 def test_a_reset_in_between_is_joined_by_loops(revisit):
     """After a reset the odometry goes on 3 m beside where it was, turned by 20 degrees."""
     R, shift = rotation_z(np.radians(20.0)), np.array([3.0, -1.0, 0.4])
@@ -226,6 +282,7 @@ def test_one_texture_all_over_closes_no_loop():
     assert closure.loops, "no place resembled another: the world is too easy"
     assert not any(loop.accepted for loop in closure.loops)
     np.testing.assert_allclose(closure.trajectory.p_WB, flown.odometry.p_WB, atol=1e-9)
+    assert all(is_identity(correction) for correction in corrections_of(flown))
 
 
 @pytest.mark.slow
@@ -261,6 +318,10 @@ def test_a_run_writes_its_loops(tmp_path):
     with (out / "loops.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert sum(int(row["accepted"]) for row in rows) == summary["loop_closure"]["loops"]
+    with (out / "loop_corrections.csv").open() as file:
+        corrections = list(csv.DictReader(file))
+    assert corrections[0] == {**dict.fromkeys(corrections[0], "0"), "t_ns": str(summary["first_frame_t_ns"])}
+    assert len(corrections) > 1, "no loop was believed while flying"
     assert "min_gap_s: 5.0" in (out / "config.yaml").read_text()
     again = CliRunner().invoke(main, ["evaluate", str(out), "--format", "csv"])
     assert "run with loop closure" in again.output

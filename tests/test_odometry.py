@@ -43,6 +43,8 @@ from vioframe.types import (
     ImuSample,
     ImuSegment,
     Keypoints,
+    LoopClosure,
+    MapCorrection,
     Measurement,
     Status,
     Step,
@@ -263,6 +265,68 @@ def test_threads_are_few_while_it_runs_and_as_before_afterwards():
         assert set(blas()) == {1}
         assert cv2.getNumThreads() <= 4
     assert (blas(), cv2.getNumThreads()) == (before, opencv)
+
+
+# With a loop closer.
+
+
+class Turning:
+    """The map turns by a degree a frame, and moves by a metre."""
+
+    def __init__(self) -> None:
+        self.t_ns: list[int] = []
+
+    def add(self, step: Step) -> MapCorrection:
+        self.t_ns.append(step.frames.t_ns)
+        return MapCorrection(so3.rotation_z(np.radians(len(self.t_ns))), np.array([0.0, 0.0, len(self.t_ns)]))
+
+    def finish(self) -> LoopClosure:
+        return LoopClosure(None, np.array(self.t_ns))
+
+
+@pytest.mark.parametrize("pipelined", [False, True])
+def test_steps_carry_the_correction_so_far_and_the_estimate_is_the_same(pipelined):
+    with_it, without = (Odometry(CALIBRATION, loop_closer=c, installed=INSTALLED) for c in (Turning(), None))
+    steps = list(pipeline.run(in_memory(short_flight()), with_it, pipelined=pipelined))
+    assert [step.correction.p_MW[2] for step in steps] == list(range(1, len(steps) + 1))
+    assert all(step.stage_seconds["loop_closure"] >= 0.0 for step in steps)
+    assert with_it.close_loops().keyframe_t_ns.tolist() == [step.frames.t_ns for step in steps]
+    alone = list(pipeline.run(in_memory(short_flight()), without))
+    assert all_bytes(alone) == all_bytes(steps)
+    assert all(step.correction is None and "loop_closure" not in step.stage_seconds for step in alone)
+    assert without.close_loops() is None
+
+
+def test_a_loop_closer_that_corrects_at_the_end_only_needs_no_more_than_before():
+    class AtTheEnd(Turning):
+        def add(self, step: Step) -> None:
+            super().add(step)
+
+    odometry = Odometry(CALIBRATION, loop_closer=AtTheEnd(), installed=INSTALLED)
+    steps = [step for item in tracked_flight(2.0) for step in add(odometry, item)] + odometry.finish()
+    assert len(steps) > 10
+    assert all(step.correction is None for step in steps)
+    assert odometry.close_loops().keyframe_t_ns.tolist() == [step.frames.t_ns for step in steps]
+
+
+@pytest.mark.parametrize(
+    ("returned", "says"),
+    [
+        (np.eye(4), "it returned a ndarray, not a MapCorrection"),
+        (MapCorrection(p_MW=np.zeros(2)), r"p_MW has the shape \(2,\), expected \(3,\)"),
+        (MapCorrection(p_MW=np.full(3, np.nan)), "p_MW is not finite"),
+        (MapCorrection(so3.exp(np.array([0.1, 0.0, 0.0]))), "R_MW is not a rotation about z"),
+        (MapCorrection(np.diag([-1.0, 1.0, 1.0])), "R_MW is not a rotation about z"),
+    ],
+)
+def test_a_correction_that_cannot_be_is_refused_by_name(returned, says):
+    class Wrong(Turning):
+        def add(self, step: Step) -> MapCorrection:
+            return returned
+
+    odometry = Odometry(CALIBRATION, loop_closer=Wrong(), installed=INSTALLED)
+    with pytest.raises(PluginError, match=f"the loop closer Wrong at [0-9]+ ns: {says}; repair the plug-in"):
+        [step for item in tracked_flight(2.0) for step in add(odometry, item)]
 
 
 # What does not fit.

@@ -246,6 +246,20 @@ def test_the_covariance_of_the_odometry_is_that_of_a_simulated_one():
     np.testing.assert_allclose(measured / scale, expected / scale, atol=0.05)
 
 
+def test_fewer_keyframes_drift_as_far():
+    t_ns, p, _ = circle(laps=1)
+    segment = (np.arange(len(p)) >= 20).astype(int)
+    graph, which = Odometry.of(t_ns, p, segment, OPTIONS), np.array([0, 3, 11, 12, 25, 40])
+    few = graph.at(which)
+    assert np.array_equal(few.p, p[which])
+    i, j = np.triu_indices(len(which))
+    whole, thinned = graph.cov(which[i], which[j]), few.cov(i, j)
+    diagonal = np.arange(4)
+    # A turn between two that are kept counts from the later one.
+    np.testing.assert_allclose(thinned[:, diagonal, diagonal], whole[:, diagonal, diagonal], rtol=0.5, atol=1e-12)
+    np.testing.assert_allclose(thinned[:, [2, 3], [2, 3]], whole[:, [2, 3], [2, 3]], rtol=1e-9, atol=1e-12)
+
+
 def test_a_segment_after_a_reset_is_hardly_tied_to_the_one_before():
     t_ns, p, _ = circle(laps=1)
     segment = (np.arange(len(p)) >= 20).astype(int)

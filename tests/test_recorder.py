@@ -1,6 +1,7 @@
 """The run folder: complete after a run, readable after an interruption, never silently replaced."""
 
 import json
+from dataclasses import replace
 from time import perf_counter
 
 import numpy as np
@@ -29,6 +30,7 @@ from vioframe.types import (
     Estimate,
     FrameSet,
     FrameTracks,
+    MapCorrection,
     NavState,
     Status,
     Step,
@@ -147,6 +149,22 @@ def test_what_is_learned_of_the_rig_is_kept_a_row_a_frame_and_camera_and_at_last
             assert getattr(camera, name) == getattr(expected, name)
         np.testing.assert_array_equal(camera.p_BC, expected.p_BC)
         np.testing.assert_allclose(camera.R_BC, expected.R_BC, atol=1e-15)
+
+
+def test_corrections_are_kept_where_they_change(tmp_path):
+    moved = MapCorrection(so3.rotation_z(0.25), np.array([0.5, -1.0, 2.0]))
+    corrections = [MapCorrection(), MapCorrection(), moved, moved, MapCorrection()]
+    steps = [replace(step(k), correction=correction) for k, correction in enumerate(corrections)]
+    record(tmp_path / "run", steps)
+    lines = (tmp_path / "run" / "loop_corrections.csv").read_text().splitlines()
+    assert lines == [
+        "t_ns,x_m,y_m,z_m,yaw_rad",
+        f"{FIRST_NS},0,0,0,0",
+        f"{FIRST_NS + 2 * PERIOD_NS},0.5,-1,2,0.25",
+        f"{FIRST_NS + 4 * PERIOD_NS},0,0,0,0",
+    ]
+    record(tmp_path / "without", [step(k) for k in range(3)])
+    assert not (tmp_path / "without" / "loop_corrections.csv").exists()
 
 
 def test_events_are_counted_and_only_the_first_of_a_kind_and_its_last_are_kept(tmp_path):

@@ -15,6 +15,7 @@ from vioframe.types import (
     ImuSegment,
     Keypoints,
     LoopClosure,
+    MapCorrection,
     Measurement,
     Mesh,
     Motion,
@@ -63,10 +64,11 @@ class Backend(Protocol):
 class LoopCloser(Protocol):
     """Recognises places and takes out the drift between them; a consumer of the main loop's steps, of any back-end."""
 
-    def add(self, step: Step) -> None:
+    def add(self, step: Step) -> MapCorrection | None:
         """Take in one frame and its estimate, quickly: long work belongs into a thread or process beside the loop.
 
-        The result may depend on the steps only, not on how long anything took.
+        Returns the correction so far, for this frame's pose; None from who corrects at the end only. That and the
+        result may depend on the steps only, not on how long anything took.
         """
         ...
 

@@ -3,8 +3,8 @@
     measurements -> packets -> tracks -> estimate -> files -> report
 
 :class:`Odometry` is the main loop. A recording is pushed through it by :mod:`vioframe.pipeline`, a live camera by
-anybody; a recorder, a progress bar and a loop closer are consumers of the :class:`~vioframe.types.Step` objects it
-gives.
+anybody; a recorder and a progress bar are consumers of the :class:`~vioframe.types.Step` objects it gives. So is a loop
+closer, the first of them: what it knows by then goes along with the step.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any
 
@@ -20,12 +20,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from vioframe.cores import usable_cores
-from vioframe.errors import DatasetError
+from vioframe.errors import DatasetError, PluginError
 from vioframe.estimation.lifecycle import LifeCycle
 from vioframe.estimation.options import EstimationOptions
+from vioframe.estimation.soundness import defect_of_correction
 from vioframe.frontend import Frontend, FrontendOptions
 from vioframe.incidents import Incidents
-from vioframe.interfaces import Backend, Detector
+from vioframe.interfaces import Backend, Detector, LoopCloser
 from vioframe.io.ahead import read_ahead
 from vioframe.io.synchronise import Packet, Synchroniser
 from vioframe.parts import registry
@@ -38,6 +39,7 @@ from vioframe.types import (
     Image,
     ImuSample,
     ImuSegment,
+    LoopClosure,
     Measurement,
     NavState,
     Status,
@@ -68,6 +70,9 @@ class Odometry:
     A frame waits until readings from ``wait_ms`` behind it are there, so that a reading may come that much later than
     its turn. In a stream in order 0 gives the least latency: the first reading at or behind a frame lets it go.
 
+    ``loop_closer``, named or a part likewise, recognises places beside the loop. The estimate is the same with it and
+    without: ``Step.correction`` says where in the map it is, and :meth:`close_loops` corrects the whole flight.
+
     A back-end named is ``warm`` before the first frame: its code is compiled, half a minute once after installation, or
     loaded. A recording, whose frames wait for it, begins sooner without.
 
@@ -82,6 +87,8 @@ class Odometry:
         *,
         detector_options: Mapping[str, Any] | None = None,
         backend_options: Mapping[str, Any] | None = None,
+        loop_closer: str | LoopCloser | None = None,
+        loop_closer_options: Mapping[str, Any] | None = None,
         frontend: FrontendOptions | None = None,
         estimation: EstimationOptions | None = None,
         initial_state: NavState | None = None,
@@ -100,6 +107,11 @@ class Odometry:
             name = str(self._registry.find(registry.BACKEND, backend))
             to_warm = self._registry.create_backend(backend, backend_options) if warm else None
             backend = self._registry.create_backend(backend, backend_options)
+        self._loop_closer_name = f"the loop closer {type(loop_closer).__name__}"
+        if isinstance(loop_closer, str):
+            self._loop_closer_name = str(self._registry.find(registry.LOOP_CLOSER, loop_closer))
+            loop_closer = self._registry.create_loop_closer(loop_closer, calibration, loop_closer_options)
+        self._loop_closer = loop_closer
         self._frontend = Frontend(detector, calibration, frontend or FrontendOptions(), self.incidents)
         self._life = LifeCycle(backend, calibration, estimation, initial_state, name)
         if to_warm is not None:
@@ -151,6 +163,17 @@ class Odometry:
     def finish(self) -> list[Step]:
         """The steps of the frames that still wait for readings: nothing more will come."""
         return [self._step(imu, frames) for imu, frames in self._synchroniser.finish()]
+
+    def close_loops(self) -> LoopClosure | None:
+        """What the loop closer, if any, made of all steps; to be called once, after the last of them."""
+        if self._loop_closer is None:
+            return None
+        with limited_threads(), self._registry.blaming():
+            closure = self._loop_closer.finish()
+        if not isinstance(closure, LoopClosure):
+            what = f"{self._loop_closer_name} returned a {type(closure).__name__}, not a LoopClosure"
+            raise PluginError(f"{what}; repair the plug-in")
+        return closure
 
     def follow(self, measurements: Iterable[Measurement], *, pipelined: bool = False) -> Iterator[Step]:
         """The steps of a whole stream, to its end.
@@ -241,7 +264,18 @@ class Odometry:
             self._retime()
             self._recalibrate()
         within = {f"backend.{stage}": seconds for stage, seconds in estimate.stage_seconds.items()}
-        return Step(seen.frames, seen.tracks, estimate, {**seen.stage_seconds, "backend": backend_s, **within})
+        step = Step(seen.frames, seen.tracks, estimate, {**seen.stage_seconds, "backend": backend_s, **within})
+        return step if self._loop_closer is None else self._corrected(step, self._loop_closer)
+
+    def _corrected(self, step: Step, loop_closer: LoopCloser) -> Step:
+        """The step with what the loop closer knows by it."""
+        with limited_threads(), self._registry.blaming():
+            begin_s = working_s()
+            correction = loop_closer.add(step)
+            seconds = {**step.stage_seconds, "loop_closure": working_s() - begin_s}
+        if (defect := defect_of_correction(correction)) is not None:
+            raise PluginError(f"{self._loop_closer_name} at {step.frames.t_ns} ns: {defect}; repair the plug-in")
+        return replace(step, stage_seconds=seconds, correction=correction)
 
     def _retime(self) -> None:
         """Cut frames from now on as the newest estimate has it."""

@@ -7,17 +7,17 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
 from typing import Any
 
 from vioframe.diagnosis import HOPELESS, Certainty, Diagnosis, Gatherer, diagnose, gather
 from vioframe.diagnosis.stamps import span_s
-from vioframe.errors import DatasetError, PluginError, RunError
+from vioframe.errors import DatasetError, RunError
 from vioframe.geometry.trajectory import Trajectory
 from vioframe.incidents import Incidents
-from vioframe.interfaces import Dataset, LoopCloser
+from vioframe.interfaces import Dataset
 from vioframe.io.calibration import write_calibration
 from vioframe.io.synchronise import played
 from vioframe.io.trajectories import load_trajectory, write_tum
@@ -28,7 +28,7 @@ from vioframe.parts.registry import BACKEND, DATASET, DETECTOR, LOOP_CLOSER, Reg
 from vioframe.runs import machine
 from vioframe.runs.recorder import Recorder, new_run_folder, write_json
 from vioframe.stopwatch import working_s
-from vioframe.types import LoopClosure, Measurement, Step
+from vioframe.types import Measurement, Step
 
 # A run looks at stamps and readings of its first minute, and at every so manieth image of it.
 _LOOK_S, _LOOK_EVERY = 60.0, 10
@@ -67,7 +67,6 @@ class Experiment:
     odometry: Odometry
     ground_truth: Trajectory | None
     gatherer: Gatherer
-    loop_closer: LoopCloser | None = None
     left_aside: tuple[str, ...] = ()
     """Cameras of the rig that are not used."""
 
@@ -80,26 +79,20 @@ class Experiment:
         return self.odometry.incidents
 
     def steps(self, *, pipelined: bool = False) -> Iterator[Step]:
-        """The main loop, the loop closer taking part; what a plug-in raises comes out as an error that names it.
+        """The main loop; what a plug-in raises comes out as an error that names it.
 
         ``pipelined`` as in :meth:`~vioframe.odometry.Odometry.follow`.
         """
         # Around all of it, not each frame alone: a loop closer's own thread works between frames.
         with limited_threads(), self.registry.blaming():
-            for step in run(
+            yield from run(
                 self.dataset,
                 self.odometry,
                 start_s=self.config.start_s,
                 duration_s=self.config.duration_s,
                 listen=self.gatherer.add,
                 pipelined=pipelined,
-            ):
-                if self.loop_closer is None:
-                    yield step
-                    continue
-                begin_s = working_s()
-                self.loop_closer.add(step)
-                yield replace(step, stage_seconds={**step.stage_seconds, "loop_closure": working_s() - begin_s})
+            )
 
     def look_closely(self) -> Diagnosis:
         """Read what was played once more, as `vioframe check` does: what may be the cause where a run came to nothing.
@@ -109,18 +102,6 @@ class Experiment:
         with limited_threads(), self.registry.blaming():
             measurements = played(self.dataset.measurements(), self.config.start_s, self.config.duration_s)
             return diagnose(gather(measurements, self.dataset.calibration))
-
-    def close_loops(self) -> LoopClosure | None:
-        """What the loop closer, if any, made of all steps; to be called once they are through."""
-        if self.loop_closer is None:
-            return None
-        with limited_threads(), self.registry.blaming():
-            closure = self.loop_closer.finish()
-        if not isinstance(closure, LoopClosure):
-            assert self.config.loop_closure is not None
-            part = self.registry.find(LOOP_CLOSER, self.config.loop_closure.name)
-            raise PluginError(f"{part} returned a {type(closure).__name__}, not a LoopClosure; repair the plug-in")
-        return closure
 
 
 def prepare(config: Config, registry: Registry, *, warm: bool = False) -> Experiment:
@@ -133,12 +114,15 @@ def prepare(config: Config, registry: Registry, *, warm: bool = False) -> Experi
         raise DatasetError("no data set given; name a bag or folder, or set dataset.path in the configuration")
     dataset, options, left_aside = _of_usable_cameras(registry, config)
     config = config.model_copy(update={"dataset": config.dataset.model_copy(update={"options": options})})
+    loop_closure = config.loop_closure
     odometry = Odometry(
         dataset.calibration,
         config.detector.name,
         config.backend.name,
         detector_options=config.detector.options,
         backend_options=config.backend.options,
+        loop_closer=None if loop_closure is None else loop_closure.name,
+        loop_closer_options=None if loop_closure is None else loop_closure.options,
         frontend=config.frontend_options,
         estimation=config.estimation_options,
         wait_ms=config.wait_ms,
@@ -152,9 +136,6 @@ def prepare(config: Config, registry: Registry, *, warm: bool = False) -> Experi
         odometry,
         dataset.ground_truth if config.ground_truth is None else load_trajectory(config.ground_truth),
         Gatherer(dataset.calibration, _LOOK_EVERY, _LOOK_S),
-        None
-        if config.loop_closure is None
-        else registry.create_loop_closer(config.loop_closure.name, dataset.calibration, config.loop_closure.options),
         left_aside,
     )
 
@@ -239,7 +220,7 @@ def _write(
             for step in steps:
                 recorder.add(step)
                 on_step(step)
-            if (loop_closure := experiment.close_loops()) is not None:
+            if (loop_closure := experiment.odometry.close_loops()) is not None:
                 recorder.add_loop_closure(loop_closure)
             closely = explain and not recorder.initialised
             found = experiment.look_closely() if closely else diagnose(experiment.gatherer.recording())

@@ -354,16 +354,30 @@ class Estimate:
 
 
 @dataclass(frozen=True, slots=True)
+class MapCorrection:
+    """How the odometry's world W lies in the map M, W as loops have corrected it: ``p_M = R_MW @ p_W + p_MW``.
+
+    ``R_MW`` (3, 3) turns about z alone, as gravity tells roll and pitch; ``p_MW`` (3,) m. It holds for the newest pose:
+    ``R_MB = R_MW @ R_WB``, ``p_MB = R_MW @ p_WB + p_MW``. Until a loop is believed it is the identity.
+    """
+
+    R_MW: Float = field(default_factory=lambda: np.eye(3))
+    p_MW: Float = field(default_factory=lambda: np.zeros(3))
+
+
+@dataclass(frozen=True, slots=True)
 class Step:
     """One turn of the main loop: the images, their tracks, the estimate, and seconds spent by stage.
 
-    A stage named ``a.b`` is a part of ``a``: a back-end's own breakdown is found below ``backend``.
+    A stage named ``a.b`` is a part of ``a``: a back-end's own breakdown is found below ``backend``. ``correction`` is
+    what loop closure knows so far, None without a loop closer that tells it while flying.
     """
 
     frames: FrameSet
     tracks: FrameTracks
     estimate: Estimate
     stage_seconds: Mapping[str, float]
+    correction: MapCorrection | None = None
 
 
 @dataclass(frozen=True, slots=True)

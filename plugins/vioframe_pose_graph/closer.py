@@ -1,4 +1,4 @@
-"""The loop closer as a recipe: pick keyframes, recognise places in a thread of its own, correct at the end.
+"""The loop closer as a recipe: pick keyframes, recognise places in a thread of its own, correct there and at the end.
 
 Qin, Li, Shen, "VINS-Mono" (T-RO 2018), sections VII and VIII, with other means of retrieval and verification.
 """
@@ -6,17 +6,19 @@ Qin, Li, Shen, "VINS-Mono" (T-RO 2018), sections VII and VIII, with other means 
 from __future__ import annotations
 
 from array import array
+from bisect import bisect_left
 from collections import deque
 from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import replace
 
 import numpy as np
 
 from vioframe.geometry.so3 import rotation_z, yaw_of
 from vioframe.geometry.trajectory import Trajectory
 from vioframe.stopwatch import working_s
-from vioframe.types import Calibration, Float, Int, Loop, LoopClosure, Status, Step
-from vioframe_pose_graph.consistency import Odometry, agreed, measured, within_drift
+from vioframe.types import NS_PER_S, Calibration, Float, Int, Loop, LoopClosure, MapCorrection, Status, Step
+from vioframe_pose_graph.consistency import REPEAT_NS, Odometry, agreed, measured, within_drift
 from vioframe_pose_graph.graph import solve_robustly, wrapped
 from vioframe_pose_graph.keyframes import Keyframe, KeyframeSelector
 from vioframe_pose_graph.matching import DescriptorIndex, match
@@ -24,59 +26,112 @@ from vioframe_pose_graph.options import PoseGraphOptions
 from vioframe_pose_graph.place import Place
 from vioframe_pose_graph.recognition import Recogniser, Sighting
 
+# What a keyframe tells counts from so much later on by the stamps: by then the thread is through with it.
+_LATENCY_NS = NS_PER_S
+# The graph of a flight under way is solved no more often than this, and of so many loops at most.
+_SOLVE_EVERY_NS = NS_PER_S
+_MOST_LOOPS = 100
+
 
 class PoseGraph:
-    """Recognition sees the keyframes in their order whatever the clock says, so the result is the same every time."""
+    """Recognition sees the keyframes in their order whatever the clock says, so the result is the same every time.
+
+    So is the correction so far: it is due by the stamps, and waited for where the thread has fallen behind them.
+    """
 
     def __init__(self, calibration: Calibration, options: PoseGraphOptions | None = None) -> None:
         self._options = options or PoseGraphOptions()
         self._selector = KeyframeSelector(calibration, self._options.parallax_px)
         self._recogniser = Recogniser(calibration.cameras[0].model.focal_px, self._options)
         self._worker = ThreadPoolExecutor(1, "loop-closure")
-        self._waiting: deque[Future[None]] = deque()
+        self._waiting: deque[tuple[int, Future[MapCorrection]]] = deque()
+        self._correction = MapCorrection()
+        # The thread's own: what it has solved, for how many sightings and until when, and how long it took.
+        self._newest, self._weighed, self._solved_ns, self._solving_s = self._correction, 0, 0, 0.0
+        self._sound = np.empty(0, np.int64)
         # Of every tracked frame: an hour of them takes 10 MB like this.
         self._t_ns, self._segments = array("q"), array("q")
         self._R_WB, self._p_WB = array("d"), array("d")
 
-    def add(self, step: Step) -> None:
-        """Take in a frame; raises what recognition of an earlier one raised."""
-        self._submit(self._selector.add(step))
+    def add(self, step: Step) -> MapCorrection:
+        """Take in a frame; the correction by the loops found until a second before. Raises what finding them raised."""
+        t_ns = step.frames.t_ns
+        self._submit(self._selector.add(step), t_ns + _LATENCY_NS)
         if step.estimate.status is Status.TRACKING and step.estimate.state is not None:
             state = step.estimate.state
             self._t_ns.append(state.t_ns)
             self._segments.append(self._selector.segment)
             self._R_WB.extend(state.R_WB.ravel())
             self._p_WB.extend(state.p_WB)
-        while self._waiting and self._waiting[0].done():
-            self._waiting.popleft().result()
+        while self._waiting and self._waiting[0][0] <= t_ns:
+            self._correction = self._waiting.popleft()[1].result()
+        return self._correction
 
     def finish(self) -> LoopClosure:
         """Wait for recognition, believe what is consistent, and correct every frame."""
-        self._submit(self._selector.flush())
+        self._submit(self._selector.flush(), 0)
         while self._waiting:
-            self._waiting.popleft().result()
+            self._waiting.popleft()[1].result()
         self._worker.shutdown()
         if not self._t_ns:
             return LoopClosure(None, np.empty(0, np.int64), (), self._recogniser.seconds)
         return self._close()
 
-    def _submit(self, keyframes: list[Keyframe]) -> None:
-        self._waiting.extend(self._worker.submit(self._recogniser.add, keyframe) for keyframe in keyframes)
+    def _submit(self, keyframes: list[Keyframe], due_ns: int) -> None:
+        self._waiting.extend((due_ns, self._worker.submit(self._recognise, keyframe)) for keyframe in keyframes)
+
+    def _recognise(self, keyframe: Keyframe) -> MapCorrection:
+        """In the thread: look for the place of ``keyframe``; the correction by the loops of it and those before."""
+        self._recogniser.add(keyframe)
+        t_ns, sightings = keyframe.state.t_ns, len(self._recogniser.sightings)
+        if sightings > self._weighed and t_ns - self._solved_ns >= _SOLVE_EVERY_NS:
+            begin = working_s()
+            self._newest, self._weighed, self._solved_ns = self._corrected_newest(), sightings, t_ns
+            self._solving_s += working_s() - begin
+        return self._newest
+
+    def _corrected_newest(self) -> MapCorrection:
+        """How the newest keyframe moves in a graph of those that the loops so far, or some of them, tie together."""
+        t_ns, _, odometry = self._keyframes()
+        sightings = self._recogniser.sightings
+        # Whether others agree with a sighting is settled after a while, and not asked again.
+        asked, open_ = (
+            bisect_left(sightings, self._solved_ns - ago_ns, key=lambda s: t_ns[s.later])
+            for ago_ns in (2 * REPEAT_NS, REPEAT_NS)
+        )
+        sound = asked + np.flatnonzero(agreed(measured(sightings[asked:]), odometry, t_ns))
+        self._sound = np.concatenate([self._sound[self._sound < open_], sound[sound >= open_]])
+        spread = np.linspace(0, len(self._sound) - 1, min(len(self._sound), _MOST_LOOPS)).astype(int)
+        loops = measured([sightings[k] for k in self._sound[spread].tolist()])
+        likely = within_drift(loops, odometry)
+        nodes = np.concatenate([[0], loops.i, loops.j, [len(t_ns) - 1]])
+        nodes, number = np.unique(nodes, return_inverse=True)
+        i, j = number[1:-1].reshape(2, -1)
+        few = odometry.at(nodes)
+        p, yaw, _ = solve_robustly(few.p, few.edges(), replace(loops, i=i, j=j), likely)
+        R_MW = rotation_z(yaw[-1])
+        return MapCorrection(R_MW, p[-1] - R_MW @ few.p[-1])
+
+    def _keyframes(self) -> tuple[Int, Int, Odometry]:
+        """The stamps and segments of all keyframes, and where the odometry placed them."""
+        places = self._recogniser.places
+        t_ns = np.array([place.t_ns for place in places])
+        segment = np.array([place.segment for place in places])
+        p = np.array([place.p_WB for place in places])
+        return t_ns, segment, Odometry.of(t_ns, p, segment, self._options)
 
     def _close(self) -> LoopClosure:
         begin = working_s()
         places, sightings = self._recogniser.places, self._recogniser.sightings
-        t_ns = np.array([place.t_ns for place in places])
-        segment = np.array([place.segment for place in places])
-        odometry = Odometry.of(t_ns, np.array([place.p_WB for place in places]), segment, self._options)
-
+        t_ns, segment, odometry = self._keyframes()
         said = measured(sightings)
         sound, likely = agreed(said, odometry, t_ns), within_drift(said, odometry)
         accepted = np.zeros(len(sightings), bool)
         p, yaw, accepted[sound] = solve_robustly(odometry.p, odometry.edges(), said.select(sound), likely[sound])
         trajectory = self._corrected(t_ns, segment, odometry.p, p, yaw)
         loops = tuple(_loop(s, places, good) for s, good in zip(sightings, accepted.tolist(), strict=True))
-        return LoopClosure(trajectory, t_ns, loops, {**self._recogniser.seconds, "solve": working_s() - begin})
+        seconds = {"solve_so_far": self._solving_s, "solve": working_s() - begin}
+        return LoopClosure(trajectory, t_ns, loops, {**self._recogniser.seconds, **seconds})
 
     def _corrected(self, t_ns: Int, segment: Int, key_p: Float, p: Float, yaw: Float) -> Trajectory:
         stamps = np.array(self._t_ns, np.int64)

@@ -26,7 +26,8 @@ _SPAN = 4
 _HOVERING_M_S = 0.1
 # Between two segments nothing is known but that the body cannot have gone far.
 _LOST_SPEED_M_S, _LOST_M, _LOST_YAW = 5.0, 5.0, 1.0
-_REPEAT_NS = 3 * NS_PER_S
+REPEAT_NS = 3 * NS_PER_S
+"""Within which another keyframe must say the same."""
 # Points seen to a pixel place a camera to millimetres; but the points themselves were placed by the odometry, whose
 # scale is off by some per cent.
 _SIGMA_M, _SIGMA_PART, _SIGMA_YAW = 0.02, 0.02, np.radians(0.2)
@@ -53,6 +54,11 @@ class Odometry:
         var_p[broken] = (_LOST_M + _LOST_SPEED_M_S * dt[broken]) ** 2
         var_yaw[broken] = _LOST_YAW**2
         return cls(p, var_p, var_yaw)
+
+    def at(self, which: Int) -> Odometry:
+        """The keyframes ``which`` (M,), in their order: a walk of fewer and longer steps."""
+        var_p, var_yaw = (np.diff(np.cumsum(var)[which], prepend=0.0) for var in (self.var_p, self.var_yaw))
+        return Odometry(self.p[which], var_p, var_yaw)
 
     def edges(self) -> Edges:
         """Edges from every keyframe to the four before it.
@@ -116,7 +122,7 @@ def agreed(loops: Edges, odometry: Odometry, t_ns: Int) -> Bool:
     """(S,) whether another keyframe, soon before or after, says the same as a loop, and its own nothing else."""
     later = loops.j
     # The loops come in the order of their later keyframes.
-    ends = np.searchsorted(t_ns[later], t_ns[later] + _REPEAT_NS, side="right")
+    ends = np.searchsorted(t_ns[later], t_ns[later] + REPEAT_NS, side="right")
     a = np.repeat(np.arange(len(later)), ends - np.arange(len(later)) - 1)
     b = np.concatenate([np.empty(0, np.int64), *(np.arange(k + 1, end) for k, end in enumerate(ends))])
     agree = _disagreement(loops, odometry, a, b) < GATE

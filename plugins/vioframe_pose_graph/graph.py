@@ -59,8 +59,8 @@ class Edges:
     def __len__(self) -> int:
         return len(self.i)
 
-    def select(self, which: Bool) -> Edges:
-        """The edges that ``which`` (E,) marks."""
+    def select(self, which: Bool | Int) -> Edges:
+        """The edges that ``which`` marks (E,) or numbers."""
         return Edges(*(getattr(self, f.name)[which] for f in fields(self)))
 
 

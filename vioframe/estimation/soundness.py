@@ -1,4 +1,4 @@
-"""What any back-end's estimate must be: checked at every frame of a run, and by the conformance kit."""
+"""What a back-end's estimate and a loop closer's correction must be: checked at every frame, and by the kit."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from vioframe.types import CalibrationEstimate, Estimate, NavState, Status
+from vioframe.types import CalibrationEstimate, Estimate, Float, MapCorrection, NavState, Status
 
 _ORTHONORMAL = 1e-9
 _RELATIVE_SYMMETRY = 1e-9
@@ -40,6 +40,24 @@ def defect_of(estimate: object, t_ns: int) -> str | None:
     return _defect_of_state(estimate.state, t_ns)
 
 
+def defect_of_correction(correction: object) -> str | None:
+    """What is wrong with what a loop closer returned for a frame, in one line; None where nothing is."""
+    if correction is None:
+        return None
+    if not isinstance(correction, MapCorrection):
+        return f"it returned a {type(correction).__name__}, not a MapCorrection"
+    for name, shape in (("R_MW", (3, 3)), ("p_MW", (3,))):
+        if (defect := _defect_of_array(name, getattr(correction, name), shape)) is not None:
+            return defect
+    if not _is_rotation(correction.R_MW) or abs(correction.R_MW[2, 2] - 1.0) > _ORTHONORMAL:
+        return "R_MW is not a rotation about z"
+    return None
+
+
+def _is_rotation(R: Float) -> bool:
+    return bool(np.abs(R @ R.T - np.eye(3)).max() <= _ORTHONORMAL and np.linalg.det(R) > 0.0)
+
+
 def _defect_of_state(state: object, t_ns: int) -> str | None:
     if not isinstance(state, NavState):
         return f"its state is a {type(state).__name__}, not a NavState"
@@ -48,8 +66,7 @@ def _defect_of_state(state: object, t_ns: int) -> str | None:
     for name, shape in _SHAPES.items():
         if (defect := _defect_of_array(name, getattr(state, name), shape)) is not None:
             return defect
-    R_WB = state.R_WB
-    if np.abs(R_WB @ R_WB.T - np.eye(3)).max() > _ORTHONORMAL or np.linalg.det(R_WB) < 0.0:
+    if not _is_rotation(state.R_WB):
         return "R_WB is not a rotation"
     return None if state.cov is None else _defect_of_covariance(state.cov)
 

@@ -7,6 +7,7 @@
     timings.csv      seconds, a column a stage                     map.ply          landmarks, written at the end
     calibration.csv  what the back-end has learned of the rig, a row a camera and frame
     calibration/     as it was given, and calibration_learned/ as it was in the end, in EuRoC's format: --calibration
+    loop_corrections.csv            how loops found so far corrected the newest pose, a row where that changed
     trajectory_loop.tum, loops.csv  poses corrected by loop closure, and the loops, where a run has it
 
 Each frame is flushed as it comes, so an interrupted run leaves what it had, with ``finished: false`` in its summary.
@@ -37,7 +38,18 @@ from vioframe.io.calibration import write_calibration
 from vioframe.io.replace import remove_written
 from vioframe.io.trajectories import tum_line, write_tum
 from vioframe.stopwatch import working_s
-from vioframe.types import NS_PER_S, Calibration, CalibrationEstimate, Float, Int, LoopClosure, NavState, Status, Step
+from vioframe.types import (
+    NS_PER_S,
+    Calibration,
+    CalibrationEstimate,
+    Float,
+    Int,
+    LoopClosure,
+    MapCorrection,
+    NavState,
+    Status,
+    Step,
+)
 
 STATE_COLUMNS = (
     "t_ns",
@@ -53,11 +65,13 @@ CALIBRATION_COLUMNS = (
 )
 """Of ``calibration.csv``: the camera by its place in the rig, its pose on the body (R_BC as a quaternion, p_BC m), time
 offset and readout, intrinsics, and their standard deviations (rad, m, s, px); zero is what is not estimated."""
+CORRECTION_COLUMNS = ("t_ns", "x_m", "y_m", "z_m", "yaw_rad")
 LOOP_COLUMNS = ("earlier_t_ns", "later_t_ns", "x_m", "y_m", "z_m", "yaw_rad", "inliers", "accepted")
 RUN_FILES = (
     *("summary.json", "config.yaml", "machine.json", "evaluation.json", "evaluation_loop.json"),
     *("trajectory.tum", "trajectory_loop.tum", "ground_truth.tum", "ground_truth_matched.tum"),
-    *("states.csv", "pose_cov.csv", "calibration.csv", "tracks.csv", "timings.csv", "loops.csv", "map.ply"),
+    *("states.csv", "pose_cov.csv", "calibration.csv", "tracks.csv", "timings.csv", "map.ply"),
+    *("loops.csv", "loop_corrections.csv"),
     *("calibration/*/sensor.yaml", "calibration_learned/*/sensor.yaml"),
 )
 """What a run folder holds; patterns, as are taken out where a run is replaced by another."""
@@ -132,6 +146,7 @@ class Recorder:
         self._begun: tuple[int, int] | None = None
         self._tracking = False
         self._calibration: Calibration | None = None
+        self._correction: MapCorrection | None = None
 
     def __enter__(self) -> Self:
         return self
@@ -186,6 +201,8 @@ class Recorder:
             self._map.update(estimate.landmark_ids, estimate.p_WF)
             if estimate.calibration is not None:
                 self._add_calibration(t_ns, estimate.calibration)
+        if step.correction is not None:
+            self._add_correction(t_ns, step.correction)
         self._tracking = tracking
         self._frames += 1
 
@@ -257,6 +274,14 @@ class Recorder:
             )
             self._append("calibration.csv", f"{t_ns},{place}," + _csv_values(values))
 
+    def _add_correction(self, t_ns: int, correction: MapCorrection) -> None:
+        if self._correction is None:
+            self._append("loop_corrections.csv", ",".join(CORRECTION_COLUMNS) + "\n")
+        elif np.array_equal(_four(correction), _four(self._correction)):
+            return
+        self._correction = correction
+        self._append("loop_corrections.csv", _csv_line(t_ns, _four(correction)))
+
     def _add_timings(self, t_ns: int, stage_seconds: Mapping[str, float]) -> None:
         self._stage_totals.update(stage_seconds)
         self._frame_seconds += sum(seconds for stage, seconds in stage_seconds.items() if "." not in stage)
@@ -307,6 +332,11 @@ class Recorder:
 
     def _write_summary(self) -> None:
         write_json(self.folder / "summary.json", self.summary)
+
+
+def _four(correction: MapCorrection) -> Float:
+    """(4,) its position and yaw."""
+    return np.append(correction.p_MW, so3.yaw_of(correction.R_MW))
 
 
 def write_json(path: Path, tree: Mapping[str, Any]) -> None:

@@ -7,10 +7,11 @@ from typing import Any
 
 import numpy as np
 
+from vioframe.estimation.soundness import defect_of_correction
 from vioframe.interfaces import LoopCloser, LoopCloserFactory
 from vioframe.simulation import TrackSequence, simulated_sequence
 from vioframe.testing.require import fail, freeze, require, same
-from vioframe.types import Estimate, FrameSet, LoopClosure, NavState, Status, Step
+from vioframe.types import Estimate, FrameSet, LoopClosure, MapCorrection, NavState, Status, Step
 
 _DURATION_S = 26.0
 _EVERY, _LOST = 4, range(50, 60)
@@ -21,18 +22,22 @@ def check_loop_closer(factory: LoopCloserFactory, **options: Any) -> None:
     """Check ``factory(calibration, **options)`` against :class:`vioframe.interfaces.LoopCloser`.
 
     That a trajectory without a place seen again comes out as it went in, one pose for each tracked frame, also where
-    tracking was lost in between; that pictures and arrays are left alone; that the same steps give the same result; and
-    that a run without a single pose ends well.
+    tracking was lost in between, and that nothing is corrected while flying; that pictures and arrays are left alone;
+    that the same steps give the same result; and that a run without a single pose ends well.
     """
     sequence = simulated_sequence("figure_eight", duration_s=_DURATION_S, max_points=60)
     steps = _steps(sequence)
-    closure = _run(factory(sequence.calibration, **options), steps)
+    closure, corrections = _run(factory(sequence.calibration, **options), steps)
     _check_closure(closure, steps)
-    again = _run(factory(sequence.calibration, **options), steps)
-    alike = same(replace(closure, stage_seconds={}), replace(again, stage_seconds={}))
+    for correction in filter(None, corrections):
+        require(same(correction, MapCorrection()), "pictures of noise were taken for a place seen again while flying")
+    again, corrections_again = _run(factory(sequence.calibration, **options), steps)
+    alike = same(replace(closure, stage_seconds={}), replace(again, stage_seconds={})) and all(
+        same(*pair) for pair in zip(corrections, corrections_again, strict=True)
+    )
     require(alike, "the same steps gave another result the second time")
     blank = [Step(s.frames, s.tracks, Estimate(Status.INITIALISING), {}) for s in steps[:20]]
-    nothing = _run(factory(sequence.calibration, **options), blank)
+    nothing, _ = _run(factory(sequence.calibration, **options), blank)
     require(
         nothing.trajectory is None and not nothing.loops, "there is a trajectory or a loop where nothing was tracked"
     )
@@ -61,15 +66,16 @@ def _steps(sequence: TrackSequence) -> list[Step]:
     return steps
 
 
-def _run(closer: LoopCloser, steps: list[Step]) -> LoopClosure:
+def _run(closer: LoopCloser, steps: list[Step]) -> tuple[LoopClosure, list[MapCorrection | None]]:
     try:
-        for step in steps:
-            closer.add(step)
+        corrections = [closer.add(step) for step in steps]
         closure = closer.finish()
     except Exception as error:
         fail(f"the loop closer raised {error!r}")
+    for defect in map(defect_of_correction, corrections):
+        require(defect is None, f"add(): {defect}")
     require(isinstance(closure, LoopClosure), f"finish() returned a {type(closure).__name__}, not a LoopClosure")
-    return closure
+    return closure, corrections
 
 
 def _check_closure(closure: LoopClosure, steps: list[Step]) -> None:
