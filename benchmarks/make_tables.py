@@ -12,6 +12,7 @@ import json
 import re
 from collections.abc import Callable, Iterable
 from pathlib import Path
+from statistics import geometric_mean
 
 import pandas as pd
 
@@ -160,8 +161,8 @@ def one_or_two() -> str:
     shown = []
     for (clip, backend), own in rows.groupby(["clip", "backend"]):
         found = dict(iter(own.groupby("cameras")))
-        one, both = found["one"], found["both"]
-        first = float(both["ate_m"][both["world"] == 0].iloc[0])
+        one, both = (found[cameras].set_index("world") for cameras in ("one", "both"))
+        first = float(both["ate_m"][0])
 
         def beside(cameras: str, found: dict[str, pd.DataFrame] = found, first: float = first) -> str:
             ate_m = float(found[cameras]["ate_m"].iloc[0])
@@ -178,9 +179,32 @@ def one_or_two() -> str:
                 "each black for 5 s": beside("both, black in turn"),
                 "right one 20 ms later": beside("both, apart"),
                 "resets": f"{own['resets'].sum()}",
-                "of one's time": f"{both['frame_ms'].mean() / one['frame_ms'].mean():.2f}",
+                "of one's time, median": f"{(both['frame_ms'] / one['frame_ms']).median():.2f}",
             }
         )
+    return markdown(shown) + source(rows)
+
+
+def error_budget() -> str:
+    """What each cause has of the error, by the flights on which it was taken away."""
+    rows = _in_m(recorded("error_budget_*.json"))
+    shown = []
+    for backend, own in _by_backend(rows):
+        flown = own[own["case"] == "as flown"].set_index(["sequence", "world"])["ate_m"]
+        for case, of in own.groupby("case", sort=False):
+            ate = of.set_index(["sequence", "world"])["ate_m"]
+            ratios = (ate / flown).dropna()
+            shown.append(
+                {
+                    "back-end": f"`{backend}`",
+                    "case": str(case),
+                    **{name: _ate(each) for name, each in of.groupby("sequence")},
+                    "of as flown": f"{geometric_mean(ratios):.2f} (n = {len(ratios)})",
+                    "NEES orientation, position (ideal 3)": " ".join(
+                        f"{of[f'nees.{part}'].median():.1f}" for part in ("orientation", "position")
+                    ),
+                }
+            )
     return markdown(shown) + source(rows)
 
 
@@ -444,6 +468,7 @@ FIGURES: dict[str, Callable[[], str]] = {
             landmarks,
             rendered,
             one_or_two,
+            error_budget,
             april,
             frontend,
             whole_runs,

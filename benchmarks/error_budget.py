@@ -1,0 +1,280 @@
+"""Where the error of an estimate comes from: a flight estimated again and again, each time with one cause taken away.
+
+    python benchmarks/error_budget.py [--record] [--flight MH_02_easy] [--world 0] [--duration 60]
+
+A recorded flight is rendered, and its points are followed as in any run. The landmark of a point lies where the ray of
+its first sighting meets the world; so where it truly is in every later image is known, and with it the tracker's error.
+Then the back-end has the same points again:
+
+    as flown          as they were followed, with the IMU that was recorded
+    white noise       where they truly are, with white noise as large as the tracker's error
+    exact points      where they truly are
+    steps closed      along the true path without the steps it has been published with, which no IMU felt
+    smooth path       along a smooth path, which has none of the noise that the true poses were measured with
+    specified IMU     there, with readings as noisy as the calibration says, and biases that wander so
+    exact IMU         there, with readings that are exact
+    known rig         with the calibration, which is exact here, not estimated
+    true start        from the true state at the first frame, where the recording has it
+    as assumed        white noise, specified IMU, known rig and true start at once: what the estimator takes for granted
+
+Everything but what a row names is as flown. Nothing is tuned on the flights of other benchmarks' targets: by default
+this flies MH_02, MH_03 and V1_01.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import click
+import numpy as np
+from common import benchmark, present
+from threadpoolctl import threadpool_limits
+
+from vioframe.arrays import Float, Int
+from vioframe.bench import Row, backend_row, run_backend
+from vioframe.bench.suites.sources import EUROC
+from vioframe.cores import usable_cores
+from vioframe.frontend import Frontend
+from vioframe.geometry.meshes import ray_scene
+from vioframe.geometry.trajectory import Trajectory
+from vioframe.geometry.two_view import rays
+from vioframe.incidents import Incidents
+from vioframe.interfaces import Flight
+from vioframe.io.synchronise import synchronise
+from vioframe.parts import config as configuration
+from vioframe.parts import registry
+from vioframe.parts.config import Config, PartConfig
+from vioframe.parts.registry import Registry
+from vioframe.simulation import TrackSequence
+from vioframe.simulation.config import SimulationConfig, complete
+from vioframe.simulation.flights import fit_flight
+from vioframe.simulation.recording import SimulatedRecording
+from vioframe.simulation.scenario import Scenario, fly, load_euroc
+from vioframe.simulation.tracks import cut_segments
+from vioframe.types import NS_PER_S, Calibration, CameraOnBody, FrameTracks, ImuNoise
+
+FLIGHTS = ("MH_02_easy", "MH_03_medium", "V1_01_easy")
+WORLDS = (0, 1)
+# What is off by more, px, slid onto something else or is no error of following: counted, not made white noise of.
+OUTLIER_PX = 5.0
+# Of a true start: rad, m, m/s, rad/s, m/s^2.
+START_SIGMA = np.repeat([0.002, 0.001, 0.01, 0.001, 0.02], 3)
+KNOWN_RIG = {"calibrate_extrinsics": False, "calibrate_time_offset": False, "calibrate_intrinsics": False}
+COLUMNS = {
+    "sequence": "",
+    "world": "d",
+    "case": "",
+    "ate_mm": ".0f",
+    "of_flown": ".2f",
+    "orientation_deg": ".2f",
+    "scale": ".4f",
+    "nees.orientation": ".1f",
+    "nees.position": ".1f",
+    "completion": ".1%",
+    "resets": "d",
+}
+
+
+@dataclass(frozen=True)
+class Case:
+    """What is otherwise than as flown.
+
+    The points are ``flown``, ``white`` or ``exact``; the path is as ``recorded``, ``closed`` or ``smooth``, and along
+    the smooth one the IMU may be as ``specified`` or ``exact`` instead of ``recorded``.
+    """
+
+    name: str
+    points: str = "flown"
+    path: str = "recorded"
+    imu: str = "recorded"
+    options: Mapping[str, Any] | None = None
+    true_start: bool = False
+
+
+CASES = (
+    Case("as flown"),
+    Case("white noise", points="white"),
+    Case("exact points", points="exact"),
+    Case("steps closed", path="closed"),
+    Case("smooth path", path="smooth"),
+    Case("specified IMU", path="smooth", imu="specified"),
+    Case("exact IMU", path="smooth", imu="exact"),
+    Case("known rig", options=KNOWN_RIG),
+    Case("true start", true_start=True),
+    Case("as assumed", points="white", path="smooth", imu="specified", options=KNOWN_RIG, true_start=True),
+)
+
+
+@dataclass(frozen=True)
+class Followed:
+    """What the tracker made of a flight: a :class:`FrameTracks` a frame, and the landmark of each sighting.
+
+    ``p_WF`` holds (N, 3) m a frame, and ``error_px`` (N, 2) how far off the true place each was seen.
+    """
+
+    tracks: tuple[FrameTracks, ...]
+    p_WF: tuple[Float, ...]
+    error_px: tuple[Float, ...]
+
+    def sigma_px(self) -> tuple[float, float]:
+        """Root mean square along an axis of what is no outlier, and the part of the sightings that are."""
+        error_px = np.concatenate(self.error_px)
+        out = np.linalg.norm(error_px, axis=1) > OUTLIER_PX
+        return float(np.sqrt(np.mean(error_px[~out] ** 2))), float(out.mean())
+
+
+@benchmark
+@click.option("--flight", "flights", multiple=True, default=FLIGHTS, show_default=True)
+@click.option("--world", "worlds", multiple=True, type=int, default=WORLDS, show_default=True)
+@click.option("--duration", "duration_s", default=60.0, show_default=True, help="Seconds flown of each.")
+def main(
+    data: Path,
+    backend: str,
+    assignments: tuple[str, ...],
+    keep: bool,
+    flights: tuple[str, ...],
+    worlds: tuple[int, ...],
+    duration_s: float,
+) -> None:
+    """The error of a back-end on rendered flights, cause by cause."""
+    installed = registry.load()
+    config = configuration.override(Config(backend=PartConfig(name=backend)), installed, assignments)
+
+    def rows() -> Iterator[Row]:
+        for flight in flights:
+            for world in worlds:
+                folder, start_s = data / "euroc_imu_gt" / flight, EUROC[flight].start_s
+                settings = {"recorded": folder, "start_s": start_s, "duration_s": duration_s, "seed": world}
+                simulation = complete(SimulationConfig.model_validate(settings), installed)
+                recording = SimulatedRecording(simulation, installed, usable_cores())
+                followed = follow(recording, config, installed, load_euroc(folder))
+                flown_mm = None
+                for case in CASES:
+                    row = estimated(case, followed, recording.calibration, folder, config, installed, world)
+                    if row is None:
+                        continue
+                    flown_mm = flown_mm or row.get("ate_mm")
+                    click.echo(f"{flight}, world {world}, {case.name}: {row.get('ate_mm', np.nan):.0f} mm", err=True)
+                    yield {**row, "of_flown": row["ate_mm"] / flown_mm if "ate_mm" in row and flown_mm else None}
+
+    about = {"backend": backend, "options": list(assignments), "duration_s": duration_s, "outlier_px": OUTLIER_PX}
+    present("error_budget", f"{backend}: where the error comes from", rows(), COLUMNS, about, keep)
+
+
+def follow(recording: SimulatedRecording, config: Config, installed: Registry, true: Scenario) -> Followed:
+    """Follow points through the images of ``recording``, and find the landmarks behind them."""
+    calibration = recording.calibration
+    detector = installed.create_detector(config.detector.name, config.detector.options)
+    incidents, offset_ns = Incidents(), calibration.cameras[0].time_offset_ns
+    frontend = Frontend(detector, calibration, config.frontend_options, incidents)
+    packets = synchronise(recording.measurements(), incidents=incidents, time_offset_ns=offset_ns)
+    tracks = [frontend.track(imu, frames, calibration) for imu, frames in packets]
+    (camera,), scene = calibration.cameras, ray_scene(recording.world.mesh.corners)
+    poses = zip(*true.motion(np.array([frame.t_ns for frame in tracks]))[:2], strict=True)
+    known: dict[int, Float] = {}
+    kept, landmarks, errors = [], [], []
+    for frame, (R_WB, p_WB) in zip(tracks, poses, strict=True):
+        new = np.array([i not in known for i in frame.ids.tolist()], bool)
+        R_WC, p_WC = R_WB @ camera.R_BC, p_WB + R_WB @ camera.p_BC
+        towards = rays(camera.model.undistort(frame.xy[new])) @ R_WC.T
+        cast = np.hstack([np.broadcast_to(p_WC, towards.shape), towards]).astype(np.float32)
+        distance = scene.cast_rays(cast)["t_hit"].numpy().astype(np.float64)
+        known.update(zip(frame.ids[new].tolist(), p_WC + distance[:, None] * towards, strict=True))
+        p_WF = np.array([known[i] for i in frame.ids.tolist()]).reshape(-1, 3)
+        xy, ahead = pixels(camera, R_WB, p_WB, p_WF)
+        kept.append(frame.only(ahead))
+        landmarks.append(p_WF[ahead])
+        errors.append(frame.xy[ahead] - xy[ahead])
+    return Followed(tuple(kept), tuple(landmarks), tuple(errors))
+
+
+def pixels(camera: CameraOnBody, R_WB: Float, p_WB: Float, p_WF: Float) -> tuple[Float, np.ndarray]:
+    """(N, 2) px at which a body there sees landmarks (N, 3) m, and which lie ahead (N,)."""
+    p_C = ((p_WF - p_WB) @ R_WB - camera.p_BC) @ camera.R_BC
+    ahead = np.isfinite(p_C).all(axis=1) & (p_C[:, 2] > 0.1)
+    return camera.model.project(np.where(ahead[:, None], p_C, [0.0, 0.0, 1.0])), ahead
+
+
+def estimated(
+    case: Case,
+    followed: Followed,
+    calibration: Calibration,
+    folder: Path,
+    config: Config,
+    installed: Registry,
+    seed: int,
+) -> Row | None:
+    """The flight as the ``case`` has it, estimated; None where it begins at a true state that nobody knows."""
+    frames_ns = np.array([frame.t_ns for frame in followed.tracks])
+    sequence = _sequence(case, followed, calibration, folder, frames_ns, seed)
+    start = None
+    if case.true_start:
+        if not sequence.true_states:
+            return None
+        sequence = replace(sequence, packets=sequence.packets[1:])
+        start = replace(sequence.true_states[1], cov=np.diag(START_SIGMA**2))
+    options = {**config.backend.options, **(case.options or {})}
+    backend = installed.create_backend(config.backend.name, options)
+    with threadpool_limits(1):
+        run = run_backend(sequence, backend, config.estimation_options, start)
+    row = backend_row(sequence, run)
+    sigma_px, outliers = followed.sigma_px()
+    about: Row = {"case": case.name, "world": seed, "tracker_px": sigma_px, "outlier_part": outliers}
+    if "ate_m" in row:
+        about["ate_mm"] = 1e3 * row["ate_m"]
+    return {**row, **about}
+
+
+def _sequence(
+    case: Case, followed: Followed, calibration: Calibration, folder: Path, frames_ns: Int, seed: int
+) -> TrackSequence:
+    recorded = load_euroc(folder, remove_jumps=case.path == "closed")
+    R_WB, p_WB, _ = recorded.motion(frames_ns)
+    readings, states = recorded, recorded.states_at(frames_ns)
+    if case.path == "smooth":
+        flight, begin_ns = _smooth(recorded, frames_ns), int(frames_ns[0])
+        motion = flight.at((frames_ns - begin_ns) / NS_PER_S)
+        R_WB, p_WB = motion.R_WB, motion.p_WB
+        if case.imu != "recorded":
+            noise = calibration.imu if case.imu == "specified" else None
+            readings = _flown(flight, frames_ns, noise, calibration.imu.rate_hz, np.random.default_rng([seed, 2]))
+            states = tuple(
+                replace(state, t_ns=t_ns)
+                for state, t_ns in zip(readings.states_at(readings.frames_ns), frames_ns.tolist(), strict=True)
+            )
+            readings = replace(readings, imu_ns=readings.imu_ns - readings.frames_ns[0] + begin_ns)
+    near = (readings.imu_ns >= frames_ns[0] - NS_PER_S) & (readings.imu_ns <= frames_ns[-1] + NS_PER_S)
+    segments = cut_segments(readings.imu_ns[near], readings.gyro_B[near], readings.accel_B[near], frames_ns)
+    rng, (sigma_px, _) = np.random.default_rng([seed, 1]), followed.sigma_px()
+    packets = []
+    frames = zip(segments, R_WB, p_WB, followed.tracks, followed.p_WF, followed.error_px, strict=True)
+    for imu, R, p, tracks, p_WF, error_px in frames:
+        xy, ahead = pixels(calibration.cameras[0], R, p, p_WF)
+        if case.points == "flown":
+            xy = xy + error_px
+        elif case.points == "white":
+            xy = xy + rng.normal(0.0, sigma_px, xy.shape)
+        packets.append((imu, replace(tracks, xy=xy).only(ahead).undistorted(*calibration.lenses).finite()))
+    return TrackSequence(folder.name, calibration, tuple(packets), Trajectory(frames_ns, R_WB, p_WB), states)
+
+
+def _smooth(recorded: Scenario, frames_ns: Int) -> Flight:
+    """A spline along the recorded path, from the first of the frames to the last."""
+    begin_ns = recorded.truth.t_ns[0]
+    return fit_flight(recorded.truth, (frames_ns[0] - begin_ns) / NS_PER_S, (frames_ns[-1] - frames_ns[0]) / NS_PER_S)
+
+
+def _flown(
+    flight: Flight, frames_ns: Int, noise: ImuNoise | None, rate_hz: float, rng: np.random.Generator
+) -> Scenario:
+    """The readings of a body that flies it."""
+    frames_s = (frames_ns - frames_ns[0]) / NS_PER_S
+    imu_s = np.arange(int(frames_s[-1] * rate_hz) + 2) / rate_hz
+    return fly(flight, "", rng, frames_s=frames_s, imu_s=imu_s, imu_rate_hz=rate_hz, noise=noise)
+
+
+if __name__ == "__main__":
+    main()
