@@ -211,7 +211,13 @@ class TestNoise:
         assert noise.gyro_density == 0.5 * EUROC.imu.gyro_density
 
     def test_gaps(self):
+        """A turn of 0.5 rad/s and an acceleration of 2 m/s^2, unseen for 0.1 s, are as white noise turns and moves."""
         rest, flight = EUROC.imu, EUROC.imu.in_flight(4.0)
-        assert noise_over(self.readings(1.0, 0.1), rest, flight).gyro_density > 0.1
+        without, short, across = (noise_over(self.readings(1.0, gap_s), rest, flight) for gap_s in (0.0, 0.02, 0.1))
+        assert short == without
+        assert (across.gyro_density - without.gyro_density) * 0.1**0.5 == pytest.approx(0.5 * 0.1)
+        assert (across.accel_density - without.accel_density) * 0.1**0.5 == pytest.approx(2.0 * 0.1)
+        # From five readings on that are missing in a row.
+        assert noise_over(self.readings(1.0, 0.025), rest, flight).gyro_density > 0.05
         with pytest.raises(DivergedError, match="no inertial readings for"):
             noise_over(self.readings(1.0, 0.6), rest, flight)

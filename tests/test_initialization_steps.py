@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from vioframe.estimation.factors.landmarks import camera_poses, positions
 from vioframe.estimation.factors.problem import Problem, Variables
 from vioframe.estimation.factors.reprojection import Calibrated
 from vioframe.estimation.inertial.preintegration import Preintegrated, preintegrate
-from vioframe.estimation.initialization import static
+from vioframe.estimation.initialization import GIVEN, dynamic, static
 from vioframe.estimation.initialization.bundle_adjustment import adjusted, adjustment, covariance
 from vioframe.estimation.initialization.closed_form import (
     _solve_on_gravity_sphere,
@@ -288,6 +289,25 @@ class TestBundleAdjustment:
         assert low < np.mean(np.square(scales)) < high
 
 
+class TestLookAhead:
+    @pytest.mark.parametrize("off_px", [0.0, 8.0])
+    def test_frames_that_the_estimate_does_not_predict_refuse_it(self, off_px: float):
+        """Those held back, but for the newest, which is estimated with the others."""
+        sequence = simulated_sequence("figure_eight", duration_s=2.5, pixel_sigma=0.3)
+        calibration, packets = sequence.calibration, list(sequence.packets)
+        for k in (-4, -3, -2):
+            imu, tracks = packets[k]
+            moved = replace(tracks, xy=tracks.xy + np.array([off_px, 0.0]))
+            packets[k] = imu, moved.undistorted(calibration.cameras[0].model)
+        known = np.diag(GIVEN.stacked() ** 2)
+        attempt = partial(dynamic.initialise, packets, calibration, known, known, ZERO, found=False)
+        if off_px:
+            with pytest.raises(RefusalError, match="the prediction misses a later frame"):
+                attempt()
+        else:
+            assert attempt().states[-1].t_ns == packets[-1][1].t_ns
+
+
 class TestStatic:
     def test_tilt_and_bias_are_tied_together(self):
         sequence = simulated_sequence("standstill", duration_s=1.0, bias_accel_B=BIAS_ACCEL)
@@ -304,6 +324,13 @@ class TestStatic:
         np.testing.assert_allclose(tilt_sigma, BIAS_ACCEL_SIGMA / GRAVITY_M_S2, rtol=0.02)
         up = estimate.states[-1].R_WB[2]
         assert np.sqrt(up @ cov[DBA, DBA] @ up) < 0.01  # along gravity the bias is seen
+
+    def test_the_bias_is_the_part_along_gravity_that_readings_are_too_long_by(self):
+        sequence = simulated_sequence("standstill", duration_s=1.0, bias_accel_B=BIAS_ACCEL)
+        newest = static.initialise(sequence.packets, sequence.calibration.imu).states[-1]
+        up = newest.R_WB[2]
+        np.testing.assert_allclose(newest.bias_accel_B, up * (up @ BIAS_ACCEL), atol=2e-3)
+        assert abs(up @ BIAS_ACCEL) > 0.04
 
     def test_a_bias_beyond_its_prior_is_refused(self):
         sequence = simulated_sequence("standstill", duration_s=1.0)

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from image_helpers import textured
 
+from vioframe.frontend.flow import follow
 from vioframe.frontend.lucas_kanade import Pyramid, search
 
 LEVELS = 4
@@ -87,6 +88,25 @@ def test_a_patch_without_gradients_in_two_directions_is_not_followed():
         pyramid = Pyramid.of(image, LEVELS, 15)
         _, ok = search(pyramid, pyramid, *2 * (np.float32([[160.0, 120.0], [161.0, 60.0]]),))
         assert not ok.any()
+
+
+def test_what_is_hidden_does_not_find_its_way_back():
+    """Another picture looks like the patch somewhere, and leads elsewhere from there; a plain one leads nowhere."""
+    before = textured(seed=5, size=(480, 240))
+    after = before.copy()
+    after[:, :150] = textured(seed=6, size=(150, 240))
+    after[:, 330:] = 128
+    xy = cv2.goodFeaturesToTrack(before, 400, 0.01, 8.0)[:, 0]
+    pyramids = Pyramid.of(before, LEVELS, 15), Pyramid.of(after, LEVELS, 15)
+    _, forth = search(*pyramids, xy, xy.copy())
+    found, ok = follow(*pyramids, xy.astype(np.float64), xy.astype(np.float64), 0.5)
+    another, same, plain = ((xy[:, 0] > a) & (xy[:, 0] < b) for a, b in ((0, 130), (180, 300), (350, 480)))
+    assert ok[same].all()
+    np.testing.assert_allclose(found[same], xy[same], atol=0.01)
+    assert forth[another].mean() > 0.7
+    assert ok[another].mean() < 0.15
+    assert forth[plain].mean() > 0.6
+    assert not ok[plain].any()
 
 
 def test_what_leaves_the_image_is_lost():

@@ -182,6 +182,19 @@ def test_delayed_initialisation_is_the_joint_update_with_nothing_known_of_the_la
     assert state.landmark_ids.tolist() == [table.ids[row]]
 
 
+def test_delayed_initialisation_is_gated_by_two_rows_a_view_but_for_the_three_of_the_landmark():
+    _, table = seeing_state()
+    views = table.seen.sum(axis=1)
+    for count in (4, 6):
+        for at_dof, elsewhere in ((np.inf, 0.0), (0.0, np.inf)):
+            state, _ = seeing_state()
+            gate = np.full(40, elsewhere)
+            gate[2 * count - 3] = at_dof
+            rows = np.flatnonzero(views == count)[:1]
+            assert promote_tracks(state, table, rows, MsckfOptions(), gate).tolist() == rows.tolist()
+            assert len(state.landmark_ids) == (at_dof > 0.0)
+
+
 def test_an_implausible_track_is_used_up_and_changes_nothing():
     state, table = seeing_state()
     row = np.flatnonzero(table.seen.all(axis=1))[0]

@@ -4,11 +4,11 @@ import copy
 
 import numpy as np
 import pytest
-from msckf_helpers import CALIBRATION, drawn_start, random_state, since
+from msckf_helpers import CALIBRATION, drawn_start, random_covariance, random_state, since
 
 from vioframe.bench import run_backend
 from vioframe.estimation.lifecycle import LifeCycle
-from vioframe.estimation.standstill import StandstillDetector, median_disparity_px
+from vioframe.estimation.standstill import Standstill, StandstillDetector, median_disparity_px
 from vioframe.geometry import so3
 from vioframe.simulation import simulated_sequence
 from vioframe.simulation.flights import ShapedFlight, levelled
@@ -138,6 +138,23 @@ def test_is_held_only_where_the_imu_agrees(v, rate, shake, held):
     else:
         np.testing.assert_array_equal(state.cov, before.cov)
         np.testing.assert_array_equal(state.v_WB, before.v_WB)
+
+
+def test_readings_at_rest_agree_with_standstill_at_the_nominal_rate():
+    """Errors are drawn from the state's covariance, means of readings from their noise: one in twenty is refused."""
+    rng, R_WB = np.random.default_rng(3), so3.exp([0.3, -0.2, 1.0])
+    bias_gyro, bias_accel = np.array([0.01, -0.02, 0.03]), np.array([0.1, 0.05, -0.1])
+    cov = 0.005**2 * random_covariance(rng, IMU)
+    root, sigma = np.linalg.cholesky(cov), Standstill(bias_gyro, bias_accel, 0.05, NOISE).sigma
+    agreed = []
+    for _ in range(4000):
+        d, noise = root @ rng.normal(size=IMU), sigma * rng.normal(size=9)
+        gyro, accel = bias_gyro + noise[:3], -R_WB.T @ g_W + bias_accel + noise[3:6]
+        still, R = Standstill(gyro, accel, 0.05, NOISE), R_WB @ so3.exp(-d[DTHETA])
+        residual = still.residual(R, noise[6:] - d[DV], bias_gyro - d[DBG], bias_accel - d[DBA])
+        agreed.append(still.agrees(residual, still.jacobian(R), cov))
+    # Of a degree of freedom more or less it would be 0.968 or 0.922; 4000 scatter by 0.0034.
+    assert np.mean(agreed) == pytest.approx(0.95, abs=0.012)
 
 
 def test_holding_still_is_the_kalman_update_with_numeric_jacobians():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -95,6 +96,25 @@ def test_turning_and_moving_everything_changes_no_residual():
     R = rotation_z(0.7)
     moved = residuals(p @ R.T + [3.0, -2.0, 1.0], yaw + 0.7, edges)[0]
     np.testing.assert_allclose(moved, residuals(p, yaw, edges)[0], atol=1e-12)
+
+
+def test_whole_turns_change_no_residual():
+    rng = np.random.default_rng(9)
+    edges = random_edges(rng)
+    p, yaw = rng.normal(0.0, 5.0, (6, 3)), rng.uniform(-np.pi, np.pi, 6)
+    expected = residuals(p, yaw, edges)[0]
+    around = yaw + 2.0 * np.pi * np.array([0, 1, -1, 0, 2, -1])
+    np.testing.assert_allclose(residuals(p, around, edges)[0], expected, atol=1e-10)
+    other = replace(edges, turn=edges.turn - 2.0 * np.pi)
+    np.testing.assert_allclose(residuals(p, yaw, other)[0], expected, atol=1e-10)
+
+
+def test_the_graph_goes_the_shorter_way_round_where_yaw_wraps():
+    """Two nodes, measured to be turned by just less than half a turn one way, seem so by just less the other way."""
+    cov = np.eye(4)[None]
+    edge = Edges(np.array([0]), np.array([1]), np.array([[1.0, 0.0, 0.0]]), np.array([np.pi - 0.1]), cov)
+    _, yaw = solve(np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]]), np.array([0.0, -np.pi + 0.1]), edge)
+    np.testing.assert_allclose(yaw, [0.0, -np.pi - 0.1], atol=1e-6)
 
 
 def test_exact_loops_restore_the_truth():

@@ -171,6 +171,39 @@ def test_a_rolling_shutter_is_told_or_not(tmp_path, clear):
     )
 
 
+def seen_at(recording, t_ns) -> np.ndarray:
+    """What the first camera would see, sharp and all rows at once, at instants (N,): (N, H, W), 255 for white."""
+    (on_body,) = recording.true_calibration.cameras
+    renderer = Renderer(on_body.model, recording.world)
+    R_WB, p_WB, _ = recording._scenario.motion(np.asarray(t_ns))
+    poses = zip(R_WB @ on_body.R_BC, R_WB @ on_body.p_BC + p_WB, strict=True)
+    return np.array([np.clip(255.0 * renderer.render(*pose), 0.0, 255.0) for pose in poses])
+
+
+def frame_in_fast_flight(tmp_path, **settings):
+    """A recording of few pixels, and the middle one of its three frames."""
+    recording = small_simulation(tmp_path, divisor=8, duration_s=0.1, flight={"name": "aggressive"}, **settings)
+    frames = [m for m in recording.measurements() if isinstance(m, FrameSet)]
+    return recording, frames[1].t_ns, frames[1].images[0].astype(float)
+
+
+def test_a_stamp_is_the_middle_of_the_exposure(tmp_path):
+    recording, t_ns, blurred = frame_in_fast_flight(tmp_path, conditions={"motion_blur": 1.0})
+    sharp = seen_at(recording, t_ns + 2_500_000 * np.arange(-12, 13))
+    early, in_time, late = (np.abs(sharp[k : k + 17].mean(axis=0) - blurred).mean() for k in (0, 4, 8))
+    assert in_time < 0.3 * min(early, late)
+
+
+@pytest.mark.parametrize("readout_ms", [30.0, -30.0])
+def test_rows_are_exposed_one_after_another_downwards_or_upwards(tmp_path, readout_ms):
+    recording, t_ns, rolled = frame_in_fast_flight(tmp_path, readout_ms=readout_ms)
+    for row in (5, 54):
+        late_ns = round(1e6 * readout_ms * ((row + 0.5) / 60 - 0.5))
+        still = seen_at(recording, [t_ns - late_ns, t_ns, t_ns + late_ns])
+        *wrong, right = np.abs(still[:, row] - rolled[row]).mean(axis=1)
+        assert right < 0.3 * min(wrong)
+
+
 def test_the_imu_is_exact_or_as_wrong_as_asked(tmp_path, clear):
     exact = small_simulation(tmp_path, duration_s=0.5, exact_imu=True)
     assert not exact.ground_truth.values[:, 10:].any()
