@@ -25,6 +25,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -150,7 +151,7 @@ def main(
                 settings = {"recorded": folder, "start_s": start_s, "duration_s": duration_s, "seed": world}
                 simulation = complete(SimulationConfig.model_validate(settings), installed)
                 recording = SimulatedRecording(simulation, installed, usable_cores())
-                followed = follow(recording, config, installed, load_euroc(folder))
+                followed = follow(recording, config, installed, recorded(folder))
                 flown_mm = None
                 for case in CASES:
                     row = estimated(case, followed, recording.calibration, folder, config, installed, world)
@@ -162,6 +163,12 @@ def main(
 
     about = {"backend": backend, "options": list(assignments), "duration_s": duration_s, "outlier_px": OUTLIER_PX}
     present("error_budget", f"{backend}: where the error comes from", rows(), COLUMNS, about, keep)
+
+
+@cache
+def recorded(folder: Path, closed: bool = False) -> Scenario:
+    """Readings and true path; ``closed`` without the steps that no IMU felt."""
+    return load_euroc(folder, remove_jumps=closed)
 
 
 def follow(recording: SimulatedRecording, config: Config, installed: Registry, true: Scenario) -> Followed:
@@ -231,11 +238,11 @@ def estimated(
 def _sequence(
     case: Case, followed: Followed, calibration: Calibration, folder: Path, frames_ns: Int, seed: int
 ) -> TrackSequence:
-    recorded = load_euroc(folder, remove_jumps=case.path == "closed")
-    R_WB, p_WB, _ = recorded.motion(frames_ns)
-    readings, states = recorded, recorded.states_at(frames_ns)
+    readings = recorded(folder, closed=case.path == "closed")
+    R_WB, p_WB, _ = readings.motion(frames_ns)
+    states = readings.states_at(frames_ns)
     if case.path == "smooth":
-        flight, begin_ns = _smooth(recorded, frames_ns), int(frames_ns[0])
+        flight, begin_ns = _smooth(readings, frames_ns), int(frames_ns[0])
         motion = flight.at((frames_ns - begin_ns) / NS_PER_S)
         R_WB, p_WB = motion.R_WB, motion.p_WB
         if case.imu != "recorded":
@@ -261,10 +268,10 @@ def _sequence(
     return TrackSequence(folder.name, calibration, tuple(packets), Trajectory(frames_ns, R_WB, p_WB), states)
 
 
-def _smooth(recorded: Scenario, frames_ns: Int) -> Flight:
+def _smooth(flown: Scenario, frames_ns: Int) -> Flight:
     """A spline along the recorded path, from the first of the frames to the last."""
-    begin_ns = recorded.truth.t_ns[0]
-    return fit_flight(recorded.truth, (frames_ns[0] - begin_ns) / NS_PER_S, (frames_ns[-1] - frames_ns[0]) / NS_PER_S)
+    begin_ns = flown.truth.t_ns[0]
+    return fit_flight(flown.truth, (frames_ns[0] - begin_ns) / NS_PER_S, (frames_ns[-1] - frames_ns[0]) / NS_PER_S)
 
 
 def _flown(
