@@ -107,6 +107,8 @@ def judged(summary: Mapping[str, Any], folder: Path) -> Row:
             "ate_se3_mm": None if errors.ate_se3_m is None else 1e3 * errors.ate_se3_m,
             "scale": errors.scale,
             "drift_mm": 1e3 * float(np.linalg.norm(from_first, axis=1).max()),
+            "nees": {found.part: found.mean for found in errors.nees},
+            "held_95": {found.part: found.held for found in errors.nees},
         }
     return row
 

@@ -38,6 +38,7 @@ def headline() -> str:
         recorded(name) for name in ("euroc_clips_*.json", "real_motion_*.json", "rendered_flights_*.json")
     )
     moving, rendered = (rows[rows["detector"] == "shi_tomasi"] for rows in (moving, rendered))
+    rendered = rendered[rendered["options"] == ""]
     cases = {
         "first 15 s of MH_01_easy, real images": _in_m(moving[moving["clip"] == "MH_01_easy_15s"]),
         f"{_RENDERED} from 5 s, images rendered along it, real IMU": _in_m(rendered[rendered["clip"] == _RENDERED]),
@@ -136,7 +137,7 @@ def landmarks() -> str:
 
 
 def rendered() -> str:
-    """Whole flights with rendered images."""
+    """Whole flights with rendered images: over their worlds."""
     rows = recorded("rendered_flights_*.json")
     shown = [
         {
@@ -148,10 +149,36 @@ def rendered() -> str:
             "completion": f"{100.0 * own['completion'].min():.1f} %",
             "resets": f"{own['resets'].sum()}",
             "ATE": _ate(_in_m(own)),
+            "NEES of orientation, position (ideal 3)": _parts(own, "nees", ".1f"),
+            "within the 95 % ellipsoid": _parts(own, "held_95", ".0%"),
             "ms a frame": f"{own['frame_ms'].mean():.1f}",
         }
-        for (clip, backend, detector), own in rows.groupby(["clip", "backend", "detector"])
+        for (clip, backend, detector), own in rows[rows["options"] == ""].groupby(["clip", "backend", "detector"])
     ]
+    return markdown(shown) + source(rows)
+
+
+def against() -> str:
+    """The same recordings with other options: the ATE as it is over theirs, in pairs."""
+    rows = _in_m(recorded("rendered_flights_*.json"))
+    shown = []
+    for (clip, backend, detector), own in rows.groupby(["clip", "backend", "detector"]):
+        found = {options: of.set_index("world")["ate_m"] for options, of in own.groupby("options")}
+        for options in filter(None, found):
+            ratios = found[""] / found[options]
+            shown.append(
+                {
+                    "flight": clip,
+                    "back-end": f"`{backend}`",
+                    "detector": f"`{detector}`",
+                    "ATE": _spread(found[""]),
+                    "beside": f"`{options}`",
+                    "its ATE": _spread(found[options]),
+                    "ratio of means": f"{found[''].mean() / found[options].mean():.2f}",
+                    "ratio, geometric mean": f"{geometric_mean(ratios):.2f}",
+                    "better": f"{(ratios < 1.0).sum()} of {len(ratios)}",
+                }
+            )
     return markdown(shown) + source(rows)
 
 
@@ -200,11 +227,28 @@ def error_budget() -> str:
                     "case": str(case),
                     **{name: _ate(each) for name, each in of.groupby("sequence")},
                     "of as flown": f"{geometric_mean(ratios):.2f} (n = {len(ratios)})",
-                    "NEES orientation, position (ideal 3)": " ".join(
-                        f"{of[f'nees.{part}'].median():.1f}" for part in ("orientation", "position")
-                    ),
+                    "NEES of orientation, position (ideal 3)": _parts(of, "nees", ".1f"),
                 }
             )
+    return markdown(shown) + source(rows)
+
+
+def take_off() -> str:
+    """After rest: the demo's world, and others."""
+    rows = recorded("take_off.json")
+    shown = []
+    for backend, own in _by_backend(rows):
+        demo, others = own[own["world"] == 0], own[own["world"] != 0]
+        shown.append(
+            {
+                "back-end": f"`{backend}`",
+                "the demo's world": length(1e-3 * demo["after_take_off_mm"].iloc[0]),
+                "other worlds": _spread(1e-3 * others["after_take_off_mm"]),
+                "ATE, all": _ate(_in_m(own)),
+                "NEES of orientation, position (ideal 3)": _parts(own, "nees", ".1f"),
+                "resets": f"{own['resets'].sum()}",
+            }
+        )
     return markdown(shown) + source(rows)
 
 
@@ -467,8 +511,10 @@ FIGURES: dict[str, Callable[[], str]] = {
             at_rest,
             landmarks,
             rendered,
+            against,
             one_or_two,
             error_budget,
+            take_off,
             april,
             frontend,
             whole_runs,
@@ -543,6 +589,11 @@ def _spread(ate_m: Iterable[float]) -> str:
     values = pd.Series(list(ate_m), dtype=float)
     of_many = f" (n = {len(values)})" if len(values) > 1 else ""
     return f"{length(values.mean(), values.std())}{of_many}"
+
+
+def _parts(rows: pd.DataFrame, what: str, spec: str) -> str:
+    """The median of a figure of orientation, and of one of position."""
+    return ", ".join(format(rows[f"{what}.{part}"].median(), spec) for part in ("orientation", "position"))
 
 
 def _range(values: pd.Series, spec: str, unit: str) -> str:

@@ -55,12 +55,14 @@ class Scripted:
         self._say = say
         self.starts: list[Start] = []
         self.still: list[bool] = []
+        self.given: list[tuple[ImuSegment, FrameTracks]] = []
 
     def begin(self, start: Start) -> None:
         self.starts.append(start)
 
     def process(self, imu: ImuSegment, tracks: FrameTracks, still: bool) -> Any:
         self.still.append(still)
+        self.given.append((imu, tracks))
         return self._say(steady(tracks.t_ns))
 
 
@@ -317,6 +319,64 @@ def test_a_backend_is_told_that_the_images_stand_still(update):
     assert not any(backend.still[:9])
     assert all(backend.still[10:]) is update
     assert any(backend.still) is update
+
+
+def standing(sequence: TrackSequence, frames: int) -> list[tuple[ImuSegment, FrameTracks]]:
+    """The packets behind the first, of which all but the last three of ``frames`` show the picture of the first."""
+    first = sequence.packets[0][1]
+    shown = [(imu, replace(first, t_ns=tracks.t_ns)) for imu, tracks in sequence.packets[1 : frames - 2]]
+    return [*shown, *sequence.packets[frames - 2 : frames + 1]]
+
+
+def test_standstill_reaches_the_backend_once_it_is_sure_and_what_follows_it_at_once():
+    backend, sequence = Scripted(), flight()
+    life, packets = begun(backend), standing(sequence, 24)
+    lags, estimates = [], []
+    for imu, tracks in packets:
+        estimates.append(life.process(imu, tracks))
+        lags.append((tracks.t_ns - backend.given[-1][1].t_ns) * 1e-9)
+    assert [e.state.t_ns for e in estimates if e.state is not None] == [tracks.t_ns for _, tracks in packets]
+    # Moving for all it knows; the frame in which it comes to rest; those of a while ago; and again the newest.
+    assert lags[:10] == [0.0] * 10
+    np.testing.assert_allclose(lags[10:14], [0.05, 0.1, 0.15, 0.2], atol=1e-3)
+    assert max(lags) == lags[-4] == pytest.approx(0.2, abs=1e-3)
+    assert lags[-3:] == [0.0] * 3
+    assert backend.still == [False] * 9 + [True] * (len(backend.still) - 12) + [False] * 3
+    # No reading is lost or given twice.
+    for (before, _), (after, _) in zip(backend.given, backend.given[1:], strict=False):
+        assert after.t_ns[0] == before.t_ns[-1]
+
+
+def test_readings_lead_on_from_the_standstill_that_is_sure():
+    """Until the back-end has them the body is where they put it, as surely as they do."""
+    backend, sequence = Scripted(), flight()
+    life = begun(backend)
+    for imu, tracks in standing(sequence, 24)[:-3]:
+        accel_B = np.broadcast_to([0.5, 0.0, 9.81], imu.accel_B.shape)
+        estimate = life.process(replace(imu, gyro_B=np.zeros_like(imu.gyro_B), accel_B=accel_B), tracks)
+    assert estimate.state is not None
+    late_s = (estimate.state.t_ns - backend.given[-1][1].t_ns) * 1e-9
+    assert late_s == pytest.approx(0.2, abs=1e-3)
+    np.testing.assert_allclose(estimate.state.v_WB, [0.5 * late_s, 0.0, 0.0], atol=1e-3)
+    np.testing.assert_allclose(estimate.state.p_WB, [0.25 * late_s**2, 0.0, 0.0], atol=1e-4)
+    assert estimate.state.cov is not None
+    assert (np.diag(estimate.state.cov)[:6] > 1.0).all()  # steady() is as unsure as that, and time goes by
+
+
+def test_what_waits_is_forgotten_with_the_estimate_that_is_lost():
+    backend = Scripted()
+    sequence = simulated_sequence("standstill", pixel_sigma=0.1, duration_s=3.0)
+    life = begun(backend, None, sequence)
+    for packet in sequence.packets[1:20]:
+        life.process(*packet)
+    backend._say = diverging
+    assert life.process(*sequence.packets[20]).status is Status.LOST
+    backend._say = lambda estimate: estimate
+    rest = [life.process(*packet) for packet in sequence.packets[21:]]
+    began_ns = backend.starts[1].state.t_ns
+    assert rest[-1].status is Status.TRACKING
+    assert min(tracks.t_ns for _, tracks in backend.given[-5:]) > began_ns
+    assert all(imu.t_ns[0] >= began_ns for imu, tracks in backend.given if tracks.t_ns > began_ns)
 
 
 # Warming up, and the calibration.

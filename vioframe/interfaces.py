@@ -53,7 +53,9 @@ class Backend(Protocol):
     def process(self, imu: ImuSegment, tracks: FrameTracks, still: bool) -> Estimate:
         """Take the readings since the last frame and the tracks of this one; say what is known now.
 
-        ``still`` says that the images show a body at rest; the readings may yet contradict it. Raises
+        ``still`` says that the images show a body at rest; the readings may yet contradict it. Such a frame comes a
+        little late, once later images bear it out; those that none has borne out yet when the body moves never come,
+        and the next frame has their readings. Raises
         :class:`~vioframe.errors.DivergedError`, saying why, where the estimate can no longer be believed: it is begun
         anew then.
         """

@@ -18,7 +18,7 @@ class MsckfOptions:
     """Observations that a finished track must have to be used."""
     max_slam_features: NonNegativeInt = 50
     """Long-lived landmarks kept in the state; 0 makes this a pure MSCKF."""
-    landmark_drift_px: NonNegativeFloat = 0.3
+    landmark_drift_px: NonNegativeFloat = 0.1
     """How far a followed point slides off its landmark from one frame to the next, px; 0 where noise is white."""
     pixel_sigma: PositiveFloat = 1.0
     """Standard deviation of a tracked feature's position, px."""

@@ -10,11 +10,12 @@ from dataclasses import replace
 import numpy as np
 
 from vioframe.errors import ConfigError, DivergedError, PluginError
+from vioframe.estimation.inertial.preintegration import join_segments, preintegrate
 from vioframe.estimation.initialization import GIVEN, Initializer
 from vioframe.estimation.options import EstimationOptions
 from vioframe.estimation.recovery import check_plausible, continued_from
 from vioframe.estimation.soundness import defect_of
-from vioframe.estimation.standstill import StandstillDetector
+from vioframe.estimation.standstill import SETTLED_NS, StandstillDetector
 from vioframe.interfaces import Backend
 from vioframe.stopwatch import Stopwatch
 from vioframe.types import (
@@ -59,6 +60,10 @@ class LifeCycle:
         self._standstill = StandstillDetector(self._options.standstill_disparity_px)
         self._initial_state = initial_state
         self._following = False
+        self._stands = False
+        # Frames in which it seems to stand still, which the back-end has yet to be given: readings, tracks, if so.
+        self._waiting: list[tuple[ImuSegment, FrameTracks, bool]] = []
+        self._settled = Estimate(Status.INITIALISING)  # the newest that is the back-end's own
         self._last: NavState | None = None
         self._corrected_ns = 0
         self._known = CalibrationEstimate(calibration, (GIVEN,) * len(calibration.cameras))
@@ -88,6 +93,33 @@ class LifeCycle:
             return Estimate(
                 Status.LOST, events=(f"lost: the camera is mounted differently; {self._initializer.found}",)
             )
+        # The first frame of a standstill says that the body has come to rest, those after it that it has not set off.
+        stood, self._stands = self._stands, still or (apart and self._stands)
+        if stood and self._stands:
+            return self._wait(imu, tracks, still)
+        imu, self._waiting = join_segments([*(readings for readings, _, _ in self._waiting), imu]), []
+        return self._follow(imu, tracks, still)
+
+    def _wait(self, imu: ImuSegment, tracks: FrameTracks, still: bool) -> Estimate:
+        """A frame that shows the picture of half a second before: the body stood still, and may be about to set off.
+
+        That is seen too late, so the back-end is given the frame of a while ago, in which the body surely stood still,
+        and the readings lead from there to this one. Once the body is seen to move, the back-end has them, too.
+        """
+        self._waiting.append((imu, tracks, still))
+        estimate = Estimate(Status.TRACKING, corrected=False, calibration=self._settled.calibration)
+        while tracks.t_ns - self._waiting[0][1].t_ns >= SETTLED_NS:
+            estimate = self._follow(*self._waiting.pop(0))
+            if estimate.status is not Status.TRACKING:
+                return estimate
+        state, noise = self._settled.state, self.calibration.imu.in_flight(self._options.imu_noise_factor)
+        assert state is not None
+        since = join_segments([readings for readings, _, _ in self._waiting])
+        self._last = preintegrate(since, state.bias_gyro_B, state.bias_accel_B, noise).predict(state)
+        return replace(estimate, state=self._last)
+
+    def _follow(self, imu: ImuSegment, tracks: FrameTracks, still: bool) -> Estimate:
+        """What the back-end makes of a frame."""
         try:
             estimate = self._backend.process(imu, tracks, still)
             if (defect := defect_of(estimate, tracks.t_ns)) is not None:
@@ -97,9 +129,10 @@ class LifeCycle:
             return self._lose(str(error))
         if estimate.status is Status.LOST:
             self._begin_anew()
+        estimate = replace(estimate, calibration=self._learned(estimate.calibration or self._known))
         if estimate.state is not None:
-            self._last = estimate.state
-        return replace(estimate, calibration=self._learned(estimate.calibration or self._known))
+            self._last, self._settled = estimate.state, estimate
+        return estimate
 
     def _begin(self, imu: ImuSegment, tracks: FrameTracks) -> Estimate:
         if self._initial_state is not None:
@@ -121,18 +154,20 @@ class LifeCycle:
 
     def _begun(self, start: Start, watch: Stopwatch, method: str) -> Estimate:
         self._backend.begin(start)
+        self._stands, self._waiting = False, []
         self._following, self._last, self._known = True, start.state, start.calibration
         self._corrected_ns = start.state.t_ns
         events = [f"initialised ({method})"]
         if (found := self._initializer.found) is not None:
             events.append(str(found))
-        return Estimate(
+        self._settled = Estimate(
             Status.TRACKING,
             start.state,
             calibration=self._learned(start.calibration),
             events=tuple(events),
             stage_seconds=watch.seconds,
         )
+        return self._settled
 
     def _start(self, state: NavState, imu: ImuSegment, tracks: FrameTracks) -> Start:
         """From ``state``, with what was found of the calibration while starting."""

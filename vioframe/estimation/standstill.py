@@ -19,6 +19,10 @@ STANDSTILL_GATE = float(chi2_quantile(0.95, 9))
 """Squared Mahalanobis distance below which the readings agree with standstill."""
 _MIN_COMMON_TRACKS = 10
 _LOOK_BACK_NS = NS_PER_S // 2
+SETTLED_NS = NS_PER_S // 6
+"""A body that still shows the old picture stood still this long ago; since then it may have set off. At an even
+acceleration it goes more than half of its first half second's way in the last sixth of a second. Longer waits would
+leave a body that is shaken at rest without corrections for longer."""
 _VELOCITY_SIGMA_M_S = 0.01
 # A body that stands still may yet shake, so its readings scatter this many times more than the sensor's noise.
 _SHAKING = 10.0

@@ -40,6 +40,11 @@ class Nees:
         low, high = self.band
         return float(np.mean((self.values >= low) & (self.values <= high)))
 
+    @property
+    def held(self) -> float:
+        """Fraction of instants at which the ellipsoid that should hold the truth in 95 % of them does."""
+        return float(np.mean(self.values <= chi2_quantile(0.95, self.dof)))
+
     def to_dict(self) -> dict[str, object]:
         return {"dof": self.dof, "mean": self.mean, "inside_95": self.inside, "band_95": list(self.band)}
 
