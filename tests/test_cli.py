@@ -242,7 +242,9 @@ def test_another_part_does_not_inherit_the_options_of_the_one_in_the_file(toy):
 def test_ground_truth_is_kept_with_the_run_and_compared(toy):
     rows = "".join(f"{1 + 0.05 * k:.9f} {0.5 * (k + 1)} 0 0 0 0 0 1\n" for k in range(60))
     Path("truth.tum").write_text(rows)
-    result = run_toy(toy, "-o", "speed=0.5", "--ground-truth", "truth.tum", "--out", "a")
+    # The toy's back-end moves, its images do not.
+    moving = "-o", "speed=0.5", "-o", "zero_velocity_update=false"
+    result = run_toy(toy, *moving, "--ground-truth", "truth.tum", "--out", "a")
     assert "ATE 0.0 mm (position and yaw aligned) over 20.0 m" in result.stdout
     assert len(RunFolder.open("a").ground_truth()) == 60
 
