@@ -1,7 +1,8 @@
 """How accurate it is on real recordings: what the project promises, from the bag to the trajectory.
 
 Real images (EuRoC), real corners (an AprilGrid), and simulated landmarks along real motion with the readings of the
-real IMU. Everything goes through the same doors as the command line and the benchmarks.
+real IMU. Everything goes through the same doors as the command line and the benchmarks. Limits are one and a half times
+what was measured.
 """
 
 from __future__ import annotations
@@ -104,28 +105,28 @@ def test_two_cameras_know_the_scale(shared_data, tmp_path):
 @pytest.mark.parametrize(
     ("detector", "backend", "limit_m"),
     [
-        ("shi_tomasi", "msckf", 0.015),
-        ("fast", "msckf", 0.025),
-        ("orb", "msckf", 0.025),
-        pytest.param("sift", "msckf", 0.025, marks=pytest.mark.very_slow),
-        pytest.param("akaze", "msckf", 0.015, marks=pytest.mark.very_slow),
-        pytest.param("brisk", "msckf", 0.015, marks=pytest.mark.very_slow),
-        pytest.param("surf", "msckf", 0.015, marks=pytest.mark.very_slow),
-        ("keypointnet", "msckf", 0.020),
-        ("shi_tomasi", "sliding_window", 0.012),
+        ("shi_tomasi", "msckf", 0.0081),
+        ("fast", "msckf", 0.0081),
+        ("orb", "msckf", 0.0092),
+        pytest.param("sift", "msckf", 0.0099, marks=pytest.mark.very_slow),
+        pytest.param("akaze", "msckf", 0.0093, marks=pytest.mark.very_slow),
+        pytest.param("brisk", "msckf", 0.0086, marks=pytest.mark.very_slow),
+        pytest.param("surf", "msckf", 0.0084, marks=pytest.mark.very_slow),
+        ("keypointnet", "msckf", 0.0090),
+        ("shi_tomasi", "sliding_window", 0.0089),
     ],
 )
 def test_machine_hall_from_a_bag(flown, detector, backend, limit_m):
     _, summary, errors = flown(detector, backend)
     assert summary["finished"]
     assert summary["frames"] == 300
-    assert summary["initialised_after_s"] <= 3.0
+    assert summary["initialised_after_s"] <= 1.3
     assert summary["completion"] == 1.0
     assert summary["resets"] == 0
     assert errors.coverage > 0.8
     assert errors.truth.path_length_m > 3.0
     assert errors.ate_m.rmse <= limit_m
-    assert errors.scale == pytest.approx(1.0, abs=0.02)
+    assert errors.scale == pytest.approx(1.0, abs=0.01)
 
 
 @pytest.mark.parametrize("backend", ["msckf", "sliding_window"])
@@ -140,18 +141,18 @@ def test_two_runs_on_one_bag_are_the_same_byte_for_byte(machine_hall, flown, tmp
         assert first == second, file
 
 
-@pytest.mark.parametrize("backend", ["msckf", "sliding_window"])
-def test_vicon_room_at_rest(shared_data, tmp_path, backend):
+@pytest.mark.parametrize(("backend", "limit_m"), [("msckf", 0.008), ("sliding_window", 0.0125)])
+def test_vicon_room_at_rest(shared_data, tmp_path, backend, limit_m):
     clip = shared_data / "euroc/V1_01_easy_rest"
     summary, errors = fly(clip, clip, tmp_path / "run", backend=backend)
     drift_m = np.linalg.norm(errors.estimate.p_WB - errors.estimate.p_WB[0], axis=1).max()
     assert "initialised (static)" in [event["event"] for event in summary["events"]]
     assert summary["completion"] == 1.0
-    assert summary["initialised_after_s"] <= 3.0
-    assert drift_m <= 0.010
+    assert summary["initialised_after_s"] <= 1.5
+    assert drift_m <= limit_m
 
 
-@pytest.mark.parametrize(("backend", "limit_m"), [("msckf", 0.040), ("sliding_window", 0.030)])
+@pytest.mark.parametrize(("backend", "limit_m"), [("msckf", 0.016), ("sliding_window", 0.016)])
 def test_april_grid_under_strong_motion(shared_data, backend, limit_m):
     row = fly_tracks(april_sequence(shared_data / "euroc_imu_april"), backend)
     assert row["completion"] == 1.0
@@ -173,7 +174,8 @@ def test_real_motion(shared_data, name):
 def test_half_a_minute_of_real_motion(shared_data):
     """Part of the above for everyday: the liveliest flight's middle."""
     folder = shared_data / "euroc_imu_gt/V1_02_medium"
-    _check_real_motion(real_motion_sequence(folder, start_s=15.0, duration_s=30.0), least_path_m=20.0)
+    sequence = real_motion_sequence(folder, start_s=15.0, duration_s=30.0)
+    assert _check_real_motion(sequence, least_path_m=20.0)["percent"] <= 0.26
 
 
 def _check_real_motion(sequence: TrackSequence, least_path_m: float, backend: str = "msckf") -> Row:
