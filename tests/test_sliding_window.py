@@ -491,10 +491,10 @@ def test_stop_and_go_is_held_at_every_stop():
     assert 0.2 < stands.mean() < 0.8
     held = fly(sequence)
     velocity = np.linalg.norm([s.v_WB for s in held.states], axis=1)
-    # It takes half a second to be told.
+    # It takes half a second to be told, and the readings of the last 0.2 s lead on from what is sure.
     told = stands & np.roll(stands, 11)
     told[:11] = False
-    assert velocity[told].max() < 0.02
+    assert velocity[told].max() < 0.045
     assert position_errors(held, sequence).max() < 0.03
     # Nothing is triangulated from a place that one does not leave: on readings alone the body wanders off.
     loose = EstimationOptions(zero_velocity_update=False)
