@@ -14,11 +14,16 @@ from rich.table import Table
 from threadpoolctl import threadpool_limits
 
 from vioframe.bench import Row, backend_row, record, run_backend
+from vioframe.cores import usable_cores
 from vioframe.errors import VioframeError
 from vioframe.parts import config as configuration
 from vioframe.parts import registry
 from vioframe.parts.config import Config, PartConfig
+from vioframe.parts.registry import Registry
 from vioframe.simulation import TrackSequence
+from vioframe.simulation.config import SimulationConfig, complete
+from vioframe.simulation.record import record as write_recording
+from vioframe.simulation.recording import SimulatedRecording
 
 HERE = Path(__file__).resolve().parent
 SHARED_DATA = HERE.parents[1] / "shared" / "data"
@@ -77,6 +82,12 @@ def backend_rows(
         with threadpool_limits(1):
             run = run_backend(sequence, estimator, config.estimation_options)
         yield {**about, **backend_row(sequence, run)}
+
+
+def render(simulated: SimulationConfig, installed: Registry, bag: Path) -> None:
+    """Write the recording that ``simulated`` describes to ``bag``, in place of one that is there."""
+    recording = SimulatedRecording(complete(simulated, installed), installed, usable_cores())
+    write_recording(recording, [bag], overwrite=True)
 
 
 def present(

@@ -174,10 +174,8 @@ def against() -> str:
                         "back-end": f"`{backend}`",
                         "detector": f"`{detector}`",
                         "beside": f"`{options}`",
-                        **{
-                            name: "-" if clip == "all" else _spread(of_each[of.index])
-                            for name, of_each in {"ATE": found[""], "ATE beside": found[options]}.items()
-                        },
+                        "ATE": "-" if clip == "all" else _spread(found[""][of.index]),
+                        "ATE beside": "-" if clip == "all" else _spread(found[options][of.index]),
                         "ratio, geometric mean": f"{geometric_mean(of):.2f}",
                         "better": f"{(of < 1.0).sum()} of {len(of)}",
                         "p, Wilcoxon": f"{wilcoxon(np.log(of)).pvalue:.3f}",

@@ -14,17 +14,14 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import click
-from common import benchmark, present
+from common import benchmark, present, render
 from euroc_clips import run
 
 from vioframe.bench import Row
-from vioframe.cores import usable_cores
 from vioframe.parts import config as configuration
 from vioframe.parts import registry
 from vioframe.parts.config import Config, DatasetConfig, PartConfig
-from vioframe.simulation.config import SimulationConfig, complete
-from vioframe.simulation.record import record
-from vioframe.simulation.recording import SimulatedRecording
+from vioframe.simulation.config import SimulationConfig
 
 START_S = {"MH_05_difficult": 5.0, "V1_02_medium": 0.0}
 WORLDS = 5
@@ -76,8 +73,7 @@ def main(
             for world, name in product(range(worlds), START_S):
                 bag = (bags or Path(temporary)) / f"{name}_{world}.bag"
                 if not bag.exists():
-                    simulated = SimulationConfig(recorded=data / "euroc_imu_gt" / name, seed=world)
-                    record(SimulatedRecording(complete(simulated, installed), installed, usable_cores()), [bag])
+                    render(SimulationConfig(recorded=data / "euroc_imu_gt" / name, seed=world), installed, bag)
                 for detector, options in product(detectors, contenders):
                     config = Config(
                         dataset=DatasetConfig(path=bag),

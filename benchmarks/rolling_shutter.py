@@ -17,10 +17,9 @@ from tempfile import TemporaryDirectory
 
 import click
 import numpy as np
-from common import benchmark, present
+from common import benchmark, present, render
 
 from vioframe.bench import Row, backend_row, run_backend
-from vioframe.cores import usable_cores
 from vioframe.frontend import Frontend, FrontendOptions
 from vioframe.incidents import Incidents
 from vioframe.io.synchronise import synchronise
@@ -30,9 +29,7 @@ from vioframe.parts import registry
 from vioframe.parts.config import Config, PartConfig
 from vioframe.parts.registry import FLIGHT, Registry
 from vioframe.simulation import TrackSequence
-from vioframe.simulation.config import SimulationConfig, complete
-from vioframe.simulation.record import record
-from vioframe.simulation.recording import SimulatedRecording
+from vioframe.simulation.config import SimulationConfig
 from vioframe.types import NS_PER_S
 
 FLIGHTS_S = {"figure_eight": 30.0, "aggressive": 20.0}
@@ -122,7 +119,7 @@ def rendered(folder: Path, flight: str, world: int, duration_s: float, readout_m
             readout_ms=readout_ms,
             seed=world,
         )
-        record(SimulatedRecording(complete(config, installed), installed, usable_cores()), [bag])
+        render(config, installed, bag)
     return bag
 
 

@@ -15,20 +15,17 @@ from tempfile import TemporaryDirectory
 
 import click
 import numpy as np
-from common import benchmark, present
+from common import benchmark, present, render
 from euroc_clips import judged
 from rendered_flights import START_S
 
 from vioframe.bench import Row
-from vioframe.cores import usable_cores
 from vioframe.interfaces import Dataset
 from vioframe.parts import config as configuration
 from vioframe.parts import registry
 from vioframe.parts.config import Config, DatasetConfig, PartConfig
 from vioframe.pipeline import prepare, record
-from vioframe.simulation.config import SimulationConfig, complete
-from vioframe.simulation.record import record as render
-from vioframe.simulation.recording import SimulatedRecording
+from vioframe.simulation.config import SimulationConfig
 from vioframe.types import NS_PER_S, FrameSet, Measurement
 
 BACKENDS = ("msckf", "sliding_window")
@@ -99,9 +96,7 @@ def main(data: Path, backend: str, assignments: tuple[str, ...], keep: bool, fli
 
             def rendered(world: int, **settings: object) -> None:
                 recorded = {"recorded": data / "euroc_imu_gt" / flight, "seed": world, "rig": ("stereo",), **settings}
-                simulated = complete(SimulationConfig.model_validate(recorded), installed)
-                bag.unlink(missing_ok=True)
-                render(SimulatedRecording(simulated, installed, usable_cores()), [bag], overwrite=True)
+                render(SimulationConfig.model_validate(recorded), installed, bag)
 
             for world in range(WORLDS):
                 rendered(world)

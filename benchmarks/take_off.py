@@ -12,19 +12,16 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
-from common import benchmark, present
+from common import benchmark, present, render
 from euroc_clips import run
 
 from vioframe.bench import Row
-from vioframe.cores import usable_cores
 from vioframe.evaluation import evaluate
 from vioframe.parts import config as configuration
 from vioframe.parts import registry
 from vioframe.parts.config import Config, DatasetConfig, PartConfig
 from vioframe.runs.folder import RunFolder
-from vioframe.simulation.config import SimulationConfig, complete
-from vioframe.simulation.record import record
-from vioframe.simulation.recording import SimulatedRecording
+from vioframe.simulation.config import SimulationConfig
 from vioframe.types import NS_PER_S
 
 BACKENDS = ("msckf", "sliding_window", "loose_ekf")
@@ -54,7 +51,7 @@ def main(data: Path, backend: str, assignments: tuple[str, ...], keep: bool) -> 
             for world in WORLDS:
                 bag = Path(temporary) / f"{world}.bag"
                 simulated = SimulationConfig(flight=PartConfig(name=FLIGHT), duration_s=DURATION_S, seed=world)
-                record(SimulatedRecording(complete(simulated, installed), installed, usable_cores()), [bag])
+                render(simulated, installed, bag)
                 for name in BACKENDS:
                     config = Config(dataset=DatasetConfig(path=bag), backend=PartConfig(name=name))
                     folder = Path(temporary) / f"{world}_{name}"

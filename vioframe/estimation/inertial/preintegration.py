@@ -89,6 +89,8 @@ def preintegrate(imu: ImuSegment, bias_gyro_B: Float, bias_accel_B: Float, noise
 def join_segments(segments: Sequence[ImuSegment]) -> ImuSegment:
     """Consecutive segments as one: the reading at each border, which both sides hold, is kept once."""
     first, *rest = segments
+    if not rest:
+        return first
     return ImuSegment(
         np.concatenate([first.t_ns, *(s.t_ns[1:] for s in rest)]),
         np.concatenate([first.gyro_B, *(s.gyro_B[1:] for s in rest)]),
