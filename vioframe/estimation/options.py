@@ -12,8 +12,8 @@ class EstimationOptions:
     """What every back-end's estimate has in common; raises :class:`ConfigError` on a value out of range."""
 
     imu_noise_factor: float = 4.0
-    """How many times the calibration's white IMU noise is assumed in flight at most, where vibration adds to the
-    sensor's own: readings that jump less count as less noisy; 1 for an exact simulation."""
+    """How many times the calibration's white IMU noise is assumed at most, where vibration adds to the sensor's own;
+    how much it adds is told from the readings."""
     zero_velocity_update: bool = True
     """Recognise standstill and use it."""
     standstill_disparity_px: float = 0.7

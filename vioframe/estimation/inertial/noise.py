@@ -12,21 +12,29 @@ from vioframe.types import ImuNoise, ImuSegment
 
 # What a body may do unseen while readings are missing, rad/s and m/s^2, and how long that can be bridged.
 _UNSEEN_TURN, _UNSEEN_ACCELERATION, _MAX_IMU_GAP_S = 0.5, 2.0, 0.5
-# What readings are off by over what they jump by: vibration is not white, and alignment and scale are off, too.
-_BEYOND_JUMPS = 2.0
+# Vibration is not white, and what shakes a sensor bends it, too: readings are off by more than they are rough by.
+_BEYOND_ROUGHNESS = 2.0
+# The few readings of a frame are rougher than the sensor's own noise by chance, but hardly by so much of its variance.
+_BY_CHANCE = 2.0
 
 
-def jumps(t_ns: Int, values: Float) -> float:
-    """The density of white noise that makes readings ``values`` (N, 3) at ``t_ns`` (N,) jump as they do.
+def roughness(t_ns: Int, values: Float) -> float:
+    """The density of white noise that makes readings ``values`` (N, 3) at ``t_ns`` (N,) as rough as they are.
 
-    Half the squared difference of two neighbours is that of the noise where the body's motion is smooth.
+    How far a reading lies from the middle of its two neighbours, squared, is one and a half times the variance of the
+    noise, however fast the body turns or speeds up, where it does so steadily. 0 of fewer than three readings.
     """
+    if len(t_ns) < 3:
+        return 0.0
     dt_s = float(np.median(np.diff(t_ns))) * 1e-9
-    return float(np.sqrt(0.5 * (np.diff(values, axis=0) ** 2).mean() * dt_s))
+    off = values[1:-1] - 0.5 * (values[:-2] + values[2:])
+    return float(np.sqrt((off**2).mean() / 1.5 * dt_s))
 
 
 def noise_over(imu: ImuSegment, at_rest: ImuNoise, in_flight: ImuNoise) -> ImuNoise:
-    """That of the readings ``imu``: by how they jump, no less than ``at_rest`` and no more than ``in_flight``.
+    """That of the readings ``imu``: the sensor's own, ``at_rest``, and what vibration adds, to ``in_flight`` at most.
+
+    The sensor's own noise makes readings rough, too; what is rougher than that shakes.
 
     It is raised where readings are missing: the straight line drawn over a gap is only a guess. A rate that is off by w
     for a gap of T turns the body by w T, as white noise of density w sqrt(T) would. Raises :class:`DivergedError` where
@@ -35,13 +43,14 @@ def noise_over(imu: ImuSegment, at_rest: ImuNoise, in_flight: ImuNoise) -> ImuNo
     gap_s = imu.largest_gap_s
     if gap_s > _MAX_IMU_GAP_S:
         raise DivergedError(f"no inertial readings for {gap_s:.2f} s")
-    gyro = _within(_BEYOND_JUMPS * jumps(imu.t_ns, imu.gyro_B), at_rest.gyro_density, in_flight.gyro_density)
-    accel = _within(_BEYOND_JUMPS * jumps(imu.t_ns, imu.accel_B), at_rest.accel_density, in_flight.accel_density)
+    gyro = _shaken(roughness(imu.t_ns, imu.gyro_B), at_rest.gyro_density, in_flight.gyro_density)
+    accel = _shaken(roughness(imu.t_ns, imu.accel_B), at_rest.accel_density, in_flight.accel_density)
     if gap_s >= 5.0 / in_flight.rate_hz:
         gyro += _UNSEEN_TURN * gap_s**0.5
         accel += _UNSEEN_ACCELERATION * gap_s**0.5
     return replace(in_flight, gyro_density=gyro, accel_density=accel)
 
 
-def _within(value: float, least: float, most: float) -> float:
-    return min(max(value, least), most)
+def _shaken(rough: float, own: float, most: float) -> float:
+    vibration = max(rough**2 - _BY_CHANCE * own**2, 0.0)
+    return min(float(np.sqrt(own**2 + _BEYOND_ROUGHNESS**2 * vibration)), most)
