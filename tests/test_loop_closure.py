@@ -30,7 +30,7 @@ from vioframe_pose_graph.keyframes import KeyframeSelector
 from vioframe_pose_graph.matching import DescriptorIndex, distance, match
 from vioframe_pose_graph.place import image_angle_deg
 from vioframe_pose_graph.recognition import Recogniser
-from vioframe_pose_graph.verification import Correspondences, hypotheses, ransac, residuals
+from vioframe_pose_graph.verification import Correspondences, _refined, hypotheses, ransac, residuals
 
 FOCAL_PX = CAMERA.model.focal_px
 
@@ -143,11 +143,34 @@ def test_the_jacobian_of_the_relation_is_its_derivative():
     p_B = np.array([1.0, 2.0, 0.5])
     R_AB = so3.exp(np.array([0.02, -0.01, 0.0])) @ rotation_z(yaw)
     p_AB = rotation_z(yaw) @ p_B + t + 0.05
-    _, J = residuals(seen, p_B, p_AB, R_AB)
+    _, J, along = residuals(seen, p_B, p_AB, R_AB)
     for k, d in enumerate(1e-6 * np.eye(6)):
         plus = residuals(seen, p_B, p_AB + d[:3], so3.exp(d[3:]) @ R_AB)[0]
         minus = residuals(seen, p_B, p_AB - d[:3], so3.exp(-d[3:]) @ R_AB)[0]
         np.testing.assert_allclose(J[:, :, k], (plus - minus) / 2e-6, atol=1e-7)
+    source = seen.p_WC[1 - seen.side]
+    far, near = (replace(seen, points=source + (1.0 + d) * (seen.points - source)) for d in (1e-6, -1e-6))
+    apart = residuals(far, p_B, p_AB, R_AB)[0] - residuals(near, p_B, p_AB, R_AB)[0]
+    np.testing.assert_allclose(along, apart / 2e-6, atol=1e-7)
+
+
+def test_points_of_uncertain_depth_tell_what_they_can():
+    """Depths are off by 3 %, pixels by half a one at 460 px: the relation is as far off as its covariance says."""
+    rng, tolerance = np.random.default_rng(7), 3.0 / 460.0
+    squares, off = [], []
+    for _ in range(200):
+        seen, yaw, t, _ = two_views(rng, count=80)
+        source = seen.p_WC[1 - seen.side]
+        depth = 1.0 + 0.03 * rng.standard_normal((len(seen.points), 1))
+        xy = seen.xy + 0.5 / 460.0 * rng.standard_normal(seen.xy.shape)
+        noisy = replace(seen, points=source + depth * (seen.points - source), xy=xy)
+        p_A, p_B = seen.p_WC
+        found = _refined(noisy, rotation_z(np.array(yaw)), t, p_A, p_B, tolerance, 25)
+        error = np.append(found.z - (rotation_z(np.array(yaw)) @ p_B + t - p_A), found.yaw - yaw)
+        squares.append(error @ np.linalg.solve(found.cov, error) / 4.0)
+        off.append(np.linalg.norm(error[:3]))
+    assert 0.5 < np.mean(squares) < 1.5
+    assert np.median(off) < 0.01
 
 
 def test_descriptors_turn_with_the_camera():

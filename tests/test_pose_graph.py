@@ -243,7 +243,7 @@ def test_four_edges_are_as_stiff_as_the_random_walk():
         H[i, j] += a @ b
         H[j, i] += a @ b
     variance = np.linalg.inv(H[1:, 1:])[-1, -1]
-    assert variance == pytest.approx(graph.var_p.sum(), rel=0.05)
+    assert variance == pytest.approx(graph.drift[:, 2, 2].sum(), rel=0.05)
 
 
 def test_the_covariance_of_the_odometry_is_that_of_a_simulated_one():
@@ -252,13 +252,13 @@ def test_the_covariance_of_the_odometry_is_that_of_a_simulated_one():
     rng = np.random.default_rng(4)
     i, j, trials = 5, 33, 20_000
     steps = np.diff(p, axis=0)[i:j]
-    yaw = np.cumsum(rng.standard_normal((trials, j - i)) * np.sqrt(graph.var_yaw[i + 1 : j + 1]), axis=1)
+    yaw = np.cumsum(rng.standard_normal((trials, j - i)) * np.sqrt(graph.drift[i + 1 : j + 1, 3, 3]), axis=1)
     # A step is turned by what the yaw was off before it.
     before = np.concatenate([np.zeros((trials, 1)), yaw[:, :-1]], axis=1)
     cos, sin = np.cos(before), np.sin(before)
     x = (cos * steps[:, 0] - sin * steps[:, 1]).sum(axis=1)
     y = (sin * steps[:, 0] + cos * steps[:, 1]).sum(axis=1)
-    noise = rng.standard_normal((trials, 3)) * np.sqrt(graph.var_p[i + 1 : j + 1].sum())
+    noise = rng.standard_normal((trials, 3)) * np.sqrt(graph.drift[i + 1 : j + 1, 2, 2].sum())
     ends = np.column_stack([x, y, np.full(trials, steps[:, 2].sum())]) + noise
     measured = np.cov(np.column_stack([ends, yaw[:, -1]]).T)
     expected = graph.cov(np.array([i]), np.array([j]))[0]
@@ -273,11 +273,50 @@ def test_fewer_keyframes_drift_as_far():
     few = graph.at(which)
     assert np.array_equal(few.p, p[which])
     i, j = np.triu_indices(len(which))
-    whole, thinned = graph.cov(which[i], which[j]), few.cov(i, j)
-    diagonal = np.arange(4)
-    # A turn between two that are kept counts from the later one.
-    np.testing.assert_allclose(thinned[:, diagonal, diagonal], whole[:, diagonal, diagonal], rtol=0.5, atol=1e-12)
-    np.testing.assert_allclose(thinned[:, [2, 3], [2, 3]], whole[:, [2, 3], [2, 3]], rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(few.cov(i, j), graph.cov(which[i], which[j]), rtol=1e-9, atol=1e-9)
+
+
+def claimed(p, added, first):
+    """(N, 4, 4) what a filter says of [position yaw] whose steps added ``added`` (N, 4, 4) to ``first`` (4, 4)."""
+    cov = [first]
+    for step, more in zip(np.diff(p, axis=0), added[1:], strict=True):
+        F = np.eye(4)
+        F[:2, 3] = -step[1], step[0]
+        cov.append(F @ cov[-1] @ F.T + more)
+    return np.array(cov)
+
+
+def test_the_odometry_drifts_by_what_its_back_end_says():
+    """What each step added is found again, whatever was unknown before; and counted as often as is asked for."""
+    t_ns, p, _ = circle(laps=1)
+    rng, segment = np.random.default_rng(8), np.zeros(len(p), int)
+    A = rng.standard_normal((len(p), 4, 4)) * [[0.05], [0.05], [0.05], [0.01]]
+    added = A @ A.transpose(0, 2, 1)
+    said = claimed(p, added, np.diag([4.0, 4.0, 4.0, 0.3]))
+    least = {"position_drift": 1e-9, "yaw_drift_deg": 1e-9}
+    once, thrice = (
+        Odometry.of(t_ns, p, segment, PoseGraphOptions(overconfidence=k, **least), said) for k in (1.0, 3.0)
+    )
+    np.testing.assert_allclose(once.drift[1:], added[1:], atol=1e-9)
+    np.testing.assert_allclose(thrice.drift, 9.0 * once.drift, atol=1e-9)
+    relative = claimed(p[10:31], added[10:31], np.zeros((4, 4)))[-1]
+    np.testing.assert_allclose(once.cov(np.array([10]), np.array([30]))[0], relative, atol=1e-8)
+
+
+def test_images_that_told_more_than_was_lost_take_no_drift_away():
+    t_ns, p, _ = circle(laps=1)
+    segment = np.zeros(len(p), int)
+    said = claimed(p, np.tile(1e-4 * np.eye(4), (len(p), 1, 1)), 0.1 * np.eye(4))
+    walk = Odometry.of(t_ns, p, segment, OPTIONS).drift
+    shrunk = said.copy()
+    shrunk[20:] *= 0.5
+    step = Odometry.of(t_ns, p, segment, OPTIONS, shrunk).drift[20]
+    assert np.linalg.eigvalsh(step - walk[20]).min() > -1e-12
+    unknown = said.copy()
+    unknown[12] = np.nan
+    drift = Odometry.of(t_ns, p, segment, OPTIONS, unknown).drift
+    np.testing.assert_array_equal(drift[12:14], walk[12:14])
+    assert (np.trace(drift[[11, 14]] - walk[[11, 14]], axis1=1, axis2=2) > 0.0).all()
 
 
 def test_a_segment_after_a_reset_is_hardly_tied_to_the_one_before():

@@ -117,8 +117,8 @@ class PoseGraph:
         places = self._recogniser.places
         t_ns = np.array([place.t_ns for place in places])
         segment = np.array([place.segment for place in places])
-        p = np.array([place.p_WB for place in places])
-        return t_ns, segment, Odometry.of(t_ns, p, segment, self._options)
+        p, cov = np.array([place.p_WB for place in places]), np.array([place.cov for place in places])
+        return t_ns, segment, Odometry.of(t_ns, p, segment, self._options, cov)
 
     def _close(self) -> LoopClosure:
         begin = working_s()

@@ -3,7 +3,8 @@
 A place may have a twin: shelves, windows, a texture laid out again and again. Its picture verifies as well as the place
 itself, so the picture cannot tell; where it would put the body can.
 
-How far the odometry is trusted is its drift as a random walk of position and yaw.
+How far the odometry is trusted is what its back-end says of itself, made larger, and a random walk of position and yaw
+at least.
 """
 
 from __future__ import annotations
@@ -35,30 +36,42 @@ _SIGMA_M, _SIGMA_PART, _SIGMA_YAW = 0.02, 0.02, np.radians(0.2)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Odometry:
-    """N keyframes as the odometry placed them, and the variances that each step added.
+    """N keyframes as the odometry placed them, and how far each step may have led astray.
 
-    ``p`` (N, 3) m; ``var_p`` (N,) m^2 and ``var_yaw`` (N,) rad^2 of the step that leads to each, 0 for the first.
+    ``p`` (N, 3) m; ``drift`` (N, 4, 4) is the covariance that the step to each added to [position yaw], 0 for the
+    first.
     """
 
     p: Float
-    var_p: Float
-    var_yaw: Float
+    drift: Float
 
     @classmethod
-    def of(cls, t_ns: Int, p: Float, segment: Int, options: PoseGraphOptions) -> Odometry:
+    def of(cls, t_ns: Int, p: Float, segment: Int, options: PoseGraphOptions, cov: Float | None = None) -> Odometry:
+        """``cov`` (N, 4, 4) is that of [position yaw] of each keyframe by the back-end, NaN where it does not say.
+
+        An error of yaw goes on to move all that follows, and counts where it began: ``docs/derivations/pose_graph.md``,
+        section 3. Where images have told more than they lost, the step has taken nothing away.
+        """
         dt = np.diff(t_ns, prepend=t_ns[:1]) * 1e-9
-        way = np.linalg.norm(np.diff(p, axis=0, prepend=p[:1]), axis=1)
+        steps = np.diff(p, axis=0, prepend=p[:1])
+        drift = np.zeros((len(p), 4, 4))
+        if cov is not None:
+            added = options.overconfidence**2 * (cov[1:] - _seen_from_afar(cov[:-1], steps[1:]))
+            said = np.isfinite(added).all(axis=(1, 2))
+            values, vectors = np.linalg.eigh(added[said])
+            drift[1:][said] = (vectors * np.maximum(values, 0.0)[:, None]) @ np.swapaxes(vectors, 1, 2)
+        way = np.linalg.norm(steps, axis=1)
+        drift[:, [0, 1, 2], [0, 1, 2]] += options.position_drift**2 * (way + _HOVERING_M_S * dt)[:, None]
+        drift[:, 3, 3] += np.radians(options.yaw_drift_deg) ** 2 * dt
         broken = np.diff(segment, prepend=segment[:1]) > 0
-        var_p = options.position_drift**2 * (way + _HOVERING_M_S * dt)
-        var_yaw = np.radians(options.yaw_drift_deg) ** 2 * dt
-        var_p[broken] = (_LOST_M + _LOST_SPEED_M_S * dt[broken]) ** 2
-        var_yaw[broken] = _LOST_YAW**2
-        return cls(p, var_p, var_yaw)
+        lost = np.full((np.count_nonzero(broken), 4), _LOST_YAW)
+        lost[:, :3] = (_LOST_M + _LOST_SPEED_M_S * dt[broken])[:, None]
+        drift[broken] = np.eye(4) * lost[:, None] ** 2
+        return cls(p, drift)
 
     def at(self, which: Int) -> Odometry:
-        """The keyframes ``which`` (M,), in their order: a walk of fewer and longer steps."""
-        var_p, var_yaw = (np.diff(np.cumsum(var)[which], prepend=0.0) for var in (self.var_p, self.var_yaw))
-        return Odometry(self.p[which], var_p, var_yaw)
+        """The keyframes ``which`` (M,), in their order: fewer and longer steps."""
+        return Odometry(self.p[which], self.cov(np.concatenate([which[:1], which[:-1]]), which))
 
     def edges(self) -> Edges:
         """Edges from every keyframe to the four before it.
@@ -70,33 +83,17 @@ class Odometry:
         n = len(self.p)
         i, j = np.array([(j - k, j) for j in range(n) for k in range(1, min(_SPAN, j) + 1)], np.int64).reshape(-1, 2).T
         share = _SPAN * (_SPAN + 1) / 2
-        sum_p, sum_yaw = np.cumsum(self.var_p), np.cumsum(self.var_yaw)
-        cov = np.zeros((len(i), 4, 4))
-        cov[:, [0, 1, 2], [0, 1, 2]] = share * (sum_p[j] - sum_p[i])[:, None]
-        cov[:, 3, 3] = share * (sum_yaw[j] - sum_yaw[i])
-        return Edges(i, j, self.p[j] - self.p[i], np.zeros(len(i)), cov)
+        return Edges(i, j, self.p[j] - self.p[i], np.zeros(len(i)), share * self.cov(i, j))
 
     def cov(self, i: Int, j: Int) -> Float:
         """(M, 4, 4) covariance of [position yaw] of keyframes j (M,) as seen from keyframes i (M,), i <= j.
 
-        A yaw error of step k swings keyframe j around keyframe k: with J_k = [-(y_j - y_k), x_j - x_k, 0, 1] it adds
-        var_yaw_k J_k J_k^T. The sums over k from i + 1 to j are differences of running sums.
+        An error of yaw of step k swings keyframe j around keyframe k. All swung to one place, what the steps from i + 1
+        to j added is a difference of running sums.
         """
-        xy = self.p[:, :2] - self.p[:, :2].mean(axis=0)  # near the origin, where no digits are lost
-        moments = np.column_stack([np.ones(len(xy)), xy, xy**2, xy[:, 0] * xy[:, 1]])
-        running = np.cumsum(self.var_yaw[:, None] * moments, axis=0)
-        v, vx, vy, vxx, vyy, vxy = (running[j] - running[i]).T
-        x, y = xy[j].T
-        var_p = np.cumsum(self.var_p)
-        cov = np.zeros((len(i), 4, 4))
-        cov[:, [0, 1, 2], [0, 1, 2]] = (var_p[j] - var_p[i])[:, None]
-        cov[:, 0, 0] += v * y * y - 2.0 * y * vy + vyy
-        cov[:, 1, 1] += v * x * x - 2.0 * x * vx + vxx
-        cov[:, 0, 1] = cov[:, 1, 0] = -(v * x * y - x * vy - y * vx + vxy)
-        cov[:, 0, 3] = cov[:, 3, 0] = vy - v * y
-        cov[:, 1, 3] = cov[:, 3, 1] = v * x - vx
-        cov[:, 3, 3] = v
-        return cov
+        lever = self.p - self.p.mean(axis=0)  # short, where no digits are lost
+        running = np.cumsum(_seen_from_afar(self.drift, -lever), axis=0)
+        return _seen_from_afar(running[j] - running[i], lever[j])
 
 
 def measured(sightings: Sequence[Sighting]) -> Edges:

@@ -15,14 +15,19 @@ class PoseGraphOptions:
     """A place seen less long ago than this is not looked for: the odometry still knows it."""
     min_inliers: int = 25
     """Points that must support a loop."""
+    overconfidence: float = 3.0
+    """How many times as far as its covariance says the odometry drifts; filters know too little of what they do not
+    know."""
     position_drift: float = 0.03
-    """Drift of the odometry's position, m after 1 m; it grows with the square root of the way."""
+    """Least drift of the odometry's position, m after 1 m; it grows with the square root of the way."""
     yaw_drift_deg: float = 0.2
-    """Drift of the odometry's yaw, deg after 1 s; it grows with the square root of the time."""
+    """Least drift of the odometry's yaw, deg after 1 s; it grows with the square root of the time."""
 
     def __post_init__(self) -> None:
         if self.max_corners < 1 or self.min_inliers < 4:
             raise ValueError("needs max_corners >= 1 and min_inliers >= 4")
+        if not self.overconfidence >= 0.0:
+            raise ValueError(f"needs overconfidence >= 0, got {self.overconfidence:g}")
         for name in ("parallax_px", "min_gap_s", "position_drift", "yaw_drift_deg"):
             if not getattr(self, name) > 0.0:
                 raise ValueError(f"needs {name} > 0, got {getattr(self, name):g}")

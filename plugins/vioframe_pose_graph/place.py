@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vioframe.geometry.resection import resect
-from vioframe.types import Float, Image, Int
+from vioframe.types import Float, Image, Int, NavState
 from vioframe_pose_graph.keyframes import Keyframe
 
 _MAX_SIGMAS = 4.0
@@ -39,7 +39,8 @@ _PRIOR = np.repeat([np.radians(1.0), 0.03], 3) ** -2.0
 class Place:
     """Where a keyframe was: its body as the odometry gave it, its camera as its landmarks say.
 
-    ``p_WB_seen`` (3,) m is where the body is by that.
+    ``p_WB_seen`` (3,) m is where the body is by that. ``cov`` (4, 4) is that of [p_WB yaw] by the odometry, NaN where
+    it does not say.
     """
 
     t_ns: int
@@ -49,6 +50,7 @@ class Place:
     p_WB_seen: Float
     R_WC: Float
     p_WC: Float
+    cov: Float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -79,8 +81,18 @@ def describe(keyframe: Keyframe, orb: cv2.ORB, sigma_px: float) -> tuple[Place, 
     R_WC, p_WC, _, squared = resect(keyframe.R_WC, keyframe.p_WC, p_WF[known], xy_normalised[known], sigma, 1.0, _PRIOR)
     p_WF[known[squared > _MAX_SIGMAS**2]] = np.nan
     p_WB_seen = state.p_WB + p_WC - keyframe.p_WC
-    place = Place(state.t_ns, keyframe.segment, state.R_WB, state.p_WB, p_WB_seen, R_WC, p_WC)
+    place = Place(state.t_ns, keyframe.segment, state.R_WB, state.p_WB, p_WB_seen, R_WC, p_WC, _levelled(state))
     return place, View(xy_normalised.astype(np.float32), p_WF.astype(np.float32), descriptors)
+
+
+def _levelled(state: NavState) -> Float:
+    """(4, 4) the covariance of position and yaw alone."""
+    if state.cov is None:
+        return np.full((4, 4), np.nan)
+    J = np.zeros((4, 6))
+    J[:3, 3:] = np.eye(3)
+    J[3, :3] = state.R_WB[2]  # R_WB dtheta about z
+    return np.asarray(J @ state.cov[:6, :6] @ J.T)
 
 
 def _described(orb: cv2.ORB, image: Image, xy: Float, angle_deg: float) -> tuple[Float, Words, Int]:

@@ -27,8 +27,12 @@ _APART_PX = 10.0
 _HYPOTHESES = 300
 # The pairs know nothing of tilt, so their support is counted more generously than that of the fit.
 _COARSE = 2.0
+# As many standard deviations of where a point is seen are tolerated.
+_TOLERATED = 3.0
 _TILT_SIGMA, _MAX_TILT = np.radians(0.5), np.radians(2.0)
 _LEAST_SIGMA = 0.2
+# How well the distance of a landmark from the camera that it was seen by is known, as a part of it.
+_DEPTH_SIGMA = 0.03
 _ITERATIONS, _CONVERGED = 10, 1e-6
 _PARALLEL = 1e-6
 
@@ -111,8 +115,9 @@ def _draw_pairs(side: Int) -> Int:
     return np.column_stack([i, starts[i] + (i - starts[i] + step) % sizes[i]])
 
 
-def residuals(seen: Correspondences, p_B: Float, p_AB: Float, R_AB: Float) -> tuple[Float, Float]:
-    """(M, 2) on the z = 1 plane, and (M, 2, 6) their derivatives by [p_AB, rotation]; NaN for points behind the camera.
+def residuals(seen: Correspondences, p_B: Float, p_AB: Float, R_AB: Float) -> tuple[Float, Float, Float]:
+    """(M, 2) on the z = 1 plane, and their derivatives (M, 2, 6) by [p_AB, rotation] and (M, 2) by the depth of a point
+    in the camera it is known from, as a part of it; NaN for points behind the camera.
 
     ``p_A = R_AB (p - p_B) + p_AB``, with ``R_AB <- Exp(rotation) R_AB`` and ``p_B`` (3,) the later body in its world.
     """
@@ -123,8 +128,18 @@ def residuals(seen: Correspondences, p_B: Float, p_AB: Float, R_AB: Float) -> tu
     p_C = np.einsum("mij,mj->mi", R_CW, there - seen.p_WC[seen.side])
     d_there = np.concatenate([np.broadcast_to(np.eye(3), (len(turned), 3, 3)), -so3.hat(turned)], axis=2)
     d_there[seen.side == 1] = -R_AB.T @ d_there[seen.side == 1]
-    xy, J = projected(p_C, R_CW @ d_there)
-    return xy - seen.xy, J
+    away = seen.points - seen.p_WC[1 - seen.side]
+    away = np.where(forward, away @ R_AB.T, away @ R_AB)
+    xy, J = projected(p_C, R_CW @ np.concatenate([d_there, away[:, :, None]], axis=2))
+    return xy - seen.xy, J[:, :, :6], J[:, :, 6]
+
+
+def _shortened(values: Float, along: Float, sigma: float) -> Float:
+    """(M, 2, K) of errors of ``sigma``, whitened to it where a depth that is off adds more, ``along`` (M, 2)."""
+    squared = np.sum(along**2, axis=1)
+    rest = 1.0 / np.sqrt(1.0 + (_DEPTH_SIGMA / sigma) ** 2 * squared)
+    part = np.einsum("mi,mik->mk", along, values) * ((1.0 - rest) / np.maximum(squared, _PARALLEL**2))[:, None]
+    return values - along[:, :, None] * part[:, None, :]
 
 
 def _refined(
@@ -133,18 +148,22 @@ def _refined(
     """Iterate to the least-squares fit of what lies within ``tolerance``, which is decided anew each time.
 
     The tilt is free within what two attitudes of an odometry may disagree: forced to zero, half a degree of it would
-    become several centimetres of position, as the points are metres away.
+    become several centimetres of position, as the points are metres away. How far away is known to some per cent, so a
+    point counts less along the line on which a wrong depth would move it: the farther the two cameras are apart, the
+    more.
     """
-    p_AB = R_AB @ p_B + t
+    p_AB, sigma = R_AB @ p_B + t, tolerance / _TOLERATED
     for _ in range(_ITERATIONS):
-        r, J = residuals(seen, p_B, p_AB, R_AB)
-        inlier = np.linalg.norm(r, axis=1) < tolerance
+        r, J, along = residuals(seen, p_B, p_AB, R_AB)
+        off = _shortened(r[:, :, None], along, tolerance / _TOLERATED)[:, :, 0]
+        inlier = np.linalg.norm(off, axis=1) < tolerance
         if inlier.sum() < min_inliers:
             return None
-        variance = max(float(np.mean(r[inlier] ** 2)), (_LEAST_SIGMA * tolerance) ** 2)
+        white = _shortened(np.concatenate([r[:, :, None], J], axis=2)[inlier], along[inlier], sigma)
+        sigma = max(float(np.sqrt(np.mean(white[:, :, 0] ** 2))), _LEAST_SIGMA * tolerance)
         tilt = so3.log(R_AB @ rotation_z(yaw_of(R_AB)).T)[:2]
-        J_in = J[inlier].reshape(-1, 6)
-        H, g = J_in.T @ J_in / variance, J_in.T @ r[inlier].ravel() / variance
+        J_in = white[:, :, 1:].reshape(-1, 6) / sigma
+        H, g = J_in.T @ J_in, J_in.T @ white[:, :, 0].ravel() / sigma
         H[[3, 4], [3, 4]] += 1.0 / _TILT_SIGMA**2
         g[3:5] += tilt / _TILT_SIGMA**2
         step = np.linalg.solve(H, -g)
