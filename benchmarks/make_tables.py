@@ -254,6 +254,28 @@ def take_off() -> str:
     return markdown(shown) + source(rows)
 
 
+def loops() -> str:
+    """What loops made of the odometry's own path; each flight's runs, and all."""
+    rows = _in_m(recorded("loops.json"))
+    shown = []
+    flights = [(f"{clip}, `{backend}`", own) for (clip, backend), own in rows.groupby(["clip", "backend"], sort=False)]
+    for name, own in (*flights, ("all", rows)):
+        ratios = own["ratio"].fillna(1.0)
+        shown.append(
+            {
+                "flight, back-end": name,
+                "n": f"{len(own)}",
+                "ATE": "-" if name == "all" else _spread(own["ate_m"]),
+                "with loops": "-" if name == "all" else _spread(1e-3 * own["ate_loops_mm"]),
+                "ratio, mean": f"{ratios.mean():.2f}",
+                "largest": f"{ratios.max():.2f}",
+                "above 1.02": f"{(ratios > 1.02).sum()}",
+                "loops a run": f"{own['loops'].mean():.0f}",
+            }
+        )
+    return markdown(shown) + source(rows)
+
+
 def april() -> str:
     """The AprilGrid board."""
     rows = recorded("april_*.json")
@@ -517,6 +539,7 @@ FIGURES: dict[str, Callable[[], str]] = {
             one_or_two,
             error_budget,
             take_off,
+            loops,
             april,
             frontend,
             whole_runs,

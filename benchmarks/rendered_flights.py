@@ -18,12 +18,14 @@ from common import benchmark, present, render
 from euroc_clips import run
 
 from vioframe.bench import Row
+from vioframe.bench.suites.sources import EUROC
 from vioframe.parts import config as configuration
 from vioframe.parts import registry
 from vioframe.parts.config import Config, DatasetConfig, PartConfig
+from vioframe.parts.registry import Registry
 from vioframe.simulation.config import SimulationConfig
 
-START_S = {"MH_05_difficult": 5.0, "V1_02_medium": 0.0}
+FLIGHTS = ("MH_05_difficult", "V1_02_medium")
 WORLDS = 5
 COLUMNS = {
     "clip": "",
@@ -70,16 +72,14 @@ def main(
 
     def rows() -> Iterator[Row]:
         with TemporaryDirectory() as temporary:
-            for world, name in product(range(worlds), START_S):
-                bag = (bags or Path(temporary)) / f"{name}_{world}.bag"
-                if not bag.exists():
-                    render(SimulationConfig(recorded=data / "euroc_imu_gt" / name, seed=world), installed, bag)
+            for world, name in product(range(worlds), FLIGHTS):
+                bag = recording(bags or Path(temporary), name, world, data, installed)
                 for detector, options in product(detectors, contenders):
                     config = Config(
                         dataset=DatasetConfig(path=bag),
                         detector=PartConfig(name=detector),
                         backend=PartConfig(name=backend),
-                        start_s=START_S[name],
+                        start_s=EUROC[name].start_s,
                     )
                     config = configuration.override(config, installed, [*assignments, *options])
                     row = run(config, installed, Path(temporary) / f"{bag.stem}_{detector}_{'_'.join(options)}")
@@ -87,8 +87,16 @@ def main(
                 if bags is None:
                     bag.unlink()
 
-    settings = {"backend": backend, "options": list(assignments), "against": list(against), "start_s": START_S}
+    settings = {"backend": backend, "options": list(assignments), "against": list(against)}
     present("rendered_flights", f"{backend}: rendered EuRoC flights", rows(), COLUMNS, settings, keep)
+
+
+def recording(folder: Path, flight: str, world: int, data: Path, installed: Registry) -> Path:
+    """The bag in ``folder`` with EuRoC's ``flight``, images rendered in ``world``; written where it is not there."""
+    bag = folder / f"{flight}_{world}.bag"
+    if not bag.exists():
+        render(SimulationConfig(recorded=data / "euroc_imu_gt" / flight, seed=world), installed, bag)
+    return bag
 
 
 if __name__ == "__main__":

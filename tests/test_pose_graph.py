@@ -10,7 +10,7 @@ import pytest
 
 from vioframe.geometry.so3 import rotation_z
 from vioframe_pose_graph.closer import carry
-from vioframe_pose_graph.consistency import Odometry
+from vioframe_pose_graph.consistency import Odometry, corrected
 from vioframe_pose_graph.graph import Edges, mahalanobis_squared, residuals, solve, solve_robustly, uncertainty
 from vioframe_pose_graph.options import PoseGraphOptions
 
@@ -317,6 +317,22 @@ def test_images_that_told_more_than_was_lost_take_no_drift_away():
     drift = Odometry.of(t_ns, p, segment, OPTIONS, unknown).drift
     np.testing.assert_array_equal(drift[12:14], walk[12:14])
     assert (np.trace(drift[[11, 14]] - walk[[11, 14]], axis1=1, axis2=2) > 0.0).all()
+
+
+def test_loops_of_one_place_count_once():
+    """Ten keyframes that see one place again are off by the same; others that see others are not."""
+    t_ns, p, _ = circle(laps=2)
+    odometry, yaw_error = drifted(p, np.random.default_rng(3))
+    graph = Odometry.of(t_ns, odometry, np.zeros(len(p), int), OPTIONS)
+    one = true_loops(p, yaw_error, [(2, 42)], sigma=(0.3, 0.05))
+    ten = one.select(np.zeros(10, int))
+    apart = true_loops(p, yaw_error, [(2, 42), (12, 52), (22, 62)], sigma=(0.3, 0.05))
+    once, often, whole = (corrected(graph, loops, t_ns, every(loops))[0] for loops in (one, ten, apart))
+    np.testing.assert_allclose(often, once, atol=1e-4)
+    edges = graph.edges() + apart
+    np.testing.assert_allclose(whole, solve(odometry, np.zeros(len(p)), edges)[0], atol=1e-4)
+    believed = corrected(graph, ten, t_ns, every(ten))[2]
+    assert believed.all()
 
 
 def test_a_segment_after_a_reset_is_hardly_tied_to_the_one_before():

@@ -18,8 +18,8 @@ from vioframe.geometry.so3 import rotation_z, yaw_of
 from vioframe.geometry.trajectory import Trajectory
 from vioframe.stopwatch import working_s
 from vioframe.types import NS_PER_S, Calibration, Float, Int, Loop, LoopClosure, MapCorrection, Status, Step
-from vioframe_pose_graph.consistency import REPEAT_NS, Odometry, agreed, measured, within_drift
-from vioframe_pose_graph.graph import solve_robustly, wrapped
+from vioframe_pose_graph.consistency import REPEAT_NS, Odometry, agreed, corrected, measured, within_drift
+from vioframe_pose_graph.graph import wrapped
 from vioframe_pose_graph.keyframes import Keyframe, KeyframeSelector
 from vioframe_pose_graph.matching import DescriptorIndex, match
 from vioframe_pose_graph.options import PoseGraphOptions
@@ -108,7 +108,7 @@ class PoseGraph:
         nodes, number = np.unique(nodes, return_inverse=True)
         i, j = number[1:-1].reshape(2, -1)
         few = odometry.at(nodes)
-        p, yaw, _ = solve_robustly(few.p, few.edges(), replace(loops, i=i, j=j), likely)
+        p, yaw, _ = corrected(few, replace(loops, i=i, j=j), t_ns[nodes], likely)
         R_MW = rotation_z(yaw[-1])
         return MapCorrection(R_MW, p[-1] - R_MW @ few.p[-1])
 
@@ -127,13 +127,13 @@ class PoseGraph:
         said = measured(sightings)
         sound, likely = agreed(said, odometry, t_ns), within_drift(said, odometry)
         accepted = np.zeros(len(sightings), bool)
-        p, yaw, accepted[sound] = solve_robustly(odometry.p, odometry.edges(), said.select(sound), likely[sound])
-        trajectory = self._corrected(t_ns, segment, odometry.p, p, yaw)
+        p, yaw, accepted[sound] = corrected(odometry, said.select(sound), t_ns, likely[sound])
+        trajectory = self._carried(t_ns, segment, odometry.p, p, yaw)
         loops = tuple(_loop(s, places, good) for s, good in zip(sightings, accepted.tolist(), strict=True))
         seconds = {"solve_so_far": self._solving_s, "solve": working_s() - begin}
         return LoopClosure(trajectory, t_ns, loops, {**self._recogniser.seconds, **seconds})
 
-    def _corrected(self, t_ns: Int, segment: Int, key_p: Float, p: Float, yaw: Float) -> Trajectory:
+    def _carried(self, t_ns: Int, segment: Int, key_p: Float, p: Float, yaw: Float) -> Trajectory:
         stamps = np.array(self._t_ns, np.int64)
         frames = (
             stamps,

@@ -10,14 +10,14 @@ at least.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from vioframe.arrays import Bool
 from vioframe.geometry.so3 import rotation_z
 from vioframe.types import NS_PER_S, Float, Int
-from vioframe_pose_graph.graph import GATE, Edges, mahalanobis_squared, wrapped
+from vioframe_pose_graph.graph import GATE, Edges, mahalanobis_squared, solve, solve_robustly, wrapped
 from vioframe_pose_graph.options import PoseGraphOptions
 from vioframe_pose_graph.recognition import Sighting
 
@@ -116,12 +116,12 @@ def within_drift(loops: Edges, odometry: Odometry) -> Bool:
 
 
 def agreed(loops: Edges, odometry: Odometry, t_ns: Int) -> Bool:
-    """(S,) whether another keyframe, soon before or after, says the same as a loop, and its own nothing else."""
+    """(S,) whether another keyframe, soon before or after, says the same as a loop, and its own nothing else.
+
+    The loops come in the order of their later keyframes.
+    """
     later = loops.j
-    # The loops come in the order of their later keyframes.
-    ends = np.searchsorted(t_ns[later], t_ns[later] + REPEAT_NS, side="right")
-    a = np.repeat(np.arange(len(later)), ends - np.arange(len(later)) - 1)
-    b = np.concatenate([np.empty(0, np.int64), *(np.arange(k + 1, end) for k, end in enumerate(ends))])
+    a, b = _soon_after(t_ns[later])
     agree = _disagreement(loops, odometry, a, b) < GATE
     own = later[a] == later[b]
     repeated, contradicted = np.zeros(len(later), bool), np.zeros(len(later), bool)
@@ -129,6 +129,35 @@ def agreed(loops: Edges, odometry: Odometry, t_ns: Int) -> Bool:
         repeated[side[agree & ~own]] = True
         contradicted[side[~agree & own]] = True
     return np.asarray(repeated & ~contradicted)
+
+
+def corrected(odometry: Odometry, loops: Edges, t_ns: Int, trusted: Bool) -> tuple[Float, Float, Bool]:
+    """Positions (N, 3), yaws (N,) and which of the ``loops`` (L,) were believed; ``trusted`` (L,) as for
+    :func:`~vioframe_pose_graph.graph.solve_robustly`.
+
+    Loops that tie one stretch to one other are of the same landmarks, and off by the same: together they count once.
+    """
+    edges = odometry.edges()
+    p, yaw, used = solve_robustly(odometry.p, edges, loops, trusted)
+    if used.any():
+        believed = loops.select(used)
+        p, yaw = solve(p, yaw, edges + replace(believed, cov=believed.cov * _alike(believed, t_ns)[:, None, None]))
+    return p, yaw, used
+
+
+def _alike(loops: Edges, t_ns: Int) -> Int:
+    """(L,) how many of the loops, itself among them, tie the stretches of keyframes that each one ties."""
+    a, b = _soon_after(t_ns[loops.j])
+    same = np.abs(t_ns[loops.i[a]] - t_ns[loops.i[b]]) <= REPEAT_NS
+    return 1 + np.bincount(np.concatenate([a[same], b[same]]), minlength=len(loops))
+
+
+def _soon_after(t_ns: Int) -> tuple[Int, Int]:
+    """The pairs (P,), (P,) of which the second comes at most :data:`REPEAT_NS` after the first; ``t_ns`` ascend."""
+    ends = np.searchsorted(t_ns, t_ns + REPEAT_NS, side="right")
+    a = np.repeat(np.arange(len(t_ns)), ends - np.arange(len(t_ns)) - 1)
+    b = np.concatenate([np.empty(0, np.int64), *(np.arange(k + 1, end) for k, end in enumerate(ends))])
+    return a, b
 
 
 def _disagreement(loops: Edges, odometry: Odometry, a: Int, b: Int) -> Float:

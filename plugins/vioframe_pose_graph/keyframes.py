@@ -26,7 +26,9 @@ class Keyframe:
 
     ``segment`` numbers the stretches of tracking between resets. ``R_WC`` and ``p_WC`` are the pose of the camera
     ``model`` when the image was taken, by the calibration that the back-end had learned by then. ``p_WF`` (N, 3) m is
-    what is known of the tracked features a second later, NaN where nothing is.
+    what is known of the tracked features a second later, NaN where nothing is, and ``parallax`` (N,) rad the angle
+    between the rays to each from where it was seen first and from where it was seen last by then; inf where that is
+    one place.
     """
 
     state: NavState
@@ -37,6 +39,7 @@ class Keyframe:
     R_WC: Float
     p_WC: Float
     p_WF: Float
+    parallax: Float
 
 
 class KeyframeSelector:
@@ -47,12 +50,15 @@ class KeyframeSelector:
 
     def __init__(self, calibration: Calibration, parallax_px: float) -> None:
         self._camera = calibration.cameras[0]
+        self._p_BC = [camera.p_BC for camera in calibration.cameras]
         self._offset_ns = self._camera.time_offset_ns
         self._parallax = parallax_px / self._camera.model.focal_px
         self._previous: NavState | None = None
         self._pending: deque[Keyframe] = deque()
         self._last: Keyframe | None = None
         self._p_WF: dict[int, Float] = {}
+        # From where each feature was seen first, and last.
+        self._seen_from: dict[int, tuple[Float, Float]] = {}
         self._tracking = False
         self.segment = -1
 
@@ -75,10 +81,12 @@ class KeyframeSelector:
         R_WC, p_WC = self._camera_pose(state)
         self._previous = state
         image, tracks = next(iter(step.frames.images), None), step.tracks.of_camera(0)
+        self._see(step.tracks, state)
         if image is not None and (
             self._last is None or (estimate.is_keyframe and self._moved_on(self._last, tracks, R_WC))
         ):
-            self._last = Keyframe(state, self.segment, image, tracks, self._camera.model, R_WC, p_WC, _UNKNOWN)
+            pose, known = (R_WC, p_WC), (_UNKNOWN, _UNKNOWN)
+            self._last = Keyframe(state, self.segment, image, tracks, self._camera.model, *pose, *known)
             self._pending.append(self._last)
             self._forget(tracks)
         while self._pending and step.frames.t_ns - self._pending[0].state.t_ns >= _WAIT_NS:
@@ -90,6 +98,7 @@ class KeyframeSelector:
         ready = [self._complete(pending) for pending in self._pending]
         self._pending.clear()
         self._p_WF.clear()
+        self._seen_from.clear()
         return ready
 
     def _camera_pose(self, state: NavState) -> tuple[Float, Float]:
@@ -103,6 +112,13 @@ class KeyframeSelector:
             R_WB, p_WB = R_WB @ so3.exp(rate_B * late_s), p_WB + state.v_WB * late_s
         return R_WB @ self._camera.R_BC, p_WB + R_WB @ self._camera.p_BC
 
+    def _see(self, tracks: FrameTracks, state: NavState) -> None:
+        """Remember from where features were seen, by every camera: two see what is far though the body stands still."""
+        for number, p_BC in enumerate(self._p_BC):
+            p_WC = state.p_WB + state.R_WB @ p_BC
+            for i in tracks.of_camera(number).ids.tolist():
+                self._seen_from[i] = self._seen_from.get(i, (p_WC,))[0], p_WC
+
     def _moved_on(self, last: Keyframe, tracks: FrameTracks, R_WC: Float) -> bool:
         _, i, j = np.intersect1d(last.tracks.ids, tracks.ids, assume_unique=True, return_indices=True)
         if len(i) < _MIN_COMMON * len(last.tracks.ids):
@@ -111,10 +127,15 @@ class KeyframeSelector:
         return median_parallax(now, before, R_WC.T @ last.R_WC) > self._parallax
 
     def _forget(self, tracks: FrameTracks) -> None:
-        """Drop the positions that no keyframe in waiting and no track of now asks for."""
+        """Drop what no keyframe in waiting and no track of now asks for."""
         needed = set(tracks.ids.tolist()).union(*(pending.tracks.ids.tolist() for pending in self._pending))
         self._p_WF = {i: p for i, p in self._p_WF.items() if i in needed}
+        self._seen_from = {i: seen for i, seen in self._seen_from.items() if i in needed}
 
     def _complete(self, pending: Keyframe) -> Keyframe:
-        known = [self._p_WF.get(i, _UNKNOWN) for i in pending.tracks.ids.tolist()]
-        return replace(pending, p_WF=np.array(known).reshape(-1, 3))
+        ids = pending.tracks.ids.tolist()
+        p_WF = np.array([self._p_WF.get(i, _UNKNOWN) for i in ids]).reshape(-1, 3)
+        first, last = (p_WF - np.array([self._seen_from[i][end] for i in ids]).reshape(-1, 3) for end in (0, 1))
+        parallax = np.arctan2(np.linalg.norm(np.cross(first, last), axis=1), np.sum(first * last, axis=1))
+        parallax[(first == last).all(axis=1)] = np.inf  # seen but once: who knows where it is knows it by other means
+        return replace(pending, p_WF=p_WF, parallax=parallax)

@@ -23,6 +23,8 @@ from vioframe.types import Float, Image, Int, NavState
 from vioframe_pose_graph.keyframes import Keyframe
 
 _MAX_SIGMAS = 4.0
+# How well the distance of a landmark is known at best, as a part of it, and the least angle of its rays, rad.
+_LEAST_DEPTH_SIGMA, _PARALLEL = 0.02, 1e-3
 
 Float32 = NDArray[np.float32]
 Words = NDArray[np.uint64]
@@ -55,10 +57,14 @@ class Place:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class View:
-    """K described points of a keyframe on the z = 1 plane, some of them with a position ``p_WF`` (K, 3) m, else NaN."""
+    """K described points of a keyframe on the z = 1 plane, some of them with a position ``p_WF`` (K, 3) m, else NaN.
+
+    ``depth_sigma`` (K,) is how well their distance from the camera is known, as a part of it.
+    """
 
     xy_normalised: Float32
     p_WF: Float32
+    depth_sigma: Float32
     descriptors: Words
 
 
@@ -81,8 +87,10 @@ def describe(keyframe: Keyframe, orb: cv2.ORB, sigma_px: float) -> tuple[Place, 
     R_WC, p_WC, _, squared = resect(keyframe.R_WC, keyframe.p_WC, p_WF[known], xy_normalised[known], sigma, 1.0, _PRIOR)
     p_WF[known[squared > _MAX_SIGMAS**2]] = np.nan
     p_WB_seen = state.p_WB + p_WC - keyframe.p_WC
+    depth_sigma = np.hypot(_LEAST_DEPTH_SIGMA, sigma / np.maximum(keyframe.parallax[which], _PARALLEL))
     place = Place(state.t_ns, keyframe.segment, state.R_WB, state.p_WB, p_WB_seen, R_WC, p_WC, _levelled(state))
-    return place, View(xy_normalised.astype(np.float32), p_WF.astype(np.float32), descriptors)
+    points = (known.astype(np.float32) for known in (xy_normalised, p_WF, depth_sigma))
+    return place, View(*points, descriptors)
 
 
 def _levelled(state: NavState) -> Float:

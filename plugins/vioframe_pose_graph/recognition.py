@@ -44,8 +44,8 @@ class Recogniser:
         self._focal_px, self._options = focal_px, options
         self._orb = corner_finder(options.max_corners)
         self._index = DescriptorIndex()
-        # How a place looked: points and positions as in its view; its descriptors are rows of the index.
-        self._remembered: dict[int, tuple[Float32, Float32, slice]] = {}
+        # How a place looked: points as in its view; its descriptors are rows of the index.
+        self._remembered: dict[int, tuple[Float32, Float32, Float32, slice]] = {}
         self.places: list[Place] = []
         self.sightings: list[Sighting] = []
         self.seconds: dict[str, float] = {}
@@ -69,7 +69,7 @@ class Recogniser:
             if relation is not None:
                 self.sightings.append(Sighting(earlier, number, relation))
         self.places.append(place)
-        self._remembered[number] = view.xy_normalised, view.p_WF, rows
+        self._remembered[number] = view.xy_normalised, view.p_WF, view.depth_sigma, rows
         if len(self._remembered) > _MOST_REMEMBERED:
             self._thin_out()
         watch.lap("verify")
@@ -77,8 +77,8 @@ class Recogniser:
             self.seconds[stage] = self.seconds.get(stage, 0.0) + seconds
 
     def _view(self, number: int) -> View:
-        xy_normalised, p_WF, rows = self._remembered[number]
-        return View(xy_normalised, p_WF, self._index.descriptors(rows))
+        *points, rows = self._remembered[number]
+        return View(*points, self._index.descriptors(rows))
 
     def _retrieve(self, place: Place, view: View) -> list[int]:
         """Numbers of the earlier keyframes that look most like ``place``, no two of them neighbours."""
@@ -92,9 +92,9 @@ class Recogniser:
         old, index = self._remembered, DescriptorIndex()
         older = set(list(old)[1 : len(old) // 2 : 2])
         self._remembered = {}
-        for number, (xy_normalised, p_WF, rows) in old.items():
+        for number, (*points, rows) in old.items():
             if number not in older:
-                self._remembered[number] = xy_normalised, p_WF, index.add(self._index.descriptors(rows), number)
+                self._remembered[number] = *points, index.add(self._index.descriptors(rows), number)
         self._index = index
 
 

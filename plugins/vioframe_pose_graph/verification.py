@@ -31,8 +31,6 @@ _COARSE = 2.0
 _TOLERATED = 3.0
 _TILT_SIGMA, _MAX_TILT = np.radians(0.5), np.radians(2.0)
 _LEAST_SIGMA = 0.2
-# How well the distance of a landmark from the camera that it was seen by is known, as a part of it.
-_DEPTH_SIGMA = 0.03
 _ITERATIONS, _CONVERGED = 10, 1e-6
 _PARALLEL = 1e-6
 
@@ -41,12 +39,14 @@ _PARALLEL = 1e-6
 class Correspondences:
     """Points (M, 3) m of one keyframe and where the other saw them, ``xy`` (M, 2) on its z = 1 plane.
 
+    ``depth_sigma`` (M,) is how well their distance in their own keyframe is known, as a part of it.
     ``side`` (M,): 0 for points of the later keyframe seen by the earlier one, 1 for the reverse. ``R_WC`` (2, 3, 3) and
     ``p_WC`` (2, 3) are the cameras that saw them, by side. ``pairs`` (M, 2) names them by their place in the earlier
     and the later keyframe: a match may occur on both sides.
     """
 
     points: Float
+    depth_sigma: Float
     xy: Float
     side: Int
     R_WC: Float
@@ -91,10 +91,11 @@ def correspondences(earlier: Seen, later: Seen, apart: float) -> Correspondences
         xy = target.xy_normalised.astype(np.float64)
         found = match(source.descriptors[known], target.descriptors, xy, _MAX_DISTANCE, _RATIO, apart)
         known, found = known[found >= 0], found[found >= 0]
-        sides.append((source.p_WF[known], target.xy_normalised[found], known, found))
-    (p_0, xy_0, later_0, earlier_0), (p_1, xy_1, earlier_1, later_1) = sides
+        sides.append((source.p_WF[known], source.depth_sigma[known], target.xy_normalised[found], known, found))
+    (p_0, depth_0, xy_0, later_0, earlier_0), (p_1, depth_1, xy_1, earlier_1, later_1) = sides
     return Correspondences(
         points=np.concatenate([p_0, p_1]).astype(np.float64),
+        depth_sigma=np.concatenate([depth_0, depth_1]).astype(np.float64),
         xy=np.concatenate([xy_0, xy_1]).astype(np.float64),
         side=np.repeat([0, 1], [len(p_0), len(p_1)]),
         R_WC=np.stack([earlier[0].R_WC, later[0].R_WC]),
@@ -116,8 +117,8 @@ def _draw_pairs(side: Int) -> Int:
 
 
 def residuals(seen: Correspondences, p_B: Float, p_AB: Float, R_AB: Float) -> tuple[Float, Float, Float]:
-    """(M, 2) on the z = 1 plane, and their derivatives (M, 2, 6) by [p_AB, rotation] and (M, 2) by the depth of a point
-    in the camera it is known from, as a part of it; NaN for points behind the camera.
+    """(M, 2) on the z = 1 plane, their derivatives (M, 2, 6) by [p_AB, rotation], and where a standard deviation of its
+    depth moves a point, (M, 2); NaN for points behind the camera.
 
     ``p_A = R_AB (p - p_B) + p_AB``, with ``R_AB <- Exp(rotation) R_AB`` and ``p_B`` (3,) the later body in its world.
     """
@@ -131,13 +132,13 @@ def residuals(seen: Correspondences, p_B: Float, p_AB: Float, R_AB: Float) -> tu
     away = seen.points - seen.p_WC[1 - seen.side]
     away = np.where(forward, away @ R_AB.T, away @ R_AB)
     xy, J = projected(p_C, R_CW @ np.concatenate([d_there, away[:, :, None]], axis=2))
-    return xy - seen.xy, J[:, :, :6], J[:, :, 6]
+    return xy - seen.xy, J[:, :, :6], J[:, :, 6] * seen.depth_sigma[:, None]
 
 
 def _shortened(values: Float, along: Float, sigma: float) -> Float:
     """(M, 2, K) of errors of ``sigma``, whitened to it where a depth that is off adds more, ``along`` (M, 2)."""
     squared = np.sum(along**2, axis=1)
-    rest = 1.0 / np.sqrt(1.0 + (_DEPTH_SIGMA / sigma) ** 2 * squared)
+    rest = 1.0 / np.sqrt(1.0 + squared / sigma**2)
     part = np.einsum("mi,mik->mk", along, values) * ((1.0 - rest) / np.maximum(squared, _PARALLEL**2))[:, None]
     return values - along[:, :, None] * part[:, None, :]
 
