@@ -54,10 +54,6 @@ class Setup(Section):
         return simulated_sequence(self.flight, seed=seed, calibration=calibration, **sensors)
 
 
-# The simulated IMU has the noise that its calibration states: there is no vibration.
-EXACT = EstimationOptions(imu_noise_factor=1.0)
-
-
 def fly(setup: Setup, part: PartConfig, seed: int) -> Trial:
     """One trial of the back-end ``part`` on one core.
 
@@ -70,7 +66,7 @@ def fly(setup: Setup, part: PartConfig, seed: int) -> Trial:
     # Small matrices; and sums in another order would be other results.
     with threadpool_limits(1):
         try:
-            run = run_backend(sequence, backend, EXACT)
+            run = run_backend(sequence, backend, EstimationOptions())
         except Exception as error:
             if isinstance(error.__cause__, KeyboardInterrupt):
                 raise KeyboardInterrupt from error  # Ctrl-C within compiled code
