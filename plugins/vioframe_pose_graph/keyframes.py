@@ -18,6 +18,8 @@ _MIN_COMMON = 0.5
 # From one frame to the next a body turns steadily, if they are no farther apart.
 _STEADY_S = 0.2
 _UNKNOWN = np.full(3, np.nan)
+# Features of which so many are remembered are looked through for those that nobody asks for any more.
+_MANY = 5000
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -88,7 +90,8 @@ class KeyframeSelector:
             pose, known = (R_WC, p_WC), (_UNKNOWN, _UNKNOWN)
             self._last = Keyframe(state, self.segment, image, tracks, self._camera.model, *pose, *known)
             self._pending.append(self._last)
-            self._forget(tracks)
+        if len(self._seen_from) > _MANY:
+            self._forget(step.tracks)
         while self._pending and step.frames.t_ns - self._pending[0].state.t_ns >= _WAIT_NS:
             ready.append(self._complete(self._pending.popleft()))
         return ready
