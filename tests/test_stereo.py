@@ -145,3 +145,41 @@ def test_what_one_camera_saw_alone_is_taken_over_by_the_other():
     images[0] = (np.zeros_like(images[0][0]), images[0][1])
     first, second, _ = play(RIG, images)
     assert len(np.intersect1d(first.of_camera(1).ids, second.of_camera(0).ids)) > 20
+
+
+def turned(camera: CameraOnBody, R_B1B2) -> CameraOnBody:
+    """The camera, in B1, of a body that has turned to B2."""
+    return replace(camera, R_BC=R_B1B2 @ camera.R_BC, p_BC=R_B1B2 @ camera.p_BC)
+
+
+def one_after_the_other(rate_B, apart_s: float = 0.02, off_px: int = 0):
+    """The left image, then the right one, of a body that turns at ``rate_B`` rad/s; and the cameras as they were."""
+    frontend = Frontend(ShiTomasi(), RIG, FrontendOptions(max_points=80), Incidents())
+    cameras = LEFT, turned(RIG.cameras[1], so3.exp(np.array(rate_B) * apart_s))
+    right = np.roll(shown(cameras[1]), off_px, axis=0)
+    steps, before_ns = [], 0
+    for t_ns, images in ((PERIOD_NS, (shown(LEFT), None)), (PERIOD_NS + round(apart_s * 1e9), (None, right))):
+        stamps = np.linspace(before_ns, t_ns, 11).astype(np.int64)
+        imu = ImuSegment(stamps, np.tile(rate_B, (11, 1)), np.zeros((11, 3)))
+        steps.append(frontend.track(imu, FrameSet(t_ns, images), RIG))
+        before_ns = t_ns
+    return steps, cameras
+
+
+@pytest.mark.parametrize("rate_B", [(0.0, 0.0, 0.0), (0.0, 2.5, 0.0), (1.5, 0.0, -1.5)])
+def test_cameras_that_take_turns_share_their_points(rate_B):
+    (left, right), (first, second) = one_after_the_other(rate_B)
+    assert set(left.camera) == {0}
+    assert set(right.camera) == {1}
+    _, i, j = np.intersect1d(left.ids, right.ids, assume_unique=True, return_indices=True)
+    assert len(i) > 20
+    R_C2C1, p_C2C1 = first.seen_from(second)
+    on_wall = WALL_M * two_view.rays(left.xy_normalised[i]) @ R_C2C1.T + p_C2C1
+    expected, _ = projected(second.model, on_wall)
+    assert np.median(np.linalg.norm(second.model.distort(right.xy_normalised[j]) - expected, axis=1)) < 0.2
+
+
+@pytest.mark.parametrize("why", [{"off_px": 25}, {"apart_s": 0.08}], ids=["contradicts", "too long ago"])
+def test_cameras_that_take_turns_share_nothing_that_cannot_be(why):
+    (left, right), _ = one_after_the_other((0.0, 0.0, 0.0), **why)
+    assert len(np.intersect1d(left.ids, right.ids)) < 5

@@ -1,10 +1,13 @@
-"""One landmark, one id: points that one camera follows are looked for in the images of another, taken with it.
+"""One landmark, one id: points that one camera follows are looked for in the images of another, taken about then.
 
 Between two cameras ``p_C2 = R_C2C1 @ p_C1 + p_C2C1``. A point on the z = 1 plane of the first, at the inverse depth
-``rho``, is seen by the second at the direction of ``R_C2C1 @ [x y 1] + rho p_C2C1``.
+``rho``, is seen by the second at the direction of ``R_C2C1 @ [x y 1] + rho p_C2C1``. Where the second image came later,
+the gyroscope tells how the body has turned since the first; how it has moved is left open, within what a body can.
 """
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 
@@ -17,6 +20,8 @@ from vioframe.types import Bool, Calibration, Float, Int
 _EPIPOLAR_PX = 2.0
 # Nearer than this nothing is matched, 1/m, nor much farther than infinity, as noise can have it.
 _NEAREST, _FARTHEST = 1.0 / 0.2, -0.02
+# Images farther apart than this are not matched, s, and a body moves between them at most as fast as this, m/s.
+MOST_APART_S, _FASTEST_M_S = 0.06, 3.0
 # Cameras overlap where one sees this part of what another does, infinitely far away or at one of these distances, m.
 _LEAST_OVERLAP, _DISTANCES_M = 0.1, (np.inf, 5.0, 1.0)
 # What was not found is looked for again every so many images: it looks different from elsewhere.
@@ -32,16 +37,22 @@ class Pair:
         self._not_found: Int = np.empty(0, np.int64)
         self._images = 0
 
-    def match(self, views: tuple[View, ...], calibration: Calibration) -> None:
-        """Have the second camera follow what the first one does, and let go of what it only seemed to."""
+    def match(self, views: tuple[View, ...], calibration: Calibration, R_B1B2: Float, apart_s: float) -> None:
+        """Have the second camera follow what the first one does, and let go of what it only seemed to.
+
+        ``R_B1B2`` (3, 3) is how the body turned in the ``apart_s`` between the image of the first and that of the
+        second.
+        """
         one, other = views[self.first], views[self.second]
         if one.is_featureless or other.is_featureless:
             return
         self._images += 1
         if self._images % _AGAIN_IMAGES == 0:
             self._not_found = self._not_found[:0]
-        R_C2C1, p_C2C1 = calibration.cameras[self.first].seen_from(calibration.cameras[self.second])
-        nearest = _EPIPOLAR_PX / other.camera.focal_px
+        first = calibration.cameras[self.first]
+        then = replace(first, R_BC=R_B1B2.T @ first.R_BC, p_BC=R_B1B2.T @ first.p_BC)
+        R_C2C1, p_C2C1 = then.seen_from(calibration.cameras[self.second])
+        nearest = _EPIPOLAR_PX / other.camera.focal_px, _FASTEST_M_S * apart_s
         _, i, j = np.intersect1d(one.ids, other.ids, assume_unique=True, return_indices=True)
         right, rho = _agreement(one.xy_normalised[i], other.xy_normalised[j], R_C2C1, p_C2C1, nearest)
         wrong, typical = ~right, float(np.median(rho[right])) if right.any() else 0.0
@@ -74,9 +85,15 @@ def overlapping(calibration: Calibration) -> tuple[Pair, ...]:
     return tuple(Pair(o, c) for c in count for o in count if o != c and _overlap(calibration, o, c))
 
 
-def _agreement(xy_1: Float, xy_2: Float, R_C2C1: Float, p_C2C1: Float, threshold: float) -> tuple[Bool, Float]:
-    """Which pairs (N, 2) may be of one point, as near to each other's epipolar lines; and inverse depths (N,) 1/m."""
-    rho = inverse_depths(xy_1, xy_2, R_C2C1, p_C2C1)
+def _agreement(
+    xy_1: Float, xy_2: Float, R_C2C1: Float, p_C2C1: Float, nearest: tuple[float, float]
+) -> tuple[Bool, Float]:
+    """Which pairs (N, 2) may be of one point, as near to each other's epipolar lines; and inverse depths (N,) 1/m.
+
+    ``nearest`` is the least distance that is tolerated, on the z = 1 plane, and what the body may have moved, m.
+    """
+    rho, (least, moved_m) = inverse_depths(xy_1, xy_2, R_C2C1, p_C2C1), nearest
+    threshold = least + moved_m * np.maximum(rho, 0.0)
     near = np.abs(sampson_distance(essential_matrix(R_C2C1, p_C2C1), xy_1, xy_2)) < threshold
     return np.asarray(near & (rho > _FARTHEST) & (rho < _NEAREST)), rho
 

@@ -6,12 +6,12 @@ import numpy as np
 
 from vioframe.frontend.flow import body_rotation
 from vioframe.frontend.options import FrontendOptions
-from vioframe.frontend.stereo import overlapping
+from vioframe.frontend.stereo import MOST_APART_S, overlapping
 from vioframe.frontend.view import View
 from vioframe.incidents import Incidents
 from vioframe.interfaces import Detector
 from vioframe.stopwatch import Stopwatch
-from vioframe.types import Calibration, FrameSet, FrameTracks, ImuSegment
+from vioframe.types import NS_PER_S, Calibration, FrameSet, FrameTracks, ImuSegment
 
 
 class Frontend:
@@ -27,8 +27,9 @@ class Frontend:
     ) -> None:
         self._views = tuple(View(detector, camera.model, options, incidents) for camera in calibration.cameras)
         self._pairs = overlapping(calibration)
-        # How the body has turned since each camera's last image, R_B1B2.
+        # How the body has turned since each camera's last image, R_B1B2, and when that was.
         self._turned = [np.eye(3) for _ in self._views]
+        self._seen_ns: list[int | None] = [None for _ in self._views]
         self._next_id = 0
         self.stage_seconds: dict[str, float] = {}
         """Seconds that the last call of :meth:`track` spent by stage: equalise, klt, reject, match, detect."""
@@ -49,12 +50,15 @@ class Frontend:
             assert image is not None
             R_C2C1 = camera.R_BC.T @ self._turned[c].T @ camera.R_BC if camera.rotation_known else None
             self._views[c].advance(image, R_C2C1, frames.t_ns, watch)
-            self._turned[c] = np.eye(3)
+            self._turned[c], self._seen_ns[c] = np.eye(3), frames.t_ns
         for c in seeing:
             for pair in self._pairs:
-                if pair.second == c and pair.first in seeing:
-                    pair.match(self._views, calibration)
-                    watch.lap("match")
+                before_ns = self._seen_ns[pair.first]
+                if pair.second == c and before_ns is not None:
+                    apart_s = (frames.t_ns - before_ns) / NS_PER_S
+                    if apart_s <= MOST_APART_S:
+                        pair.match(self._views, calibration, self._turned[pair.first], apart_s)
+                        watch.lap("match")
             if not self._views[c].is_featureless:
                 self._next_id = self._views[c].refill(self._next_id, frames.t_ns)
                 watch.lap("detect")
