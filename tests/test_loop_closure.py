@@ -431,12 +431,15 @@ def test_the_parallax_of_a_feature_is_between_where_it_was_seen_first_and_last()
     # A second later, all is known of the first.
     expected = [np.arctan2(1.0, 5.0), np.arctan2(0.2, 5.0), by_two]
     np.testing.assert_allclose(keyframes[0].parallax, expected, atol=1e-9)
-    assert np.isinf(keyframes_of_one_frame(image)[0].parallax).all()
 
 
-def keyframes_of_one_frame(image):
-    selector, zero, xy = KeyframeSelector(CALIBRATION, 30.0), np.zeros(3), np.zeros((1, 2))
-    ids = np.zeros(1, np.int64)
-    estimate = Estimate(Status.TRACKING, NavState(0, np.eye(3), zero, zero, zero, zero), ids, np.ones((1, 3)))
-    selector.add(Step(FrameSet(0, (image,)), FrameTracks(0, ids, ids, xy, xy), estimate, {}))
-    return selector.flush()
+@pytest.mark.parametrize("count", [0, 1])
+def test_a_frame_that_sees_nothing_is_no_keyframe(count):
+    """Another camera may go on seeing. What was seen but once is known by other means than parallax."""
+    selector, zero, ids = KeyframeSelector(CALIBRATION, 30.0), np.zeros(3), np.arange(count)
+    estimate = Estimate(Status.TRACKING, NavState(0, np.eye(3), zero, zero, zero, zero), ids, np.ones((count, 3)))
+    tracks = FrameTracks(0, ids, ids, np.zeros((count, 2)), np.zeros((count, 2)))
+    selector.add(Step(FrameSet(0, (np.zeros((10, 10), np.uint8),)), tracks, estimate, {}))
+    keyframes = selector.flush()
+    assert len(keyframes) == count
+    assert all(np.isinf(keyframe.parallax).all() for keyframe in keyframes)
