@@ -404,8 +404,8 @@ def test_a_keyframe_is_placed_by_what_was_learned_of_the_offset_since_the_start(
         )
         ids, xy = np.array([k]), np.zeros((1, 2))
         estimate = Estimate(Status.TRACKING, state, is_keyframe=True, calibration=learned)
-        step = Step(FrameSet(t_ns, (image,)), FrameTracks(t_ns, ids, ids, xy, xy), estimate, {})
-        keyframes += selector.add(step)
+        tracks = FrameTracks(t_ns, ids, np.zeros_like(ids), xy, xy)
+        keyframes += selector.add(Step(FrameSet(t_ns, (image,)), tracks, estimate, {}))
     keyframes += selector.flush()
     moved_m = [keyframe.p_WC[0] - keyframe.state.p_WB[0] - CAMERA.p_BC[0] for keyframe in keyframes]
     np.testing.assert_allclose(moved_m, [0.0, 0.010], atol=1e-12)
