@@ -259,7 +259,7 @@ def test_prior_keeps_the_four_unobservable_directions(flight, readout_s, monkeyp
     options = SlidingWindowOptions(calibrate_readout=readout_s != 0.0)
     priors = fly(flight, monkeypatch, options, 10.0, 1.0, readout_s)
     growth = np.array([known(prior) / known(priors[0]) for prior in priors])
-    assert growth.max() < 1.0 + 1e-3
+    assert growth.max() < 1.0 + 2e-3
     assert cancelled(priors[-1]).max() < 1e-7
 
 

@@ -18,6 +18,15 @@ _BEYOND_ROUGHNESS = 2.0
 _BY_CHANCE = 2.0
 
 
+def jumps(t_ns: Int, values: Float) -> float:
+    """The density of white noise that makes readings ``values`` (N, 3) at ``t_ns`` (N,) jump as they do.
+
+    Half the squared difference of two neighbours: noise, and what a motion between two readings leaves unsaid.
+    """
+    dt_s = float(np.median(np.diff(t_ns))) * 1e-9
+    return float(np.sqrt(0.5 * (np.diff(values, axis=0) ** 2).mean() * dt_s))
+
+
 def roughness(t_ns: Int, values: Float) -> float:
     """The density of white noise that makes readings ``values`` (N, 3) at ``t_ns`` (N,) as rough as they are.
 

@@ -10,7 +10,7 @@ import numpy as np
 from vioframe.arrays import Float
 from vioframe.estimation import rig
 from vioframe.estimation.factors.reprojection import CALIBRATION_SIZE, INTRINSICS, OFFSET, READOUT
-from vioframe.estimation.inertial.noise import roughness
+from vioframe.estimation.inertial.noise import jumps
 from vioframe.estimation.inertial.readings import Readings
 from vioframe.estimation.initialization import dynamic, static, stereo
 from vioframe.estimation.initialization.found import Found, found_by
@@ -48,8 +48,8 @@ _SHORTEST_WINDOW_S, _USUAL_WINDOW_S, _LONGEST_WINDOW_S, _LONGER = 1.5, 3.0, 10.0
 _SOON_S, _LATER_S, _LATEST_S = 0.1, 0.05, 0.6
 # Times ``imu_noise_factor`` in the dynamic method, which has no later readings to correct what vibration, scale and
 # alignment errors do over its seconds: with 8 in all its squared errors on EuRoC's flights are as its covariance says.
-# Readings that are smoother than their calibration has it count as such: this many times what they are rough by.
-_IN_MOTION, _ROUGHNESS = 2.0, 2.5
+# Readings that are smoother than their calibration has it count as such: this many times what they jump by.
+_IN_MOTION, _JUMPS = 2.0, 2.5
 # What a calibration may be off by before a start has borne it out, beyond how well it is known: rad, s and relative.
 # What contradicts it is taken over so many times in one attempt.
 _DOUBT_ROTATION, _DOUBT_OFFSET_S, _DOUBT_FOCAL, _DOUBT_READOUT_S = 0.05, 0.02, 0.06, 0.015
@@ -284,9 +284,9 @@ class Initializer:
         return out
 
     def _noise_in_motion(self) -> ImuNoise:
-        """What the readings of the window are off by: white noise by how rough they are, within what is given."""
+        """What the readings of the window are off by: white noise by how they jump, within what is given."""
         given, readings = self._calibration.imu, self._readings
-        gyro, accel = (_ROUGHNESS * roughness(readings.t_ns, values) for values in (readings.gyro_B, readings.accel_B))
+        gyro, accel = (_JUMPS * jumps(readings.t_ns, values) for values in (readings.gyro_B, readings.accel_B))
         return replace(
             given,
             gyro_density=min(gyro, self._factor * given.gyro_density),
