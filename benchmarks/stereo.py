@@ -17,9 +17,10 @@ import click
 import numpy as np
 from common import benchmark, present, render
 from euroc_clips import judged
-from rendered_flights import START_S
+from rendered_flights import FLIGHTS
 
 from vioframe.bench import Row
+from vioframe.bench.suites.sources import EUROC
 from vioframe.interfaces import Dataset
 from vioframe.parts import config as configuration
 from vioframe.parts import registry
@@ -71,7 +72,7 @@ class _Covered:
 
 
 @benchmark
-@click.option("--flight", default="MH_05_difficult", show_default=True, type=click.Choice(list(START_S)))
+@click.option("--flight", default="MH_05_difficult", show_default=True, type=click.Choice(FLIGHTS))
 def main(data: Path, backend: str, assignments: tuple[str, ...], keep: bool, flight: str) -> None:
     """Rendered EuRoC flights by one camera and by two; both back-ends, whatever --backend says."""
     installed = registry.load()
@@ -80,7 +81,7 @@ def main(data: Path, backend: str, assignments: tuple[str, ...], keep: bool, fli
         config = Config(
             dataset=DatasetConfig(path=bag, options={"cameras": ["cam0"] if cameras == "one" else ["cam0", "cam1"]}),
             backend=PartConfig(name=backend),
-            start_s=START_S[flight],
+            start_s=EUROC[flight].start_s,
         )
         experiment = prepare(configuration.override(config, installed, assignments), installed)
         if cameras == "both, black in turn":
@@ -108,7 +109,7 @@ def main(data: Path, backend: str, assignments: tuple[str, ...], keep: bool, fli
             for name in BACKENDS:
                 yield flown(bag, name, "both, apart", 0)
 
-    settings = {"options": list(assignments), "start_s": START_S[flight], "black_s": BLACK_S, "apart_ms": APART_MS}
+    settings = {"options": list(assignments), "start_s": EUROC[flight].start_s, "black_s": BLACK_S, "apart_ms": APART_MS}
     present(f"stereo_{flight}", f"{flight}: one camera and two", rows(), COLUMNS, settings, keep)
 
 
