@@ -109,7 +109,8 @@ def main(data: Path, backend: str, assignments: tuple[str, ...], keep: bool, fli
             for name in BACKENDS:
                 yield flown(bag, name, "both, apart", 0)
 
-    settings = {"options": list(assignments), "start_s": EUROC[flight].start_s, "black_s": BLACK_S, "apart_ms": APART_MS}
+    start_s = EUROC[flight].start_s
+    settings = {"options": list(assignments), "start_s": start_s, "black_s": BLACK_S, "apart_ms": APART_MS}
     present(f"stereo_{flight}", f"{flight}: one camera and two", rows(), COLUMNS, settings, keep)
 
 
