@@ -43,6 +43,12 @@ BACKEND_COLUMNS = {
     "stage_ms.total": ".2f",
 }
 
+bags_option = click.option(
+    "--bags",
+    type=click.Path(file_okay=False, path_type=Path),
+    help="Folder in which recordings are kept, and found again; default: none are kept.",
+)
+
 
 def benchmark(command: Callable[..., None]) -> click.Command:
     """A script with the options all of them have; a :class:`VioframeError` becomes one line and exit code 2."""

@@ -13,7 +13,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import click
-from common import benchmark, present
+from common import bags_option, benchmark, present
 from euroc_clips import run
 from rendered_flights import recording
 
@@ -56,11 +56,7 @@ class Job:
 
 @benchmark
 @click.option("--worlds", default=WORLDS, show_default=True, help="In how many worlds each flight is flown.")
-@click.option(
-    "--bags",
-    type=click.Path(file_okay=False, path_type=Path),
-    help="Folder in which recordings are kept, and found again; default: none are kept.",
-)
+@bags_option
 def main(data: Path, backend: str, assignments: tuple[str, ...], keep: bool, worlds: int, bags: Path | None) -> None:
     """Rendered flights, with loop closure and without."""
     with TemporaryDirectory() as temporary:

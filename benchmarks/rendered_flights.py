@@ -14,7 +14,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import click
-from common import benchmark, present, render
+from common import bags_option, benchmark, present, render
 from euroc_clips import run
 
 from vioframe.bench import Row
@@ -51,11 +51,7 @@ COLUMNS = {
 @click.option("--detector", "detectors", multiple=True, default=["shi_tomasi"], help="Default: shi_tomasi.")
 @click.option("--worlds", default=WORLDS, show_default=True, help="In how many worlds each flight is flown.")
 @click.option("--against", multiple=True, metavar="KEY=VALUE", help="Fly each recording also with these options.")
-@click.option(
-    "--bags",
-    type=click.Path(file_okay=False, path_type=Path),
-    help="Folder in which recordings are kept, and found again; default: none are kept.",
-)
+@bags_option
 def main(
     data: Path,
     backend: str,

@@ -193,12 +193,16 @@ class TestNoise:
 
     def test_roughness_is_the_density_of_white_noise(self):
         imu, density = self.readings(1.0), EUROC.imu.gyro_density
-        assert roughness(imu.t_ns, imu.gyro_B) == pytest.approx(density, rel=0.1)
+        for order in (1, 2):
+            assert roughness(imu.t_ns, imu.gyro_B, order) == pytest.approx(density, rel=0.1)
+            assert roughness(imu.t_ns[:order], imu.gyro_B[:order], order) == 0.0
         # A steady turn, or a steady change of it, is none; nor is what a body does of its own accord.
         seconds = imu.t_ns[:, None] * 1e-9
         for motion in (2.0 + 3.0 * seconds, 1.5 * np.sin(2 * np.pi * 1.5 * seconds)):
             assert roughness(imu.t_ns, imu.gyro_B + motion) == pytest.approx(density, rel=0.1)
-        assert roughness(imu.t_ns[:2], imu.gyro_B[:2]) == 0.0
+        # A difference from one reading to the next is jump enough for an order of 1.
+        fast = imu.gyro_B + 30.0 * seconds
+        assert roughness(imu.t_ns, fast, order=1) > 3.0 * roughness(imu.t_ns, fast)
 
     @pytest.mark.parametrize(("times", "expected"), [(0.1, 1.0), (1.0, 1.0), (2.0, 3.0), (10.0, 4.0)])
     def test_between_rest_and_flight(self, times: float, expected: float):

@@ -29,8 +29,10 @@ def examples(tmp_path_factory):
     return {**os.environ, "PYTHONPATH": search, "COLUMNS": "200"}
 
 
-def call(environment, *arguments):
-    done = subprocess.run([sys.executable, "-m", *arguments], env=environment, capture_output=True, text=True)
+def call(environment, *arguments, code=None):
+    """What Python prints, of the module that the arguments begin with, or of ``code``."""
+    what = ["-m"] if code is None else ["-c", code]
+    done = subprocess.run([sys.executable, *what, *arguments], env=environment, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr + done.stdout
     return done.stdout
 
@@ -55,6 +57,16 @@ def test_the_options_of_the_examples_are_known(examples):
 def test_the_example_plugins_pass_their_own_tests(examples, test):
     path = str(ROOT / "docs" / test)
     assert "1 passed" in call(examples, "pytest", "-q", "-p", "no:cacheprovider", "-c", os.devnull, path)
+
+
+def test_every_benchmark_finds_what_it_imports():
+    """Each is a script, run by nobody between two records."""
+    folder = ROOT / "benchmarks"
+    scripts = [path.stem for path in sorted(folder.glob("*.py"))]
+    assert "rendered_flights" in scripts
+    search = os.pathsep.join(filter(None, [str(folder), os.environ.get("PYTHONPATH")]))
+    importing = "import importlib, sys; [importlib.import_module(name) for name in sys.argv[1:]]"
+    call({**os.environ, "PYTHONPATH": search}, *scripts, code=importing)
 
 
 @pytest.mark.parametrize("name", INSTALLED.names(registry.DETECTOR))

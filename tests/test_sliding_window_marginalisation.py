@@ -234,6 +234,8 @@ def fly(
     monkeypatch.setattr(window_module, "marginalise_oldest", recorded)
     calibration = CALIBRATION.with_camera(0, readout_s=readout_s)
     sequence = simulated_sequence(flight, seed=1, duration_s=8.0, calibration=calibration)
+    # The less is believed of the readings, the less rounding leaves of the large in the small.
+    sequence = replace(sequence, calibration=replace(calibration, imu=calibration.imu.in_flight(4.0)))
     start = start_in_the_dark(sequence.true_states[1], 1, position_m, yaw_rad)
     run = run_backend(since(sequence, 1), SlidingWindow(options), initial_state=start)
     assert run.completion == 1.0
@@ -259,7 +261,7 @@ def test_prior_keeps_the_four_unobservable_directions(flight, readout_s, monkeyp
     options = SlidingWindowOptions(calibrate_readout=readout_s != 0.0)
     priors = fly(flight, monkeypatch, options, 10.0, 1.0, readout_s)
     growth = np.array([known(prior) / known(priors[0]) for prior in priors])
-    assert growth.max() < 1.0 + 2e-3
+    assert growth.max() < 1.0 + 1e-3
     assert cancelled(priors[-1]).max() < 2e-7
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from math import comb
 
 import numpy as np
 
@@ -18,26 +19,17 @@ _BEYOND_ROUGHNESS = 2.0
 _BY_CHANCE = 2.0
 
 
-def jumps(t_ns: Int, values: Float) -> float:
-    """The density of white noise that makes readings ``values`` (N, 3) at ``t_ns`` (N,) jump as they do.
-
-    Half the squared difference of two neighbours: noise, and what a motion between two readings leaves unsaid.
-    """
-    dt_s = float(np.median(np.diff(t_ns))) * 1e-9
-    return float(np.sqrt(0.5 * (np.diff(values, axis=0) ** 2).mean() * dt_s))
-
-
-def roughness(t_ns: Int, values: Float) -> float:
+def roughness(t_ns: Int, values: Float, order: int = 2) -> float:
     """The density of white noise that makes readings ``values`` (N, 3) at ``t_ns`` (N,) as rough as they are.
 
-    How far a reading lies from the middle of its two neighbours, squared, is one and a half times the variance of the
-    noise, however fast the body turns or speeds up, where it does so steadily. 0 of fewer than three readings.
+    By their differences of ``order`` n, in which the variance of white noise counts (2n)!/(n!)^2 times and a motion
+    that is a polynomial of degree n - 1 not at all: 1 takes for noise what differs from one reading to the next, 2 only
+    what lies off the middle of its neighbours. 0 where there are too few readings for that.
     """
-    if len(t_ns) < 3:
+    if len(t_ns) <= order:
         return 0.0
     dt_s = float(np.median(np.diff(t_ns))) * 1e-9
-    off = values[1:-1] - 0.5 * (values[:-2] + values[2:])
-    return float(np.sqrt((off**2).mean() / 1.5 * dt_s))
+    return float(np.sqrt((np.diff(values, order, axis=0) ** 2).mean() / comb(2 * order, order) * dt_s))
 
 
 def noise_over(imu: ImuSegment, at_rest: ImuNoise, in_flight: ImuNoise) -> ImuNoise:

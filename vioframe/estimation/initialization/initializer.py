@@ -10,7 +10,7 @@ import numpy as np
 from vioframe.arrays import Float
 from vioframe.estimation import rig
 from vioframe.estimation.factors.reprojection import CALIBRATION_SIZE, INTRINSICS, OFFSET, READOUT
-from vioframe.estimation.inertial.noise import jumps
+from vioframe.estimation.inertial.noise import roughness
 from vioframe.estimation.inertial.readings import Readings
 from vioframe.estimation.initialization import dynamic, static, stereo
 from vioframe.estimation.initialization.found import Found, found_by
@@ -286,7 +286,9 @@ class Initializer:
     def _noise_in_motion(self) -> ImuNoise:
         """What the readings of the window are off by: white noise by how they jump, within what is given."""
         given, readings = self._calibration.imu, self._readings
-        gyro, accel = (_JUMPS * jumps(readings.t_ns, values) for values in (readings.gyro_B, readings.accel_B))
+        gyro, accel = (
+            _JUMPS * roughness(readings.t_ns, values, order=1) for values in (readings.gyro_B, readings.accel_B)
+        )
         return replace(
             given,
             gyro_density=min(gyro, self._factor * given.gyro_density),
