@@ -64,7 +64,7 @@ def _parts() -> list[str]:
         (kind, part)
         for kind in registry.KINDS
         for name in installed.names(kind)
-        if (part := installed.find(kind, name)).source.distribution == "vioframe"
+        if (part := installed.find(kind, name)).origin.distribution == "vioframe"
     ]
     return [_section(f"{kind.name} `{part.name}`", _summary(part.factory), part.options) for kind, part in own]
 

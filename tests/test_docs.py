@@ -65,7 +65,7 @@ def test_the_command_line_reference_is_up_to_date():
 
 def test_every_part_that_ships_is_explained():
     tables = registry.load().parts.values()
-    own = [part.name for table in tables for part in table.values() if part.source.distribution == "vioframe"]
+    own = [part.name for table in tables for part in table.values() if part.origin.distribution == "vioframe"]
     explained = re.findall(r"^### [\w ]+ `(\w+)`$", (ROOT / "docs" / "cli.md").read_text(), re.MULTILINE)
     assert sorted(explained) == sorted(own)
 

@@ -344,6 +344,15 @@ class TestStatic:
             static.initialise(sequence.packets, sequence.calibration.imu)
 
 
+    def test_too_few_frames_for_a_start_in_motion_are_refused(self):
+        """As many as are left where an estimator is too slow: all of them among the newest."""
+        sequence = simulated_sequence("figure_eight", duration_s=3.0)
+        packets = sequence.packets[-4:]
+        known = np.eye(16)
+        with pytest.raises(RefusalError, match="4 frames are too few"):
+            dynamic.initialise(packets, sequence.calibration, known, known, np.zeros(3), found=False)
+
+
 class TestWindow:
     def test_longest_tracks_first_and_readings_joined(self):
         t_ns = np.arange(4) * 100_000_000

@@ -48,7 +48,7 @@ def add(tmp_path, monkeypatch):
 
 
 def failure(loaded: registry.Registry, entry_point: str) -> str:
-    return next(f.reason for f in loaded.failures if f.source.entry_point == entry_point)
+    return next(f.reason for f in loaded.failures if f.origin.entry_point == entry_point)
 
 
 def test_every_built_in_comes_in_through_the_entry_points():
@@ -126,7 +126,7 @@ def test_a_broken_plugin_does_not_trip_the_next(add):
     add("a_misspelt", "@hookimpl\ndef vioframe_detektors(): return {}")
     add("b_fine", detector('"b_fine": Blank'))
     loaded = registry.load()
-    assert [f.source.entry_point for f in loaded.failures] == ["a_misspelt"]
+    assert [f.origin.entry_point for f in loaded.failures] == ["a_misspelt"]
     assert "b_fine" in loaded.names(registry.DETECTOR)
 
 

@@ -21,6 +21,10 @@ class DatasetError(VioframeError):
     """A data set cannot be read as asked."""
 
 
+class SourceError(DatasetError):
+    """A live source is not there, or not any more."""
+
+
 class ImageSizeError(DatasetError):
     """Images of ``size`` (width, height) px are not of the size that their camera is ``calibrated`` for."""
 

@@ -19,6 +19,7 @@ from vioframe.types import (
     Measurement,
     Mesh,
     Motion,
+    NavState,
     Start,
     Step,
     TrainingStep,
@@ -127,6 +128,24 @@ class DatasetFactory(Protocol):
 
 
 @runtime_checkable
+class Source(Dataset, Protocol):
+    """Sensors that bring what they measure as it happens: a camera that is plugged in, or what stands for one.
+
+    ``measurements`` blocks until something comes, in any order that a :class:`~vioframe.odometry.Odometry` takes, and
+    ends where nothing more will. It raises :class:`~vioframe.errors.SourceError` where the device is not there, or not
+    any more; asked anew it looks for it again. Nothing is started before it is asked for the first time.
+    """
+
+    def tell(self, state: NavState) -> None:
+        """Hear where the body is, at up to 200 Hz, in the thread that reads: for those who publish it, quickly."""
+        ...
+
+    def close(self) -> None:
+        """Let go of the device, for good; from any thread: ``measurements`` ends within a second."""
+        ...
+
+
+@runtime_checkable
 class Flight(Protocol):
     """A motion known exactly, for simulation."""
 
@@ -180,6 +199,7 @@ class Trainer(Protocol):
 DetectorFactory = Callable[..., Detector]
 BackendFactory = Callable[..., Backend]
 LoopCloserFactory = Callable[..., LoopCloser]
+SourceFactory = Callable[..., Source]
 FlightFactory = Callable[..., Flight]
 WorldFactory = Callable[..., World]
 MetricFactory = Callable[..., Metric]

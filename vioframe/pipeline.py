@@ -10,21 +10,23 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from vioframe.diagnosis import HOPELESS, Certainty, Diagnosis, Gatherer, diagnose, gather
 from vioframe.diagnosis.stamps import span_s
 from vioframe.errors import DatasetError, RunError
 from vioframe.geometry.trajectory import Trajectory
 from vioframe.incidents import Incidents
-from vioframe.interfaces import Dataset
+from vioframe.interfaces import Dataset, Source
 from vioframe.io.calibration import write_calibration
 from vioframe.io.synchronise import played
 from vioframe.io.trajectories import load_trajectory, write_tum
+from vioframe.live.ahead import Ahead
+from vioframe.live.stream import Live
 from vioframe.odometry import Odometry, limited_threads
 from vioframe.parts import config as configuration
 from vioframe.parts.config import Config
-from vioframe.parts.registry import BACKEND, DATASET, DETECTOR, LOOP_CLOSER, Registry
+from vioframe.parts.registry import BACKEND, DETECTOR, LOOP_CLOSER, SOURCE, Registry
 from vioframe.runs import machine
 from vioframe.runs.recorder import Recorder, new_run_folder, write_json
 from vioframe.stopwatch import working_s
@@ -71,6 +73,11 @@ class Experiment:
     """Cameras of the rig that are not used."""
 
     @property
+    def live(self) -> Live | None:
+        """The data set, where it is a live source: then it is not run a second time, and can be told to stop."""
+        return self.dataset if isinstance(self.dataset, Live) else None
+
+    @property
     def name(self) -> str:
         return f"{self.dataset.name}_{self.config.detector.name}_{self.config.backend.name}"
 
@@ -104,10 +111,11 @@ class Experiment:
             return diagnose(gather(measurements, self.dataset.calibration))
 
 
-def prepare(config: Config, registry: Registry, *, warm: bool = False) -> Experiment:
+def prepare(config: Config, registry: Registry, *, warm: bool = False, tape: Path | None = None) -> Experiment:
     """Check the whole of ``config``, then open the data set and create the parts.
 
-    ``warm``, the back-end has flown once: it begins later, but one that fails does so before anything is replaced.
+    ``warm``, the back-end has flown once: it begins later, but one that fails does so before anything is replaced. A
+    live source, which waits for nobody, always finds it so; all that is used of it is written to ``tape``.
     """
     config = configuration.complete(config, registry)
     if config.dataset.path is None:
@@ -115,6 +123,11 @@ def prepare(config: Config, registry: Registry, *, warm: bool = False) -> Experi
     dataset, options, left_aside = _of_usable_cameras(registry, config)
     config = config.model_copy(update={"dataset": config.dataset.model_copy(update={"options": options})})
     loop_closure = config.loop_closure
+    if live := config.dataset.path is not None and registry.find_reader(config.dataset.path).kind is SOURCE:
+        imu = dataset.calibration.imu.in_flight(config.estimation_options.imu_noise_factor)
+        dataset = Live(cast(Source, dataset), Ahead(imu), tape)
+    elif tape is not None:
+        raise DatasetError(f"{dataset.name} is a recording already; `vioframe convert` makes another of it")
     odometry = Odometry(
         dataset.calibration,
         config.detector.name,
@@ -126,7 +139,7 @@ def prepare(config: Config, registry: Registry, *, warm: bool = False) -> Experi
         frontend=config.frontend_options,
         estimation=config.estimation_options,
         wait_ms=config.wait_ms,
-        warm=warm,
+        warm=warm or live,
         installed=registry,
     )
     return Experiment(
@@ -190,6 +203,8 @@ def _why_none(experiment: Experiment) -> str:
 
     Told by all of the recording: what was played may have ended where clocks are apart, and a run listens to a part.
     """
+    if experiment.live is not None:
+        return "it ended, or was told to, ahead of the first image that its readings reach behind"
     gatherer = Gatherer(experiment.dataset.calibration, look_every=sys.maxsize)
     for measurement in experiment.dataset.measurements():
         gatherer.add(measurement)
@@ -209,7 +224,7 @@ def _write(
     on_step: Callable[[Step], None],
     explain: bool,
 ) -> dict[str, Any]:
-    config, registry = experiment.config, experiment.registry
+    config, registry, live = experiment.config, experiment.registry, experiment.live
     (folder / "config.yaml").write_text(configuration.render(config, registry), encoding="utf-8")
     write_json(folder / "machine.json", machine.describe())
     write_calibration(experiment.dataset.calibration, folder / "calibration")
@@ -218,11 +233,15 @@ def _write(
     with Recorder(folder, _about(experiment), experiment.incidents, begin_s) as recorder:
         try:
             for step in steps:
+                between = () if live is None else live.estimated(step)
                 recorder.add(step)
+                recorder.add_between(between)
                 on_step(step)
             if (loop_closure := experiment.odometry.close_loops()) is not None:
                 recorder.add_loop_closure(loop_closure)
-            closely = explain and not recorder.initialised
+            if live is not None:
+                recorder.summary["live"] = live.figures()
+            closely = explain and live is None and not recorder.initialised
             found = experiment.look_closely() if closely else diagnose(experiment.gatherer.recording())
             recorder.add_findings(found.findings)
         except BaseException as error:
@@ -233,7 +252,9 @@ def _write(
 
 def _about(experiment: Experiment) -> dict[str, Any]:
     config = experiment.config
-    chosen = {DATASET: config.dataset.reader or "", DETECTOR: config.detector.name, BACKEND: config.backend.name}
+    assert config.dataset.path is not None
+    reader = experiment.registry.find_reader(config.dataset.path, config.dataset.reader)
+    chosen = {DETECTOR: config.detector.name, BACKEND: config.backend.name}
     if config.loop_closure is not None:
         chosen[LOOP_CLOSER] = config.loop_closure.name
     return {
@@ -243,7 +264,10 @@ def _about(experiment: Experiment) -> dict[str, Any]:
         "detector": config.detector.name,
         "backend": config.backend.name,
         "loop_closer": None if config.loop_closure is None else config.loop_closure.name,
-        "plugins": {kind.name: str(experiment.registry.find(kind, name).source) for kind, name in chosen.items()},
+        "plugins": {
+            reader.kind.name: str(reader.origin),
+            **{kind.name: str(experiment.registry.find(kind, name).origin) for kind, name in chosen.items()},
+        },
         "start_s": config.start_s,
         "duration_s": config.duration_s,
     }

@@ -9,6 +9,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from dataclasses import replace
 
 import numpy as np
 
@@ -72,7 +73,7 @@ def helped(backend: str) -> Iterator[None]:
 
 
 def _fly_along_a_wall(backend: Backend, calibration: Calibration) -> None:
-    """Fly sideways along points that come and go, through every step of a window of some ten frames, and halt."""
+    """Fly sideways along points that come and go, through every step of a window of some ten frames, and rest."""
     camera = calibration.cameras[0]
     right_W = camera.R_BC[:, 0]
     rng = np.random.default_rng(0)
@@ -90,9 +91,15 @@ def _fly_along_a_wall(backend: Backend, calibration: Calibration) -> None:
         tracks = FrameTracks(int(t_ns[-1]), ids, np.zeros_like(ids), xy, xy_normalised)
         if k == 0:
             known = CalibrationEstimate(calibration, (initialization.GIVEN,) * len(calibration.cameras))
-            backend.begin(Start(state, known, calibration.imu, imu, tracks))
+            start = Start(state, known, calibration.imu, imu, tracks)
+            backend.begin(start)
         else:
-            backend.process(imu, tracks, k == _FRAMES - 1)
+            backend.process(imu, tracks, False)
+            if k == 1:
+                resting = imu, tracks
+    # A body that rests is held: many a flight comes to that late, and none may wait then.
+    backend.begin(replace(start, state=replace(state, v_WB=np.zeros(3))))
+    backend.process(*resting, True)
 
 
 if __name__ == "__main__":

@@ -30,13 +30,13 @@ def plugins(name: str | None) -> None:
     console = Console()
     if name is None:
         rows = [
-            (kind.name, part.name, part.source.distribution, part.source.version, summary_of(part.factory))
+            (kind.name, part.name, part.origin.distribution, part.origin.version, summary_of(part.factory))
             for kind, part in every
         ]
         console.print(_table(("kind", "name", "distribution", "version", "what it is"), rows))
         if installed.failures:
             failed = [
-                (each.source.entry_point, each.source.distribution, each.source.version, each.reason)
+                (each.origin.entry_point, each.origin.distribution, each.origin.version, each.reason)
                 for each in installed.failures
             ]
             console.print(_table(("failed to load", "distribution", "version", "why"), failed))

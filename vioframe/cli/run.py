@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import signal
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from math import inf
 from pathlib import Path
 from typing import Any
@@ -16,6 +18,7 @@ from vioframe.diagnosis import Severity
 from vioframe.errors import DatasetError, TrajectoryError
 from vioframe.evaluation import evaluate
 from vioframe.geometry.trajectory import Trajectory
+from vioframe.live import Live
 from vioframe.parts import config as configuration
 from vioframe.parts import registry
 from vioframe.parts.config import Config
@@ -55,9 +58,18 @@ _MOST_REASONS = 4
 )
 @click.option("--out", type=FILE, help="Run folder.  [default: runs/DATASET_DETECTOR_BACKEND]")
 @click.option("--overwrite", is_flag=True, help="Replace the run that is in --out.")
+@click.option(
+    "--record",
+    "tape",
+    type=FILE,
+    help="Write what is used of a live source to FILE.mcap, .bag or .ros2, which gives the same estimates again.",
+)
 @quiet_option
-def run(threads: int | None, out: Path | None, overwrite: bool, quiet: bool, **choices: Any) -> None:
+def run(threads: int | None, out: Path | None, overwrite: bool, tape: Path | None, quiet: bool, **choices: Any) -> None:
     """Estimate the motion along DATA, a bag or an ASL folder, and write a run folder.
+
+    DATA may also be a live source, NAME:ADDRESS, such as `replay:FLIGHT.bag`; `vioframe plugins` lists them. Ctrl-C
+    ends it, and the run folder is complete.
 
     The exit code is 1 where it never initialised; `vioframe check DATA` says more about why.
 
@@ -69,16 +81,18 @@ def run(threads: int | None, out: Path | None, overwrite: bool, quiet: bool, **c
     installed = registry.load()
     config = _configure(installed, **choices)
     with Bar(None, quiet=quiet, late=True) as bar, helped(config.backend.name):
-        experiment = prepare(config, installed, warm=overwrite)
+        experiment = prepare(config, installed, warm=overwrite, tape=tape)
         folder = out or free_run_folder(Path("runs"), experiment.name)
-        summary = record(
-            experiment,
-            folder,
-            overwrite=overwrite,
-            on_step=_watched(bar, experiment),
-            explain=True,
-            pipelined=(threads or usable_cores()) > 1,
-        )
+        with _ended_by_signals(experiment.live):
+            summary = record(
+                experiment,
+                folder,
+                overwrite=overwrite,
+                on_step=_watched(bar, experiment),
+                explain=True,
+                # Live, a frame that was read ahead would only be older.
+                pipelined=(threads or usable_cores()) > 1 and experiment.live is None,
+            )
     if not quiet:
         if others := experiment.left_aside:
             used = experiment.dataset.calibration.cameras[0].name
@@ -110,6 +124,28 @@ def _configure(
     return configuration.override(configuration.parse(tree, "command line"), installed, options)
 
 
+@contextmanager
+def _ended_by_signals(live: Live | None) -> Iterator[None]:
+    """Within it the first Ctrl-C, or request to terminate, ends what is ``live``, and a second one everything."""
+    if live is None:
+        yield
+        return
+    before = {each: signal.getsignal(each) for each in (signal.SIGINT, signal.SIGTERM)}
+
+    def end(*_: object) -> None:
+        for each, handler in before.items():
+            signal.signal(each, handler)
+        live.stop()
+
+    try:
+        for each in before:
+            signal.signal(each, end)
+        yield
+    finally:
+        for each, handler in before.items():
+            signal.signal(each, handler)
+
+
 def _watched(bar: Bar, experiment: Experiment) -> Callable[[Step], None]:
     """Has ``bar`` show frame rate, real-time factor, tracked points and what the back-end says."""
     config, frame_count = experiment.config, experiment.dataset.frame_count
@@ -131,8 +167,11 @@ def _watched(bar: Bar, experiment: Experiment) -> Callable[[Step], None]:
         nonlocal first_t_ns
         first_t_ns = step.frames.t_ns if first_t_ns is None else first_t_ns
         data_s = (step.frames.t_ns - first_t_ns) / NS_PER_S
+        pace = f"{data_s / bar.elapsed_s:.2f}x real time"
+        if (live := experiment.live) is not None:
+            pace = f"{live.latency_ms:.0f} ms after the exposure, {live.dropped} dropped"
         bar(
-            f"{(bar.completed + 1) / bar.elapsed_s:.1f} frames/s, {data_s / bar.elapsed_s:.2f}x real time, "
+            f"{(bar.completed + 1) / bar.elapsed_s:.1f} frames/s, {pace}, "
             f"{len(step.tracks.ids)} points, {step.estimate.status}",
             total=expected(data_s),
         )
@@ -158,7 +197,14 @@ def _report(folder: Path, summary: dict[str, Any]) -> None:
     else:
         went = f"initialised after {summary['initialised_after_s']:.2f} s, then {summary['completion']:.1%} tracked"
     click.echo(f"{summary['name']}: {summary['frames']} frames, {went}, {summary['resets']} resets")
-    click.echo(f"{summary['mean_frame_ms']:.1f} ms a frame, {summary['real_time_factor']:.2f} x real time")
+    if (live := summary.get("live")) is None:
+        click.echo(f"{summary['mean_frame_ms']:.1f} ms a frame, {summary['real_time_factor']:.2f} x real time")
+    else:
+        late = live["latency_ms"]
+        click.echo(
+            f"{summary['mean_frame_ms']:.1f} ms a frame; from exposure to estimate {late['median']:.0f} ms (median), "
+            f"{late['p99']:.0f} ms (99 %); {live['frames_dropped']} of {live['frames']} frames dropped"
+        )
     if summary["incidents"]:
         counts = ", ".join(f"{kind} {count}" for kind, count in summary["incidents"].items())
         click.echo(f"handled on the way: {counts}")

@@ -167,8 +167,8 @@ class _RosWriter(RecordingWriter):
                 self._write(topic, t_ns, message)
 
     def _write_in_order(self, topic: str, t_ns: int, message: Any) -> None:
-        """As recorded no sooner than what was written before."""
-        self._recorded_ns = max(self._recorded_ns, t_ns)
+        """As recorded later than what was written before: readers go by that order."""
+        self._recorded_ns = max(self._recorded_ns + 1, t_ns)
         self._write(topic, self._recorded_ns, message)
 
     def _write(self, topic: str, recorded_ns: int, message: Any) -> None:

@@ -23,7 +23,7 @@ from vioframe.estimation.options import EstimationOptions
 from vioframe.frontend import FrontendOptions
 from vioframe.io.yaml import parse_yaml, read_yaml_text
 from vioframe.parts.options import Option, did_you_mean, options_of, validate_options
-from vioframe.parts.registry import BACKEND, DETECTOR, LOOP_CLOSER, Kind, Part, Registry
+from vioframe.parts.registry import BACKEND, DETECTOR, LOOP_CLOSER, SOURCE, Kind, Part, Registry
 
 SectionT = TypeVar("SectionT", bound="Section")
 
@@ -209,7 +209,9 @@ def complete(config: Config, registry: Registry) -> Config:
     }
     for section, part in _parts_by_section(config, registry).items():
         named = getattr(config, section)
-        found = {"path": named.path.absolute(), "reader": part.name} if section == "dataset" else {}
+        found = {}
+        if section == "dataset":
+            found = {"path": named.path if part.kind is SOURCE else named.path.absolute(), "reader": part.name}
         changes[section] = named.model_copy(update={"options": part.validate(named.options), **found})
     return config.model_copy(update=changes)
 

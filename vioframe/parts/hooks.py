@@ -15,6 +15,7 @@ from vioframe.interfaces import (
     FlightFactory,
     LoopCloserFactory,
     MetricFactory,
+    SourceFactory,
     TrainerFactory,
     WorldFactory,
 )
@@ -42,6 +43,11 @@ def vioframe_loop_closers() -> Mapping[str, LoopCloserFactory]:  # type: ignore[
 @hookspec
 def vioframe_datasets() -> Mapping[str, DatasetFactory]:  # type: ignore[empty-body]
     """Map names to factories: ``factory(path, **options) -> Dataset``."""
+
+
+@hookspec
+def vioframe_sources() -> Mapping[str, SourceFactory]:  # type: ignore[empty-body]
+    """Map names to factories: ``factory(address, **options) -> Source``, for data called ``NAME:ADDRESS``."""
 
 
 @hookspec

@@ -21,7 +21,7 @@ import numpy as np
 import pluggy
 
 from vioframe.errors import DatasetError, PluginError, VioframeError, shown
-from vioframe.interfaces import Backend, Dataset, Detector, Flight, LoopCloser, Metric, Trainer, World
+from vioframe.interfaces import Backend, Dataset, Detector, Flight, LoopCloser, Metric, Source, Trainer, World
 from vioframe.parts import hooks as hookspecs
 from vioframe.parts.options import Option, did_you_mean, options_of, plugin_factory, validate_options
 from vioframe.types import Calibration, Float
@@ -47,6 +47,7 @@ DETECTOR = Kind("detector", "vioframe_detectors", Detector, 0)
 BACKEND = Kind("backend", "vioframe_backends", Backend, 0)
 LOOP_CLOSER = Kind("loop closer", "vioframe_loop_closers", LoopCloser, 1)
 DATASET = Kind("dataset", "vioframe_datasets", Dataset, 1)
+SOURCE = Kind("source", "vioframe_sources", Source, 1)
 FLIGHT = Kind("flight", "vioframe_flights", Flight, 2)
 WORLD = Kind("world", "vioframe_worlds", World, 2)
 METRIC = Kind("metric", "vioframe_metrics", Metric, 0)
@@ -54,16 +55,17 @@ TRAINER = Kind("trainer", "vioframe_trainers", Trainer, 1)
 _GIVEN = {
     LOOP_CLOSER.name: "the calibration",
     DATASET.name: "the path",
+    SOURCE.name: "the address",
     FLIGHT.name: "duration_s and R_LB",
     WORLD.name: "p_WB and rng",
     TRAINER.name: "the job",
 }
 """What the framework fills in."""
-KINDS = (DETECTOR, BACKEND, LOOP_CLOSER, DATASET, FLIGHT, WORLD, METRIC, TRAINER)
+KINDS = (DETECTOR, BACKEND, LOOP_CLOSER, DATASET, SOURCE, FLIGHT, WORLD, METRIC, TRAINER)
 
 
 @dataclass(frozen=True, slots=True)
-class Source:
+class Origin:
     """Where a plug-in comes from: its entry point and the distribution that declares it."""
 
     entry_point: str
@@ -82,10 +84,10 @@ class Part:
     kind: Kind
     name: str
     factory: Any
-    source: Source
+    origin: Origin
 
     def __str__(self) -> str:
-        return f"{self.kind.name} {self.name!r} ({self.source})"
+        return f"{self.kind.name} {self.name!r} ({self.origin})"
 
     @property
     def options(self) -> list[Option]:
@@ -119,7 +121,7 @@ class Part:
 class Failure:
     """A plug-in that was skipped, and why."""
 
-    source: Source
+    origin: Origin
     reason: str
 
 
@@ -187,14 +189,21 @@ class Registry:
     def open_dataset(
         self, path: str | Path, reader: str | None = None, options: Mapping[str, Any] | None = None
     ) -> Dataset:
-        """Open the recording at ``path`` with the reader of that name, or with the one that accepts it."""
+        """Open the recording at ``path`` with the reader of that name, or with the one that accepts it.
+
+        Of a ``path`` that is ``NAME:ADDRESS`` it is a live :class:`~vioframe.interfaces.Source`, not started yet.
+        """
         part = self.find_reader(path, reader)
-        return cast(Dataset, part.create(Path(path), options=options or {}))
+        given = str(path).partition(":")[2] if part.kind is SOURCE else Path(path)
+        return cast(Dataset, part.create(given, options=options or {}))
 
     def find_reader(self, path: str | Path, reader: str | None = None) -> Part:
-        """The reader to open ``path`` with; raises :class:`DatasetError` saying what is wrong with the path."""
+        """The reader or live source to open ``path`` with; raises :class:`DatasetError` saying what is wrong."""
         path = Path(path)
         if not path.exists():
+            name, colon, _ = str(path).partition(":")
+            if colon and (name in self.parts.get(SOURCE.name, {}) or "/" not in name):
+                return self.find(SOURCE, name)
             raise DatasetError(f"{path} does not exist")
         if reader is not None:
             return self.find(DATASET, reader)
@@ -207,9 +216,9 @@ class Registry:
         readers = ", ".join(self.names(DATASET)) or "none"
         raise DatasetError(f"{path} {_what_is_wrong(path)}; readers: {readers}{self._failure_hint()}")
 
-    def blame(self, trace: TracebackType | None) -> Source | None:
+    def blame(self, trace: TracebackType | None) -> Origin | None:
         """The plug-in in whose code an exception was last under way, or None where no plug-in was involved."""
-        modules = {part.source.module: part.source for table in self.parts.values() for part in table.values()}
+        modules = {part.origin.module: part.origin for table in self.parts.values() for part in table.values()}
         culprit = None
         while trace is not None:
             name = str(trace.tb_frame.f_globals.get("__name__", ""))
@@ -227,15 +236,15 @@ class Registry:
         except (Exception, SystemExit) as error:
             if _is_interrupt(error):
                 raise KeyboardInterrupt from error
-            source = self.blame(error.__traceback__)
-            if source is None:
+            origin = self.blame(error.__traceback__)
+            if origin is None:
                 raise
-            raise PluginError(f"plug-in {source.entry_point!r} ({source}) failed: {describe(error)}") from error
+            raise PluginError(f"plug-in {origin.entry_point!r} ({origin}) failed: {describe(error)}") from error
 
     def _failure_hint(self) -> str:
         if not self.failures:
             return ""
-        broken = ", ".join(sorted(failure.source.entry_point for failure in self.failures))
+        broken = ", ".join(sorted(failure.origin.entry_point for failure in self.failures))
         return f" (failed to load: {broken}; `vioframe plugins` says why)"
 
 
@@ -247,12 +256,12 @@ def load(found: Iterable[EntryPoint] | None = None) -> Registry:
     failures = []
     chosen = entry_points(group=hookspecs.PROJECT) if found is None else found
     # One at a time: pluggy's own loader gives up on all of them at the first ImportError.
-    for source, entry in sorted(((_source(entry), entry) for entry in chosen), key=lambda pair: astuple(pair[0])):
+    for origin, entry in sorted(((_origin(entry), entry) for entry in chosen), key=lambda pair: astuple(pair[0])):
         try:
-            every += _parts_of(manager, source, entry.load())
+            every += _parts_of(manager, origin, entry.load())
         except Exception as error:
-            failures.append(Failure(source, str(error) if isinstance(error, PluginError) else describe(error)))
-            _LOG.warning("plug-in %s (%s) is skipped: %s", source.entry_point, source, failures[-1].reason)
+            failures.append(Failure(origin, str(error) if isinstance(error, PluginError) else describe(error)))
+            _LOG.warning("plug-in %s (%s) is skipped: %s", origin.entry_point, origin, failures[-1].reason)
     parts: dict[str, dict[str, Part]] = {kind.name: {} for kind in KINDS}
     clashes = []
     for (kind, name), named in _by_name(every).items():
@@ -270,10 +279,10 @@ def _by_name(every: Iterable[Part]) -> dict[tuple[Kind, str], list[Part]]:
         table.setdefault((part.kind, part.name), []).append(part)
     for named in table.values():
         if len(named) > 1:
-            distributions = {part.source.distribution for part in named}
+            distributions = {part.origin.distribution for part in named}
             apart = len(distributions) == len(named)
             named[:] = [
-                replace(part, name=f"{part.name}@{part.source.distribution if apart else part.source.entry_point}")
+                replace(part, name=f"{part.name}@{part.origin.distribution if apart else part.origin.entry_point}")
                 for part in named
             ]
     return table
@@ -284,9 +293,9 @@ def describe(error: BaseException) -> str:
     return " ".join(f"{type(error).__name__}: {error}".split())
 
 
-def _parts_of(manager: pluggy.PluginManager, source: Source, plugin: Any) -> list[Part]:
+def _parts_of(manager: pluggy.PluginManager, origin: Origin, plugin: Any) -> list[Part]:
     """Register one plug-in and ask its hooks for its parts; raises :class:`PluginError` where it is not in order."""
-    identity = f"{source.distribution}:{source.entry_point}"
+    identity = f"{origin.distribution}:{origin.entry_point}"
     manager.register(plugin, identity)
     try:
         manager.check_pending()
@@ -294,7 +303,7 @@ def _parts_of(manager: pluggy.PluginManager, source: Source, plugin: Any) -> lis
         if not hooks:
             raise PluginError("it implements no hook; decorate its functions with @vioframe.parts.hooks.hookimpl")
         return [
-            Part(kind, name, _checked(kind, name, factory), source)
+            Part(kind, name, _checked(kind, name, factory), origin)
             for kind in KINDS
             if kind.hook in hooks
             for name, factory in _offered(kind, getattr(plugin, kind.hook)()).items()
@@ -339,9 +348,9 @@ def _is_interrupt(error: BaseException | None) -> bool:
     return False
 
 
-def _source(entry: EntryPoint) -> Source:
+def _origin(entry: EntryPoint) -> Origin:
     name, version = (entry.dist.name, entry.dist.version) if entry.dist else ("unknown", "?")
-    return Source(entry.name, entry.module, name, version)
+    return Origin(entry.name, entry.module, name, version)
 
 
 def _accepts(part: Part, path: Path) -> bool:

@@ -7,6 +7,7 @@
     timings.csv      seconds, a column a stage                     map.ply          landmarks, written at the end
     calibration.csv  what the back-end has learned of the rig, a row a camera and frame
     calibration/     as it was given, and calibration_learned/ as it was in the end, in EuRoC's format: --calibration
+    imu_rate.csv     pose, velocity and pose covariance at up to 200 Hz, of a live source
     loop_corrections.csv            how loops found so far corrected the newest pose, a row where that changed
     trajectory_loop.tum, loops.csv  poses corrected by loop closure, and the loops, where a run has it
 
@@ -57,6 +58,7 @@ STATE_COLUMNS = (
     *(f"cov_{i}" for i in range(15)),
 )
 POSE_COV_COLUMNS = ("t_ns", *(f"c{i}{j}" for i in range(6) for j in range(i, 6)))
+IMU_RATE_COLUMNS = ("t_ns", *"xyz", "qx", "qy", "qz", "qw", "vx", "vy", "vz", *POSE_COV_COLUMNS[1:])
 CALIBRATION_COLUMNS = (
     *("t_ns", "camera", "qx", "qy", "qz", "qw", "px", "py", "pz", "time_offset_s", "readout_s"),
     *("fx", "fy", "cx", "cy", "d1", "d2", "d3", "d4"),
@@ -70,7 +72,7 @@ LOOP_COLUMNS = ("earlier_t_ns", "later_t_ns", "x_m", "y_m", "z_m", "yaw_rad", "i
 RUN_FILES = (
     *("summary.json", "config.yaml", "machine.json", "evaluation.json", "evaluation_loop.json"),
     *("trajectory.tum", "trajectory_loop.tum", "ground_truth.tum", "ground_truth_matched.tum"),
-    *("states.csv", "pose_cov.csv", "calibration.csv", "tracks.csv", "timings.csv", "map.ply"),
+    *("states.csv", "pose_cov.csv", "imu_rate.csv", "calibration.csv", "tracks.csv", "timings.csv", "map.ply"),
     *("loops.csv", "loop_corrections.csv"),
     *("calibration/*/sensor.yaml", "calibration_learned/*/sensor.yaml"),
 )
@@ -222,6 +224,15 @@ class Recorder:
             "rejected": len(result.loops) - accepted,
             "seconds_beside": dict(result.stage_seconds),
         }
+
+    def add_between(self, states: Sequence[NavState]) -> None:
+        """States that readings led to since the frame before."""
+        if states and "imu_rate.csv" not in self._files:
+            self._append("imu_rate.csv", ",".join(IMU_RATE_COLUMNS) + "\n")
+        for state in states:
+            cov = np.full((6, 6), np.nan) if state.cov is None else state.cov[:6, :6]
+            values = [state.p_WB, so3.to_quat_xyzw(state.R_WB), state.v_WB, cov[_UPPER]]
+            self._append("imu_rate.csv", _csv_line(state.t_ns, np.concatenate(values)))
 
     def add_findings(self, findings: Sequence[Finding]) -> None:
         """What was found to be odd about the recording, the likeliest cause of trouble first."""

@@ -26,7 +26,7 @@ def of_values(*values: Any) -> str:
 
 def of_code(installed: Registry) -> str:
     """Tells vioframe, all installed plug-ins, and the versions of what they are built on from others."""
-    modules = {part.source.module.partition(".")[0] for table in installed.parts.values() for part in table.values()}
+    modules = {part.origin.module.partition(".")[0] for table in installed.parts.values() for part in table.values()}
     return _of_modules(("vioframe", *sorted(modules)))
 
 

@@ -60,6 +60,8 @@ _EPIPOLAR_LIMIT, _STRUCTURE_LIMIT, _ADJUSTED_LIMIT = 3.0, 10.0, 3.0
 _FARTHEST_M = 200.0
 # Frames of the window that are estimated, tracks that are used, the longest first, and how few refuse the attempt.
 _KEYFRAMES, _MOST_LANDMARKS, _FEWEST_LANDMARKS = 14, 100, 20
+# Where images are dropped there may be hardly any but the newest: so many must be older.
+_FEWEST_FRAMES = 4
 # The newest part of the window is predicted from the rest to test the estimate.
 _LOOKAHEAD_S, _LARGEST_LOOKAHEAD_PX, _FEWEST_COMMON = 0.2, 4.0, 8
 # Least median parallax, with the rotation taken out; most that the observations may disagree with the estimate (RMS).
@@ -97,6 +99,7 @@ def initialise(
     """
     t_ns = np.array([tracks.t_ns for _, tracks in packets])
     held_out = int((t_ns > t_ns[-1] - _LOOKAHEAD_S * 1e9).sum())
+    refuse_unless(len(t_ns) - held_out >= _FEWEST_FRAMES, f"{len(t_ns)} frames are too few")
     chosen = spread_indices(t_ns[:-held_out], _KEYFRAMES)
     noise = PIXEL_SIGMA / calibration.cameras[0].model.focal_px
 
