@@ -33,6 +33,7 @@ from vioframe.live.tape import taped
 from vioframe.parts import registry
 from vioframe.runs.folder import RunFolder
 from vioframe.simulation import simulated_sequence
+from vioframe.testing import check_source
 from vioframe.types import (
     NS_PER_S,
     Calibration,
@@ -46,6 +47,7 @@ from vioframe.types import (
     Step,
     Unreadable,
 )
+from vioframe_replay import Replay
 
 INSTALLED = registry.load()
 MS = 1_000_000
@@ -417,6 +419,29 @@ class SlowMsckf(Msckf):
 @hookimpl
 def vioframe_backends(): return {"slow_msckf": SlowMsckf}
 """
+
+
+class TestConformance:
+    def test_a_replay_conforms(self, recording: Path):
+        check_source(Replay, str(recording), speed=5.0)
+        said = CliRunner().invoke(main, ["check", "replay", "--data", str(recording)])
+        assert said.exit_code == 0, said.output
+        assert "keeps to all that is promised" in said.output
+
+    def test_what_is_not_kept_is_said(self, recording: Path):
+        class Deaf(Replay):
+            def close(self) -> None:
+                pass
+
+        with pytest.raises(AssertionError, match=r"goes on 2 s after close"):
+            check_source(Deaf, str(recording))
+
+        class Picky(Replay):
+            def tell(self, state: NavState) -> None:
+                raise ValueError("no covariance")
+
+        with pytest.raises(AssertionError, match="states without a covariance come"):
+            check_source(Picky, str(recording), speed=5.0)
 
 
 class TestRuns:

@@ -23,7 +23,19 @@ from vioframe.io.synchronise import played
 from vioframe.odometry import limited_threads
 from vioframe.parts import registry
 from vioframe.parts.options import did_you_mean
-from vioframe.parts.registry import BACKEND, DATASET, DETECTOR, FLIGHT, KINDS, LOOP_CLOSER, METRIC, Kind, Part, Registry
+from vioframe.parts.registry import (
+    BACKEND,
+    DATASET,
+    DETECTOR,
+    FLIGHT,
+    KINDS,
+    LOOP_CLOSER,
+    METRIC,
+    SOURCE,
+    Kind,
+    Part,
+    Registry,
+)
 from vioframe.types import FrameSet, Measurement
 
 _COLOURS = {Severity.WRONG: "bold red", Severity.WORTH_KNOWING: "yellow"}
@@ -182,6 +194,10 @@ def _complaint(part: Part, data: Path | None) -> str:
                 if data is None:
                     raise ConfigError(f"name a recording to try {part} on, with --data")
                 testing.check_dataset(part.factory, data)
+            elif part.kind is SOURCE:
+                if data is None:
+                    raise ConfigError(f"name what to try {part} on, what stands behind {part.name}:, with --data")
+                testing.check_source(part.factory, str(data))
             elif part.kind in checks:
                 checks[part.kind](part.factory)
             else:

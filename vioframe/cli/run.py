@@ -50,6 +50,13 @@ _MOST_REASONS = 4
 @click.option("--start", "start_s", type=float, metavar="S", help="Skip the first S seconds.")
 @click.option("--duration", "duration_s", type=float, metavar="S", help="Stop after S seconds.")
 @click.option(
+    "--wait-ms",
+    type=float,
+    metavar="MS",
+    help="How long a frame waits for readings that come late; live, 0 is quickest where they come in order.  "
+    "[default: 50]",
+)
+@click.option(
     "--threads",
     type=click.IntRange(1, 2),
     help="With 2, points are followed while the frame before is estimated from, and the next ones are read; the "
@@ -118,7 +125,9 @@ def _configure(
     tree["dataset"] |= {
         key: value for key, value in (("path", data), ("reader", chosen["reader"])) if value is not None
     }
-    tree |= {key: chosen[key] for key in ("ground_truth", "start_s", "duration_s") if chosen[key] is not None}
+    tree |= {
+        key: chosen[key] for key in ("ground_truth", "start_s", "duration_s", "wait_ms") if chosen[key] is not None
+    }
     if tree["dataset"]["path"] is None:
         raise DatasetError("no data given: `vioframe run DATA`, or set dataset.path in the configuration")
     return configuration.override(configuration.parse(tree, "command line"), installed, options)

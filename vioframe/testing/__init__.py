@@ -13,5 +13,14 @@ from vioframe.testing.detector import check_detector
 from vioframe.testing.flight import check_flight
 from vioframe.testing.loop_closer import check_loop_closer
 from vioframe.testing.metric import check_metric
+from vioframe.testing.source import check_source
 
-__all__ = ["check_backend", "check_dataset", "check_detector", "check_flight", "check_loop_closer", "check_metric"]
+__all__ = [
+    "check_backend",
+    "check_dataset",
+    "check_detector",
+    "check_flight",
+    "check_loop_closer",
+    "check_metric",
+    "check_source",
+]

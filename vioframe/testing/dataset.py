@@ -33,10 +33,15 @@ def check_dataset(factory: DatasetFactory, path: Path, *, max_frames: int = 50, 
         require(factory.accepts(stranger) is False, "accepts() does not refuse a text file")
         _check_refuses(factory, Path(folder) / "missing", options)
     dataset = factory(path, **options)
+    check_about(dataset)
+    check_measurements(dataset, max_frames)
+
+
+def check_about(dataset: Dataset) -> None:
+    """What a data set says of itself."""
     require(isinstance(dataset.name, str) and dataset.name, f"name is {dataset.name!r}, expected a short string")
     require(isinstance(dataset.calibration, Calibration), f"calibration is a {type(dataset.calibration).__name__}")
     require(dataset.ground_truth is None or isinstance(dataset.ground_truth, Trajectory), "ground_truth: no Trajectory")
-    _check_measurements(dataset, max_frames)
 
 
 def _check_refuses(factory: DatasetFactory, missing: Path, options: dict[str, Any]) -> None:
@@ -49,7 +54,8 @@ def _check_refuses(factory: DatasetFactory, missing: Path, options: dict[str, An
     fail("a path that does not exist raised nothing, expected a DatasetError")
 
 
-def _check_measurements(dataset: Dataset, max_frames: int) -> None:
+def check_measurements(dataset: Dataset, max_frames: int) -> None:
+    """What it brings, up to so many frames."""
     latest: dict[type, int] = {}
     counts: Counter[type] = Counter()
     for measurement in dataset.measurements():
