@@ -88,6 +88,9 @@ def test_a_good_flight_is_found_good():
     found = looked_at()
     assert not found.wrong
     assert "200.0 Hz" in found.facts["IMU"]
+    assert re.fullmatch(
+        r"gyroscope (0\.9|1\.0|1\.1) times, accelerometer (0\.9|1\.0|1\.1) times .*", found.facts["vibration"]
+    )
     assert "10.0 Hz" in found.facts["cam0"]
 
 

@@ -7,6 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from vioframe.diagnosis.inertial import times_as_rough
+from vioframe.diagnosis.recording import ImuSamples
 from vioframe.errors import DivergedError
 from vioframe.estimation.factors.reprojection import INTRINSICS, OFFSET, Calibrated
 from vioframe.estimation.inertial.noise import noise_over, roughness
@@ -221,6 +223,12 @@ class TestNoise:
         found = [noise_over(imu, own, own.in_flight(4.0)) for imu, _ in sequence.packets]
         assert np.mean([n.gyro_density for n in found]) == pytest.approx(own.gyro_density, rel=0.1)
         assert np.mean([n.accel_density for n in found]) == pytest.approx(own.accel_density, rel=0.1)
+
+    @pytest.mark.parametrize("times", [1.0, 10.0])
+    def test_how_rough_a_recording_is_is_told(self, times: float):
+        imu = self.readings(times)
+        told = times_as_rough(ImuSamples(imu.t_ns, imu.gyro_B, imu.accel_B), EUROC.imu)
+        assert told == pytest.approx((times, times), rel=0.1)
 
     def test_what_is_asked_for_is_the_most(self):
         noise = noise_over(self.readings(10.0), EUROC.imu, EUROC.imu.in_flight(0.5))

@@ -343,7 +343,6 @@ class TestStatic:
         with pytest.raises(RefusalError, match="only 3 frames"):
             static.initialise(sequence.packets, sequence.calibration.imu)
 
-
     def test_too_few_frames_for_a_start_in_motion_are_refused(self):
         """As many as are left where an estimator is too slow: all of them among the newest."""
         sequence = simulated_sequence("figure_eight", duration_s=3.0)

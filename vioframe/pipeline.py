@@ -243,7 +243,7 @@ def _write(
                 recorder.summary["live"] = live.figures()
             closely = explain and live is None and not recorder.initialised
             found = experiment.look_closely() if closely else diagnose(experiment.gatherer.recording())
-            recorder.add_findings(found.findings)
+            recorder.add_findings(found)
         except BaseException as error:
             error.add_note(f"what was estimated until then is in {folder}")
             raise

@@ -9,7 +9,7 @@ import numpy as np
 from vioframe.diagnosis.findings import Finding, Severity, ranked
 from vioframe.diagnosis.geometry import look_at_geometry
 from vioframe.diagnosis.images import look_at_images
-from vioframe.diagnosis.inertial import look_at_imu, smoothed
+from vioframe.diagnosis.inertial import look_at_imu, smoothed, times_as_rough
 from vioframe.diagnosis.motion import look_at_motion, moving_windows
 from vioframe.diagnosis.recording import Recording
 from vioframe.diagnosis.self_calibration import OFFSET, ROTATION, SelfCalibration
@@ -60,6 +60,10 @@ def _facts(recording: Recording, found: SelfCalibration | None) -> dict[str, str
         facts["IMU"] = (
             f"{len(imu.t_ns)} readings at {rate_hz(imu.t_ns):.1f} Hz over {span_s(imu.t_ns):.1f} s, "
             f"specific force {length:.2f} m/s^2"
+        )
+        gyro, accel = times_as_rough(imu, recording.calibration.imu)
+        facts["vibration"] = (
+            f"gyroscope {gyro:.1f} times, accelerometer {accel:.1f} times as rough as its noise density"
         )
     if len(look.t_ns) > 2 and span_s(look.t_ns) > 0.0:
         width, height = camera.model.resolution

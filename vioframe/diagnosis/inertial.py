@@ -9,7 +9,8 @@ import numpy as np
 from vioframe.diagnosis.findings import Certainty, Finding, Severity
 from vioframe.diagnosis.recording import ImuSamples, Recording
 from vioframe.diagnosis.stamps import rate_hz
-from vioframe.types import GRAVITY_M_S2, NS_PER_S, Float
+from vioframe.estimation.inertial.noise import roughness
+from vioframe.types import GRAVITY_M_S2, NS_PER_S, Float, ImuNoise
 
 # Over half a second vibration averages out and gravity does not.
 _SMOOTHED_S = 0.5
@@ -32,6 +33,21 @@ def look_at_imu(recording: Recording) -> list[Finding]:
     if len(imu.t_ns) < 20 or imu.t_ns[-1] == imu.t_ns[0]:
         return [*_constant(recording)]
     return [*_constant(recording), *_forces(imu), *_rates(imu), *_saturated(imu), *_noise(imu, recording)]
+
+
+def times_as_rough(imu: ImuSamples, given: ImuNoise) -> tuple[float, float]:
+    """How many times as rough as by their densities gyroscope and accelerometer are, in the middle half second of all.
+
+    By so much vibration is told from noise; up to ``imu_noise_factor`` times the density are counted with in flight.
+    """
+    width = max(10, round(_NOISE_WINDOW_S * rate_hz(imu.t_ns)))
+    stretches = [slice(begin, begin + width) for begin in range(0, len(imu.t_ns) - width + 1, width)]
+
+    def times(values: Float, density: float) -> float:
+        rough = [roughness(imu.t_ns[stretch], values[stretch]) for stretch in stretches]
+        return float(np.median(rough)) / density if rough else 0.0
+
+    return times(imu.gyro_B, given.gyro_density), times(imu.accel_B, given.accel_density)
 
 
 def smoothed(values: Float, rate: float) -> Float:

@@ -30,7 +30,7 @@ from typing import Any, Self, TextIO
 
 import numpy as np
 
-from vioframe.diagnosis.findings import Finding
+from vioframe.diagnosis import Diagnosis
 from vioframe.errors import RunError
 from vioframe.evaluation.landmarks import Landmarks
 from vioframe.geometry import so3
@@ -234,9 +234,10 @@ class Recorder:
             values = [state.p_WB, so3.to_quat_xyzw(state.R_WB), state.v_WB, cov[_UPPER]]
             self._append("imu_rate.csv", _csv_line(state.t_ns, np.concatenate(values)))
 
-    def add_findings(self, findings: Sequence[Finding]) -> None:
-        """What was found to be odd about the recording, the likeliest cause of trouble first."""
-        self.summary["findings"] = [asdict(finding) for finding in findings]
+    def add_findings(self, found: Diagnosis) -> None:
+        """What was looked at in the recording, and found to be odd about it, the likeliest cause of trouble first."""
+        self.summary["facts"] = found.facts
+        self.summary["findings"] = [asdict(finding) for finding in found.findings]
 
     @property
     def initialised(self) -> bool:
