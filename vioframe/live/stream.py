@@ -86,7 +86,8 @@ class Live:
 
     def estimated(self, step: Step) -> list[NavState]:
         """Take note of a frame's estimate; the states at the rate of the IMU since the one before."""
-        self._latencies.add(self._clock.since_s(step.frames.t_ns, monotonic_ns()))
+        if not self._stopped.is_set():  # the last frame waits for readings until the end
+            self._latencies.add(self._clock.since_s(step.frames.t_ns, monotonic_ns()))
         calibration = step.estimate.calibration
         if calibration is not None:
             self._offset_ns = calibration.calibration.cameras[0].time_offset_ns
