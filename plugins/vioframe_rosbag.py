@@ -13,21 +13,20 @@ import logging
 import os
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import replace
 from itertools import chain, takewhile
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, BinaryIO
 
 import numpy as np
-from numpy.typing import NDArray
 
 from vioframe.errors import DatasetError
 from vioframe.interfaces import DatasetFactory
 from vioframe.io.calibration import PACKAGED, match_cameras, sidecar_folder
-from vioframe.io.images import check_bit_depth, decode_image, frame_set, gathered
+from vioframe.io.images import check_bit_depth, frame_set, gathered
+from vioframe.io.ros import imu_sample, pixels, stamp_ns
 from vioframe.io.writers import GROUND_TRUTH_TOPIC, TRUE_VECTOR_TOPICS
 from vioframe.parts.hooks import hookimpl
-from vioframe.types import NS_PER_S, FrameSet, ImuSample, Measurement, Unreadable
+from vioframe.types import FrameSet, Measurement, Unreadable
 
 if TYPE_CHECKING:
     from rosbags.highlevel import AnyReader
@@ -109,7 +108,7 @@ class RosbagDataset:
         vectors: dict[str, dict[int, list[float]]] = {topic: {} for topic in TRUE_VECTOR_TOPICS}
         with _opened(self._path) as reader:
             for topic, message in self._deserialized(reader, GROUND_TRUTH_TOPIC, *TRUE_VECTOR_TOPICS):
-                t_ns = _stamp_ns(message)
+                t_ns = stamp_ns(message)
                 if topic == GROUND_TRUTH_TOPIC:
                     p, q = message.pose.position, message.pose.orientation
                     poses[t_ns] = [p.x, p.y, p.z, q.w, q.x, q.y, q.z]
@@ -137,11 +136,11 @@ class RosbagDataset:
 
     def _messages(self, reader: AnyReader, *topics: str) -> Iterator[Measurement]:
         for topic, message in self._deserialized(reader, *topics):
-            yield _imu_sample(message) if topic == self._imu_topic else self._frame(topic, message)
+            yield imu_sample(message) if topic == self._imu_topic else self._frame(topic, message)
 
     def _frame(self, topic: str, message: Any) -> FrameSet | Unreadable:
-        t_ns, where = _stamp_ns(message), f"{self._path} [{topic}]"
-        image = _raw_image(message, where) if hasattr(message, "encoding") else decode_image(message.data, where)
+        t_ns, where = stamp_ns(message), f"{self._path} [{topic}]"
+        image = pixels(message, where)
         if image is None:
             return Unreadable(t_ns, "frame_unreadable", f"the image's data on {topic} are damaged or incomplete")
         return frame_set(t_ns, image, self._topics.index(topic), self.calibration, self._bit_depth, where)
@@ -289,41 +288,6 @@ def _check_topic(path: Path, wanted: str, topics: list[str], sensor: str) -> Non
     if wanted not in topics:
         there = ", ".join(topics)
         raise DatasetError(f"{path} has no {sensor} messages on {wanted}; its {sensor} topics: {there}")
-
-
-def _stamp_ns(message: Any) -> int:
-    stamp = message.header.stamp
-    return int(stamp.sec) * NS_PER_S + int(stamp.nanosec)
-
-
-def _imu_sample(message: Any) -> ImuSample:
-    w, a = message.angular_velocity, message.linear_acceleration
-    return ImuSample(_stamp_ns(message), np.array([w.x, w.y, w.z]), np.array([a.x, a.y, a.z]))
-
-
-def _raw_image(message: Any, where: str) -> NDArray[Any] | None:
-    """The pixels of a sensor_msgs/Image, mono8 without copying; None where there are fewer than its header says."""
-    from rosbags.image import ImageError, message_to_cvimage
-    from rosbags.image.image import to_cvtype
-
-    try:
-        bits, _, type_name, channels = to_cvtype(message.encoding)
-        if bits > 16:
-            raise ImageError(f"Format {message.encoding!r} is not supported")
-        row_bytes = message.width * channels * np.dtype(type_name).itemsize
-        if message.step < row_bytes or message.data.size < message.height * message.step:
-            return None
-        rows: NDArray[Any] = message.data[: message.height * message.step].reshape(message.height, message.step)[
-            :, :row_bytes
-        ]
-        if message.encoding in ("mono8", "8UC1"):
-            return rows
-        # rosbags-image takes rows to be contiguous.
-        packed = replace(message, data=np.ascontiguousarray(rows).ravel(), step=row_bytes)
-        image: NDArray[Any] = message_to_cvimage(packed, "mono16" if bits == 16 else "mono8")
-        return image
-    except ImageError as err:
-        raise DatasetError(f"{where}: {err}; convert the images to mono8, rgb8 or bgr8") from None
 
 
 @hookimpl

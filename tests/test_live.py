@@ -91,8 +91,8 @@ class Scripted:
         self.closed.set()
 
 
-def live(source: Scripted, tape: Path | None = None) -> Live:
-    return Live(source, Ahead(CALIBRATION.imu), tape)
+def live(source: Scripted) -> Live:
+    return Live(source, Ahead(CALIBRATION.imu))
 
 
 class TestInbox:
@@ -505,6 +505,14 @@ class TestRuns:
         assert "imu_gap" not in summary["incidents"]
         self.vioframe("run", tmp_path / "tape.mcap", "--out", again, "--quiet")
         self.same(flown, again)
+
+    def test_of_a_part_that_is_used_the_part_is_recorded(self, recording: Path, tmp_path: Path):
+        flown, again = tmp_path / "flown", tmp_path / "again"
+        part = ("--start", 1.0, "--duration", 2.5, "-o", "speed=2")
+        self.vioframe("run", f"replay:{recording}", *part, "--record", tmp_path / "tape.mcap", "--out", flown)
+        self.vioframe("run", tmp_path / "tape.mcap", "--out", again, "--quiet")
+        self.same(flown, again)
+        assert RunFolder.open(flown).summary["frames"] <= 26
 
     def test_ctrl_c_ends_it_with_a_complete_folder_and_recording(self, recording: Path, tmp_path: Path):
         out, tape = tmp_path / "flown", tmp_path / "tape.mcap"

@@ -133,7 +133,7 @@ class Source(Dataset, Protocol):
 
     ``measurements`` blocks until something comes, in any order that a :class:`~vioframe.odometry.Odometry` takes, and
     ends where nothing more will. It raises :class:`~vioframe.errors.SourceError` where the device is not there, or not
-    any more; asked anew it looks for it again. Nothing is started before it is asked for the first time.
+    any more; asked anew it looks for it again. Nothing is started before it, or ``calibration``, is asked for.
     """
 
     def tell(self, state: NavState) -> None:

@@ -6,7 +6,8 @@ The command line and the benchmarks both come through here; :class:`vioframe.odo
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
@@ -23,6 +24,7 @@ from vioframe.io.synchronise import played
 from vioframe.io.trajectories import load_trajectory, write_tum
 from vioframe.live.ahead import Ahead
 from vioframe.live.stream import Live
+from vioframe.live.tape import taped
 from vioframe.odometry import Odometry, limited_threads
 from vioframe.parts import config as configuration
 from vioframe.parts.config import Config
@@ -42,18 +44,19 @@ def run(
     *,
     start_s: float = 0.0,
     duration_s: float | None = None,
-    listen: Callable[[Measurement], None] = lambda measurement: None,
+    listeners: Sequence[Callable[[Measurement], None]] = (),
     pipelined: bool = False,
 ) -> Iterator[Step]:
     """Push a data set through ``odometry``, yielding one :class:`~vioframe.types.Step` a frame.
 
     ``start_s`` seconds are skipped, counted from the first frame's stamp; ``duration_s`` is how much is then played.
-    ``listen`` hears every measurement ahead of the odometry. ``pipelined`` as in :meth:`Odometry.follow`.
+    ``listeners`` hear every measurement ahead of the odometry. ``pipelined`` as in :meth:`Odometry.follow`.
     """
 
     def heard() -> Iterator[Measurement]:
         for measurement in played(dataset.measurements(), start_s, duration_s):
-            listen(measurement)
+            for listen in listeners:
+                listen(measurement)
             yield measurement
 
     return odometry.follow(heard(), pipelined=pipelined)
@@ -71,6 +74,8 @@ class Experiment:
     gatherer: Gatherer
     left_aside: tuple[str, ...] = ()
     """Cameras of the rig that are not used."""
+    tape: Path | None = None
+    """The file that all of a live source is written to that is used: run again it gives the same estimates."""
 
     @property
     def live(self) -> Live | None:
@@ -90,14 +95,19 @@ class Experiment:
 
         ``pipelined`` as in :meth:`~vioframe.odometry.Odometry.follow`.
         """
-        # Around all of it, not each frame alone: a loop closer's own thread works between frames.
-        with limited_threads(), self.registry.blaming():
+        with ExitStack() as within:
+            # Around all of it, not each frame alone: a loop closer's own thread works between frames.
+            within.enter_context(limited_threads())
+            within.enter_context(self.registry.blaming())
+            listeners = [self.gatherer.add]
+            if self.tape is not None:
+                listeners.append(within.enter_context(taped(self.tape, self.dataset.calibration)).add)
             yield from run(
                 self.dataset,
                 self.odometry,
                 start_s=self.config.start_s,
                 duration_s=self.config.duration_s,
-                listen=self.gatherer.add,
+                listeners=listeners,
                 pipelined=pipelined,
             )
 
@@ -125,7 +135,7 @@ def prepare(config: Config, registry: Registry, *, warm: bool = False, tape: Pat
     loop_closure = config.loop_closure
     if live := config.dataset.path is not None and registry.find_reader(config.dataset.path).kind is SOURCE:
         imu = dataset.calibration.imu.in_flight(config.estimation_options.imu_noise_factor)
-        dataset = Live(cast(Source, dataset), Ahead(imu), tape)
+        dataset = Live(cast(Source, dataset), Ahead(imu))
     elif tape is not None:
         raise DatasetError(f"{dataset.name} is a recording already; `vioframe convert` makes another of it")
     odometry = Odometry(
@@ -150,6 +160,7 @@ def prepare(config: Config, registry: Registry, *, warm: bool = False, tape: Pat
         dataset.ground_truth if config.ground_truth is None else load_trajectory(config.ground_truth),
         Gatherer(dataset.calibration, _LOOK_EVERY, _LOOK_S),
         left_aside,
+        tape,
     )
 
 

@@ -5,8 +5,6 @@ from __future__ import annotations
 import logging
 from collections import deque
 from collections.abc import Iterator
-from contextlib import nullcontext
-from pathlib import Path
 from threading import Event, Thread
 from time import monotonic_ns
 from typing import Any
@@ -17,7 +15,6 @@ from vioframe.interfaces import Source
 from vioframe.live.ahead import Ahead
 from vioframe.live.inbox import Inbox
 from vioframe.live.latency import HostClock, Latencies
-from vioframe.live.tape import taped
 from vioframe.types import NS_PER_S, Calibration, FrameSet, ImuSample, Measurement, NavState, Step, Unreadable
 
 _log = logging.getLogger("vioframe.live")
@@ -34,12 +31,12 @@ class Live:
     """Takes what ``source`` brings, in a thread of its own, so that no reading is lost while a frame is estimated from.
 
     Frames that come faster than they are used give way to newer ones and are counted as ``frame_dropped``. A source
-    that is gone (:class:`SourceError`) is looked for again for a minute, counted as ``source_lost``. ``tape`` is a file
-    to which all that is used is written: run again it gives the same estimates. :meth:`stop` ends it.
+    that is gone (:class:`SourceError`) is looked for again for a minute, counted as ``source_lost``. :meth:`stop` ends
+    it.
     """
 
-    def __init__(self, source: Source, ahead: Ahead, tape: Path | None = None) -> None:
-        self._source, self._tape = source, tape
+    def __init__(self, source: Source, ahead: Ahead) -> None:
+        self._source = source
         self._inbox = Inbox(_MOST_WAITING_FRAMES)
         self._offset_ns = source.calibration.cameras[0].time_offset_ns
         self._clock, self._latencies = HostClock(), Latencies()
@@ -67,16 +64,12 @@ class Live:
     def measurements(self) -> Iterator[Measurement]:
         """What comes in from now on, until the source ends or :meth:`stop`."""
         reader = Thread(target=self._read, name="source", daemon=True)
-        with nullcontext() if self._tape is None else taped(self._tape, self.calibration) as tape:
-            reader.start()
-            try:
-                for measurement in self._inbox:
-                    if tape is not None:
-                        tape.add(measurement)
-                    yield measurement
-            finally:
-                self.stop()
-                reader.join(_ENDS_WITHIN_S)
+        reader.start()
+        try:
+            yield from self._inbox
+        finally:
+            self.stop()
+            reader.join(_ENDS_WITHIN_S)
 
     def stop(self) -> None:
         """End it: what has come by now is still used."""
