@@ -22,7 +22,6 @@ import click
 import numpy as np
 import psutil
 from common import benchmark, present, render
-from vioframe.report.live_view import LiveView
 
 from vioframe.bench import Row
 from vioframe.evaluation import evaluate
@@ -32,6 +31,7 @@ from vioframe.parts import registry
 from vioframe.parts.config import Config, DatasetConfig, PartConfig
 from vioframe.parts.registry import BACKEND, Registry
 from vioframe.pipeline import prepare, record
+from vioframe.report.live_view import LiveView
 from vioframe.runs.folder import RunFolder
 from vioframe.simulation.config import SimulationConfig
 from vioframe.types import Estimate, FrameTracks, ImuSegment
@@ -94,7 +94,7 @@ def fly(case: str, bag: Path, backend: str, assignments: tuple[str, ...]) -> Row
         live = experiment.live
         assert live is not None
         if case == "watched":
-            with LiveView(live.calibration, Path(temporary) / "view.rrd") as view, watch:
+            with LiveView(experiment.name, live.calibration, Path(temporary) / "view.rrd") as view, watch:
                 summary = record(experiment, folder, on_step=lambda step: view.add(step, live.latency_ms, live.dropped))
         else:
             with watch:

@@ -71,8 +71,19 @@ _MOST_REASONS = 4
     type=FILE,
     help="Write what is used of a live source to FILE.mcap, .bag or .ros2, which gives the same estimates again.",
 )
+@click.option("--view", is_flag=True, help="Watch it in rerun's viewer while it flies.")
+@click.option("--save-view", type=FILE, metavar="FILE", help="Write what would be watched to FILE.rrd.")
 @quiet_option
-def run(threads: int | None, out: Path | None, overwrite: bool, tape: Path | None, quiet: bool, **choices: Any) -> None:
+def run(
+    threads: int | None,
+    out: Path | None,
+    overwrite: bool,
+    tape: Path | None,
+    view: bool,
+    save_view: Path | None,
+    quiet: bool,
+    **choices: Any,
+) -> None:
     """Estimate the motion along DATA, a bag or an ASL folder, and write a run folder.
 
     DATA may also be a live source, NAME:ADDRESS, such as `replay:FLIGHT.bag`; `vioframe plugins` lists them. Ctrl-C
@@ -90,12 +101,18 @@ def run(threads: int | None, out: Path | None, overwrite: bool, tape: Path | Non
     with Bar(None, quiet=quiet, late=True) as bar, helped(config.backend.name):
         experiment = prepare(config, installed, warm=overwrite, tape=tape)
         folder = out or free_run_folder(Path("runs"), experiment.name)
-        with _ended_by_signals(experiment.live):
+        told = _watched(bar, experiment)
+        with _ended_by_signals(experiment.live), _viewer(experiment, view, save_view) as shown:
+
+            def on_step(step: Step) -> None:
+                shown(step)
+                told(step)
+
             summary = record(
                 experiment,
                 folder,
                 overwrite=overwrite,
-                on_step=_watched(bar, experiment),
+                on_step=on_step,
                 explain=True,
                 # Live, a frame that was read ahead would only be older.
                 pipelined=(threads or usable_cores()) > 1 and experiment.live is None,
@@ -153,6 +170,19 @@ def _ended_by_signals(live: Live | None) -> Iterator[None]:
     finally:
         for each, handler in before.items():
             signal.signal(each, handler)
+
+
+@contextmanager
+def _viewer(experiment: Experiment, window: bool, save: Path | None) -> Iterator[Callable[[Step], None]]:
+    """What shows a step in a window, or writes it to ``save``, or does nothing."""
+    if not window and save is None:
+        yield lambda step: None
+        return
+    from vioframe.report.live_view import LiveView
+
+    live = experiment.live
+    with LiveView(experiment.name, experiment.dataset.calibration, save) as view:
+        yield lambda step: view.add(step, *(() if live is None else (live.latency_ms, live.dropped)))
 
 
 def _watched(bar: Bar, experiment: Experiment) -> Callable[[Step], None]:
