@@ -94,6 +94,8 @@ def run(
     Options of the parts are set with -o: `-o backend.max_clones=15`, or just `-o max_clones=15` where only one part has
     such an option. `vioframe plugins NAME` lists them.
     """
+    if view and save_view is not None:
+        raise click.UsageError("--view opens a window and --save-view writes a file; choose one")
     if out is not None:
         check_run_folder(out, overwrite=overwrite)
     installed = registry.load()
