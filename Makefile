@@ -14,7 +14,7 @@ FLIGHT_BAG := $(DEMO)/$(FLIGHT).bag
 DETECTORS := shi_tomasi fast orb sift keypointnet
 RUNS := $(DETECTORS:%=$(DEMO)/%) $(DEMO)/sliding_window
 
-# What Open3D's wheel needs from the system, and the browser that the tests open a report's page in.
+# What the wheels of Open3D and pyrealsense2 need from the system, and the browser that the tests open a report's page in.
 SYSTEM_LIBRARIES := libusb-1.0-0 libgl1 libgomp1 libx11-6 libegl1
 BROWSER := chromium chromium-driver
 
@@ -64,9 +64,9 @@ $(BIN)/python:
 	@$(PYTHON) -m venv $(VENV) || { rm -rf $(VENV); \
 		echo "cannot create $(VENV); on Debian or Ubuntu: apt-get install python3-venv"; exit 2; }
 
-# Only Open3D needs these, so what cannot be installed is said and not fatal.
+# Only Open3D and pyrealsense2 need these, so what cannot be installed is said and not fatal.
 system-libraries:
-	@$(call debian_packages,$(SYSTEM_LIBRARIES),Open3D needs system libraries)
+	@$(call debian_packages,$(SYSTEM_LIBRARIES),Open3D and RealSense cameras need system libraries)
 
 # Without it the tests of a report's page are skipped.
 browser:
