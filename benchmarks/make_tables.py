@@ -417,6 +417,26 @@ def memory() -> str:
     return markdown(shown) + source(rows)
 
 
+def live() -> str:
+    """Minutes of a live flight, as it is, with a slow back-end, and watched."""
+    rows = recorded("live*.json")
+    shown = [
+        {
+            "flown": row["case"],
+            "back-end": f"`{row['backend']}`",
+            "frames dropped": f"{row['frames_dropped']:.0f} of {row['frames']:.0f}",
+            "readings lost": f"{row['readings_lost']:.0f}",
+            "tracked": f"{row['completion']:.1%}",
+            "ATE": length(1e-3 * row["ate_mm"]),
+            "exposure to estimate, median, 99 %": f"{row['latency_ms.median']:.0f}, {row['latency_ms.p99']:.0f} ms",
+            "memory after a minute, at the end": f"{row['minute_mib']:.0f}, {row['end_mib']:.0f} MiB",
+            "the same bytes again": row["same_bytes"],
+        }
+        for _, row in rows.iterrows()
+    ]
+    return markdown(shown) + source(rows)
+
+
 def push() -> str:
     """Measurements pushed from Python against the command line."""
     rows = recorded("odometry_speed.json")
@@ -545,6 +565,7 @@ FIGURES: dict[str, Callable[[], str]] = {
             whole_runs,
             consistency,
             memory,
+            live,
             push,
         ),
         *(speed, quality, clean, comparison, stress, throughput, rolling_shutter, planted_faults, starts),
