@@ -29,7 +29,7 @@ from vioframe.live import Live, stream
 from vioframe.live.ahead import Ahead
 from vioframe.live.inbox import Inbox
 from vioframe.live.latency import HostClock, Latencies
-from vioframe.live.tape import taped
+from vioframe.live.tape import Tape
 from vioframe.parts import registry
 from vioframe.runs.folder import RunFolder
 from vioframe.simulation import simulated_sequence
@@ -263,7 +263,7 @@ class TestTape:
             reading(25 * MS),
             frame(24 * MS),
         ]
-        with taped(tmp_path / "flight.mcap", small()) as tape:
+        with Tape(tmp_path / "flight.mcap", small()) as tape:
             for measurement in given:
                 tape.add(measurement)
         assert stamps(INSTALLED.open_dataset(tmp_path / "flight.mcap").measurements()) == stamps(given)
@@ -280,7 +280,7 @@ class TestTape:
     )
     def test_what_cannot_be_written_is_refused_ahead_of_the_flight(self, name: str, why: str, tmp_path: Path):
         (tmp_path / "there.mcap").touch()
-        with pytest.raises(DatasetError, match=why), taped(tmp_path / name, small()):
+        with pytest.raises(DatasetError, match=why), Tape(tmp_path / name, small()):
             pytest.fail("it began")
 
     def test_a_disk_that_is_full_ends_the_flight_and_nobody_waits(self, tmp_path: Path):
@@ -289,7 +289,7 @@ class TestTape:
 
     @staticmethod
     def take(path: Path, given: Iterable[Measurement | BaseException]) -> None:
-        with taped(path, small()) as tape:
+        with Tape(path, small()) as tape:
             for each in given:
                 if isinstance(each, BaseException):
                     raise each

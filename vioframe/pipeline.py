@@ -24,11 +24,11 @@ from vioframe.io.synchronise import played
 from vioframe.io.trajectories import load_trajectory, write_tum
 from vioframe.live.ahead import Ahead
 from vioframe.live.stream import Live
-from vioframe.live.tape import taped
+from vioframe.live.tape import Tape
 from vioframe.odometry import Odometry, limited_threads
 from vioframe.parts import config as configuration
 from vioframe.parts.config import Config
-from vioframe.parts.registry import BACKEND, DETECTOR, LOOP_CLOSER, SOURCE, Registry
+from vioframe.parts.registry import BACKEND, DATASET, DETECTOR, LOOP_CLOSER, SOURCE, Registry
 from vioframe.runs import machine
 from vioframe.runs.recorder import Recorder, new_run_folder, write_json
 from vioframe.stopwatch import working_s
@@ -101,7 +101,7 @@ class Experiment:
             within.enter_context(self.registry.blaming())
             listeners = [self.gatherer.add]
             if self.tape is not None:
-                listeners.append(within.enter_context(taped(self.tape, self.dataset.calibration)).add)
+                listeners.append(within.enter_context(Tape(self.tape, self.dataset.calibration)).add)
             yield from run(
                 self.dataset,
                 self.odometry,
@@ -130,10 +130,11 @@ def prepare(config: Config, registry: Registry, *, warm: bool = False, tape: Pat
     config = configuration.complete(config, registry)
     if config.dataset.path is None:
         raise DatasetError("no data set given; name a bag or folder, or set dataset.path in the configuration")
+    live = registry.find_reader(config.dataset.path, config.dataset.reader).kind is SOURCE
     dataset, options, left_aside = _of_usable_cameras(registry, config)
     config = config.model_copy(update={"dataset": config.dataset.model_copy(update={"options": options})})
     loop_closure = config.loop_closure
-    if live := config.dataset.path is not None and registry.find_reader(config.dataset.path).kind is SOURCE:
+    if live:
         imu = dataset.calibration.imu.in_flight(config.estimation_options.imu_noise_factor)
         dataset = Live(cast(Source, dataset), Ahead(imu))
     elif tape is not None:
@@ -263,9 +264,8 @@ def _write(
 
 def _about(experiment: Experiment) -> dict[str, Any]:
     config = experiment.config
-    assert config.dataset.path is not None
-    reader = experiment.registry.find_reader(config.dataset.path, config.dataset.reader)
-    chosen = {DETECTOR: config.detector.name, BACKEND: config.backend.name}
+    kind = DATASET if experiment.live is None else SOURCE
+    chosen = {kind: config.dataset.reader or "", DETECTOR: config.detector.name, BACKEND: config.backend.name}
     if config.loop_closure is not None:
         chosen[LOOP_CLOSER] = config.loop_closure.name
     return {
@@ -275,10 +275,7 @@ def _about(experiment: Experiment) -> dict[str, Any]:
         "detector": config.detector.name,
         "backend": config.backend.name,
         "loop_closer": None if config.loop_closure is None else config.loop_closure.name,
-        "plugins": {
-            reader.kind.name: str(reader.origin),
-            **{kind.name: str(experiment.registry.find(kind, name).origin) for kind, name in chosen.items()},
-        },
+        "plugins": {kind.name: str(experiment.registry.find(kind, name).origin) for kind, name in chosen.items()},
         "start_s": config.start_s,
         "duration_s": config.duration_s,
     }

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from math import hypot
 from typing import Any
 
 import numpy as np
@@ -77,12 +76,5 @@ def _point(kind: str, xyz: Float) -> Any:
 
 
 def _quaternion(R: Float) -> Any:
-    """By the largest component, as :func:`so3.to_quat_xyzw`, which is made for many rotations: this is for one."""
-    (a, b, c), (d, e, f), (g, h, i) = R.tolist()
-    # Four times the products of the components; the row of the largest square is proportional to the quaternion.
-    squares = 1.0 + a - e - i, 1.0 - a + e - i, 1.0 - a - e + i, 1.0 + a + e + i
-    xy, xz, yz, xw, yw, zw = b + d, c + g, f + h, h - f, c - g, d - b
-    rows = (squares[0], xy, xz, xw), (xy, squares[1], yz, yw), (xz, yz, squares[2], zw), (xw, yw, zw, squares[3])
-    row = rows[squares.index(max(squares))]
-    x, y, z, w = (each / hypot(*row) for each in row)
+    x, y, z, w = so3.to_quat_xyzw(R).tolist()
     return new("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w)

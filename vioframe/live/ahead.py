@@ -46,7 +46,6 @@ class Ahead:
         if estimate is not self._from:
             self._from = self._newest = estimate
         if self._newest is None or estimate is None or estimate.t_ns + offset_ns < kept_from_ns:
-            self._newest = None if estimate is None else estimate
             return None
         t_ns = sample.t_ns - offset_ns
         if t_ns - self._last_ns < self._period_ns or (since := self._since(self._newest.t_ns, offset_ns)) is None:

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from queue import Queue
 from threading import Thread
+from typing import Self
 
 from vioframe.errors import DatasetError
 from vioframe.io.convert import FORMATS, format_of, write_recording, write_sidecar
@@ -18,14 +18,34 @@ _MOST_WAITING = 1000
 
 
 class Tape:
-    """Takes measurements in the order in which they are to be read."""
+    """Takes measurements in the order in which they are to be read; a context manager.
 
-    def __init__(self) -> None:
+    ``destination`` is complete in the end, however that comes. Raises :class:`DatasetError` where it exists, tells no
+    format that keeps an order, or can no longer be written.
+    """
+
+    def __init__(self, destination: Path, calibration: Calibration) -> None:
+        if format_of(destination) == "asl":
+            raise DatasetError(f"an ASL folder keeps no order of arrival; record to {destination}.mcap instead")
+        if destination.exists():
+            raise DatasetError(f"{destination} exists already; remove it or choose another name")
+        write_sidecar(calibration, destination)
+        self._destination, self._calibration = destination, calibration
         self._waiting: Queue[Measurement | None] = Queue(_MOST_WAITING)
         self._error: Exception | None = None
+        self._thread = Thread(target=self._write, name="tape")
+
+    def __enter__(self) -> Self:
+        self._thread.start()
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        self._waiting.put(None)
+        self._thread.join()
+        if kind is None and self._error is not None:
+            raise self._error
 
     def add(self, measurement: Measurement) -> None:
-        """Raises :class:`DatasetError` where the recording can no longer be written."""
         if self._error is not None:
             raise self._error
         self._waiting.put(measurement)
@@ -34,36 +54,14 @@ class Tape:
         while (measurement := self._waiting.get()) is not None:
             yield measurement
 
-    def _write(self, destination: Path, calibration: Calibration) -> None:
+    def _write(self) -> None:
+        """The thread."""
         try:
-            with appearing(destination) as unfinished:
-                names = [camera.name for camera in calibration.cameras]
-                with FORMATS[format_of(destination)].open(unfinished, None, names) as writer:
+            with appearing(self._destination) as unfinished:
+                names = [camera.name for camera in self._calibration.cameras]
+                with FORMATS[format_of(self._destination)].open(unfinished, None, names) as writer:
                     write_recording(self._measurements(), None, [writer])
         except Exception as error:
             self._error = error
             for _ in self._measurements():  # nobody may wait for what is not written
                 pass
-
-
-@contextmanager
-def taped(destination: Path, calibration: Calibration) -> Iterator[Tape]:
-    """Write what the tape is given to ``destination``, complete by the end, however that comes.
-
-    Raises :class:`DatasetError` where it exists, or tells no format.
-    """
-    if format_of(destination) == "asl":
-        raise DatasetError(f"an ASL folder keeps no order of arrival; record to {destination}.mcap instead")
-    if destination.exists():
-        raise DatasetError(f"{destination} exists already; remove it or choose another name")
-    write_sidecar(calibration, destination)
-    tape = Tape()
-    thread = Thread(target=tape._write, args=(destination, calibration), name="tape")
-    thread.start()
-    try:
-        yield tape
-    finally:
-        tape._waiting.put(None)
-        thread.join()
-    if tape._error is not None:
-        raise tape._error

@@ -202,7 +202,7 @@ class Registry:
         path = Path(path)
         if not path.exists():
             name, colon, _ = str(path).partition(":")
-            if colon and (name in self.parts.get(SOURCE.name, {}) or "/" not in name):
+            if colon and "/" not in name:
                 return self.find(SOURCE, name)
             raise DatasetError(f"{path} does not exist")
         if reader is not None:
