@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import replace
 from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any
@@ -26,11 +25,7 @@ def small_calibration(divisor: int = 4, cameras: Sequence[str] = ("cam0",)) -> C
     """EuRoC's cameras, distortion included, at a fraction of their resolution."""
     rig = packaged_calibration("euroc", cameras=cameras)
     for index, camera in enumerate(rig.cameras):
-        model, (width, height) = camera.model, camera.model.resolution
-        fx, fy = model.fx / divisor, model.fy / divisor
-        cx, cy = (model.cx + 0.5) / divisor - 0.5, (model.cy + 0.5) / divisor - 0.5
-        small = replace(model, fx=fx, fy=fy, cx=cx, cy=cy, resolution=(width // divisor, height // divisor))
-        rig = rig.with_camera(index, model=small)
+        rig = rig.with_camera(index, model=camera.model.shrunk(divisor))
     return rig
 
 

@@ -29,6 +29,7 @@ from vioframe_realsense import calibration as conversion
 from vioframe_realsense import device as devices
 from vioframe_realsense import source as sources
 from vioframe_realsense.device import Wanted
+from vioframe_realsense.emulated import Emulated, librealsense_lens
 from vioframe_realsense.source import RealSense
 from vioframe_realsense.timing import HARDWARE_CLOCK, Clock, Pairs, Readings
 
@@ -49,137 +50,6 @@ RIG = Calibration(
     ),
     ImuNoise(1.6e-4, 1e-3, conversion.GYRO_WALK, conversion.ACCEL_WALK, 200.0),
 )
-
-
-class Emulated:
-    """A device of librealsense's own making, with the sensors of a D435i; :meth:`play` has it measure."""
-
-    def __init__(
-        self,
-        rig: Calibration = RIG,
-        *,
-        serial: str = "0123",
-        rate_hz: int = 30,
-        cameras: int | None = None,
-        imu: bool = True,
-        emitter: bool = True,
-        placed: bool = True,
-        domain: str = HARDWARE_CLOCK,
-        domain_of_images: str | None = None,
-    ) -> None:
-        self.device = rs.software_device()
-        self.device.register_info(rs.camera_info.serial_number, serial)
-        self.device.register_info(rs.camera_info.name, "Intel RealSense D435I")
-        self.device.register_info(rs.camera_info.usb_type_descriptor, "2.1")
-        self.stereo = self.device.add_sensor("Stereo Module")
-        self.motion = self.device.add_sensor("Motion Module")
-        on = rs.option_range(0.0, 1.0, 1.0, 1.0)
-        if emitter:
-            self.stereo.add_option(rs.option.emitter_enabled, on, True)
-        for sensor in (self.stereo, self.motion):
-            sensor.add_option(rs.option.global_time_enabled, on, True)
-        self._domain, self._domain_of_images = domain, domain_of_images or domain
-        self._uid = 0
-        self._numbers: dict[int, int] = {}
-        self.injected: list[int] = []
-        """Stamps of the gyroscope's readings."""
-        self._accel_ns: list[int] = []
-        count = len(rig.cameras) if cameras is None else cameras
-        self.cameras = [self._infrared(i, camera.model, rate_hz) for i, camera in enumerate(rig.cameras[:count])]
-        for i, camera in enumerate(rig.cameras[:count]):
-            self._infrared(i, camera.model.zoomed(0.5), rate_hz // 2)  # another mode
-        if not imu:
-            return
-        noise = rig.imu
-        self.gyro = self._motion_stream(rs.stream.gyro, 200, noise.gyro_density**2 * 200)
-        self._motion_stream(rs.stream.gyro, 100, 0.0)
-        self._motion_stream(rs.stream.gyro, 1600, 0.0)
-        self.accel = self._motion_stream(rs.stream.accel, 100, noise.accel_density**2 * 100)
-        for stream, camera in zip(self.cameras if placed else (), rig.cameras, strict=False):
-            extrinsics = rs.extrinsics()
-            extrinsics.rotation = camera.R_BC.ravel().tolist()  # R_CB column after column
-            extrinsics.translation = (-camera.R_BC.T @ camera.p_BC).tolist()
-            self.gyro.register_extrinsics_to(stream, extrinsics)
-
-    def _infrared(self, place: int, lens: Camera, rate_hz: int) -> Any:
-        stream = rs.video_stream()
-        stream.type, stream.index, stream.uid = rs.stream.infrared, place + 1, self._next_uid()
-        (stream.width, stream.height), stream.fps, stream.bpp, stream.fmt = lens.resolution, rate_hz, 1, rs.format.y8
-        stream.intrinsics = librealsense_lens(lens)
-        return self.stereo.add_video_stream(stream)
-
-    def _motion_stream(self, kind: Any, rate_hz: int, variance: float) -> Any:
-        stream = rs.motion_stream()
-        stream.type, stream.index, stream.uid, stream.fps = kind, 0, self._next_uid(), rate_hz
-        stream.fmt, stream.intrinsics = rs.format.motion_xyz32f, rs.motion_device_intrinsic()
-        intrinsics = rs.motion_device_intrinsic()
-        intrinsics.noise_variances = [variance] * 3
-        stream.intrinsics = intrinsics
-        return self.motion.add_motion_stream(stream)
-
-    def _next_uid(self) -> int:
-        self._uid += 1
-        return self._uid
-
-    def image(self, place: int, t_ns: int, image: np.ndarray) -> None:
-        frame = rs.software_video_frame()
-        frame.pixels, frame.stride, frame.bpp = np.ascontiguousarray(image), image.shape[1], 1
-        frame.timestamp, frame.domain = t_ns / MS, getattr(rs.timestamp_domain, self._domain_of_images)
-        frame.frame_number, frame.profile = self._number(place), self.cameras[place].as_video_stream_profile()
-        self.stereo.on_video_frame(frame)
-
-    def reads(self, stream: Any, t_ns: int, values: np.ndarray) -> None:
-        vector, frame = rs.vector(), rs.software_motion_frame()
-        vector.x, vector.y, vector.z = values.tolist()
-        frame.data, frame.timestamp, frame.domain = vector, t_ns / MS, getattr(rs.timestamp_domain, self._domain)
-        number = self._number(10 + int(stream is self.gyro))
-        frame.frame_number, frame.profile = number, stream.as_motion_stream_profile()
-        self.motion.on_motion_frame(frame)
-        (self.injected if stream is self.gyro else self._accel_ns).append(t_ns)
-
-    def wait_until_started(self) -> None:
-        """It is no fault where it never is: then the source has refused it."""
-        give_up_s = time.monotonic() + 5.0
-        while not self.stereo.get_active_streams() and time.monotonic() < give_up_s:
-            time.sleep(0.01)
-        time.sleep(0.1)
-
-    @property
-    def usable(self) -> int:
-        """How many of the gyroscope's readings have the accelerometer's on either side."""
-        return sum(self._accel_ns[0] <= t_ns <= self._accel_ns[-1] for t_ns in self.injected)
-
-    def _number(self, key: int) -> int:
-        self._numbers[key] = self._numbers.get(key, 0) + 1
-        return self._numbers[key]
-
-    def play(self, measurements: Iterable[Measurement], *, at_once: bool = False) -> None:
-        """At their own pace; the accelerometer reads half as often, in between."""
-        begin_s, first_ns = time.monotonic(), None
-        before: ImuSample | None = None
-        for m in measurements:
-            first_ns = m.t_ns if first_ns is None else first_ns
-            if not at_once:
-                time.sleep(max(0.0, begin_s + (m.t_ns - first_ns) / NS_PER_S - time.monotonic()))
-            if isinstance(m, FrameSet):
-                for place, image in enumerate(m.images):
-                    if image is not None:
-                        self.image(place, m.t_ns, image)
-            elif isinstance(m, ImuSample):
-                self.reads(self.gyro, m.t_ns, m.gyro_B)
-                if before is None:
-                    before = m
-                else:
-                    self.reads(self.accel, (before.t_ns + m.t_ns) // 2, 0.5 * (before.accel_B + m.accel_B))
-                    before = None
-
-
-def librealsense_lens(lens: Camera, model: str = "brown_conrady") -> Any:
-    intrinsics = rs.intrinsics()
-    intrinsics.width, intrinsics.height = lens.resolution
-    intrinsics.fx, intrinsics.fy, intrinsics.ppx, intrinsics.ppy = lens.fx, lens.fy, lens.cx, lens.cy
-    intrinsics.model, intrinsics.coeffs = getattr(rs.distortion, model), [*lens.distortion, 0.0]
-    return intrinsics
 
 
 def opened(emulated: Emulated, **options: Any) -> RealSense:
@@ -436,7 +306,7 @@ class TestPairs:
 
 class TestSource:
     def test_all_that_is_measured_comes(self):
-        emulated, measured = Emulated(), flight()
+        emulated, measured = Emulated(RIG), flight()
         brought = collected(emulated, opened(emulated), lambda: emulated.play(measured))
         given, readings = samples(measured), samples(brought)
         # The first reading is ahead of the accelerometer's, the last one behind.
@@ -461,7 +331,7 @@ class TestSource:
         assert len(brought) == len(readings) + len(frames(brought))
 
     def test_nothing_is_lost_while_nobody_reads(self):
-        emulated, measured = Emulated(), flight(2.0)
+        emulated, measured = Emulated(RIG), flight(2.0)
         brought = iter(opened(emulated).measurements())
         Thread(target=lambda: (emulated.wait_until_started(), emulated.play(measured, at_once=True))).start()
         first = next(brought)
@@ -472,7 +342,7 @@ class TestSource:
         brought.close()
 
     def test_the_rig_is_read_from_the_device(self):
-        source = opened(Emulated())
+        source = opened(Emulated(RIG))
         assert isinstance(source, Source)
         assert source.name == "D435I_0123"
         assert (source.frame_count, source.ground_truth) == (None, None)
@@ -489,7 +359,7 @@ class TestSource:
 
     @pytest.mark.parametrize("name", ["cam0", "cam1"])
     def test_one_camera_of_two(self, name):
-        emulated = Emulated()
+        emulated = Emulated(RIG)
         source = opened(emulated, cameras=name)
         assert [camera.name for camera in source.calibration.cameras] == [name]
         measured = flight(0.3)
@@ -500,21 +370,21 @@ class TestSource:
             np.testing.assert_array_equal(one.images, [other.images[place]])
 
     def test_a_device_with_one_camera(self):
-        emulated = Emulated(cameras=1)
+        emulated = Emulated(RIG, cameras=1)
         source, measured = opened(emulated), flight(0.3, cameras=1)
         assert [camera.name for camera in source.calibration.cameras] == ["cam0"]
         assert len(frames(collected(emulated, source, lambda: emulated.play(measured)))) == len(frames(measured))
 
     @pytest.mark.parametrize("wanted", [False, True])
     def test_emitter_and_clock_are_set(self, wanted):
-        emulated = Emulated()
+        emulated = Emulated(RIG)
         collected(emulated, opened(emulated, emitter=wanted), lambda: None)
         assert emulated.stereo.get_option(rs.option.emitter_enabled) == float(wanted)
         for sensor in (emulated.stereo, emulated.motion):
             assert sensor.get_option(rs.option.global_time_enabled) == 0.0
 
     def test_an_emitter_that_is_not_there_is_refused(self):
-        emulated = Emulated(emitter=False)
+        emulated = Emulated(RIG, emitter=False)
         with pytest.raises(DatasetError, match="D435I_0123 has no emitter"):
             next(opened(emulated, emitter=True).measurements())
         assert collected(emulated, opened(emulated), lambda: emulated.play(flight(0.1)))
@@ -522,16 +392,16 @@ class TestSource:
     def test_a_calibration_that_is_named_comes_before_the_devices(self, tmp_path):
         own = RIG.with_camera(0, p_BC=np.array([1.0, 2.0, 3.0]), time_offset_ns=4 * MS)
         write_calibration(own, tmp_path)
-        source = opened(Emulated(placed=False), calibration=tmp_path)
+        source = opened(Emulated(RIG, placed=False), calibration=tmp_path)
         np.testing.assert_array_equal(source.calibration.cameras[0].p_BC, [1.0, 2.0, 3.0])
         assert source.calibration.cameras[0].time_offset_ns == 4 * MS
-        second = opened(Emulated(), calibration=[tmp_path], cameras=["cam1"])
+        second = opened(Emulated(RIG), calibration=[tmp_path], cameras=["cam1"])
         assert [camera.name for camera in second.calibration.cameras] == ["cam1"]
 
     def test_a_calibration_for_another_size_is_refused(self, tmp_path):
         write_calibration(RIG.with_camera(0, model=replace(LENS, resolution=(848, 480))), tmp_path)
         with pytest.raises(DatasetError, match="images of 64x48, but cam0 is calibrated for 848x480"):
-            opened(Emulated(), calibration=tmp_path)
+            opened(Emulated(RIG), calibration=tmp_path)
 
     @pytest.mark.parametrize(
         ("device", "options", "message"),
@@ -546,11 +416,11 @@ class TestSource:
     )
     def test_what_cannot_be_used_is_refused(self, device, options, message):
         with pytest.raises((DatasetError, CalibrationError), match=message) as refused:
-            opened(Emulated(**device), **options)
+            opened(Emulated(RIG, **device), **options)
         assert "\n" not in str(refused.value)
 
     def test_images_are_stamped_in_the_middle_of_their_exposure(self):
-        emulated = Emulated(cameras=1)
+        emulated = Emulated(RIG, cameras=1)
         known = rs.frame_metadata_value
 
         def inject() -> None:
@@ -565,13 +435,13 @@ class TestSource:
         assert [f.t_ns / MS for f in brought] == [4991.0, 4995.0, 5000.0]
 
     def test_two_clocks_are_refused(self):
-        emulated = Emulated(domain_of_images="system_time")
+        emulated = Emulated(RIG, domain_of_images="system_time")
         source = opened(emulated)
         with pytest.raises(DatasetError, match=r"different clocks \(hardware_clock, system_time\)"):
             collected(emulated, source, lambda: emulated.play(flight()))
 
     def test_a_stray_stamp_is_counted(self):
-        emulated = Emulated(cameras=1)
+        emulated = Emulated(RIG, cameras=1)
 
         def inject() -> None:
             emulated.play(flight(0.2, cameras=1))
@@ -583,7 +453,7 @@ class TestSource:
         assert (last.kind, last.t_ns) == ("frame_unreadable", emulated.injected[-1] - 2_500_000)
 
     def test_a_device_that_is_unplugged_is_lost_and_goes_on_when_it_is_back(self):
-        emulated = Emulated()
+        emulated = Emulated(RIG)
         there = True
 
         def find(serial: str) -> Any:
@@ -618,7 +488,7 @@ class TestSource:
     @pytest.mark.parametrize("silent", ["gyroscope", "accelerometer", "cam1"])
     def test_a_stream_that_falls_silent_is_told(self, monkeypatch, silent):
         monkeypatch.setattr(sources, "_SILENT_S", 0.5)
-        emulated = Emulated()
+        emulated = Emulated(RIG)
         measured = flight(1.5)
         if silent == "cam1":
             measured = [m if isinstance(m, ImuSample) else FrameSet(m.t_ns, (m.images[0], None)) for m in measured]
@@ -630,7 +500,7 @@ class TestSource:
             collected(emulated, opened(emulated), lambda: emulated.play(measured))
 
     def test_a_device_in_use_is_told(self):
-        emulated = Emulated()
+        emulated = Emulated(RIG)
         emulated.stereo.open(emulated.cameras[:1])
         with pytest.raises(SourceError, match=r"D435I_0123 cannot be started: .*; end other programs that use it"):
             next(opened(emulated).measurements())
@@ -638,7 +508,7 @@ class TestSource:
         assert samples(collected(emulated, opened(emulated), lambda: emulated.play(flight(0.1))))  # all was let go
 
     def test_it_ends_within_a_second(self):
-        source = opened(Emulated())
+        source = opened(Emulated(RIG))
         closed_s = 0.0
 
         def close() -> None:
@@ -669,7 +539,7 @@ class TestFinding:
         assert "\n" not in str(none.value)
 
     def test_the_first_or_that_of_the_serial_number(self, found):
-        found += [Emulated(serial="11").device, Emulated(serial="22").device]
+        found += [Emulated(RIG, serial="11").device, Emulated(RIG, serial="22").device]
         options = {"resolution": "64x48"}
         assert INSTALLED.open_dataset("realsense:", options=options).name == "D435I_11"
         assert INSTALLED.open_dataset("realsense:22", options=options).name == "D435I_22"
@@ -677,9 +547,9 @@ class TestFinding:
             INSTALLED.open_dataset("realsense:33")
 
     def test_the_one_that_was_found_is_looked_for_again(self, found):
-        found += [Emulated(serial="11").device]
+        found += [Emulated(RIG, serial="11").device]
         source = INSTALLED.open_dataset("realsense:", options={"resolution": "64x48"})
-        found[:] = [Emulated(serial="22").device]
+        found[:] = [Emulated(RIG, serial="22").device]
         with pytest.raises(SourceError, match="serial number 11"):
             next(source.measurements())
 

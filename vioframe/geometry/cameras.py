@@ -57,6 +57,18 @@ class Camera:
         """The same with both focal lengths ``factor`` times as long."""
         return replace(self, fx=factor * self.fx, fy=factor * self.fy)
 
+    def shrunk(self, divisor: int) -> Camera:
+        """The same of images in which ``divisor`` by ``divisor`` pixels are one."""
+        width, height = self.resolution
+        return replace(
+            self,
+            fx=self.fx / divisor,
+            fy=self.fy / divisor,
+            cx=(self.cx + 0.5) / divisor - 0.5,
+            cy=(self.cy + 0.5) / divisor - 0.5,
+            resolution=(width // divisor, height // divisor),
+        )
+
     def with_intrinsics(self, intrinsics: Float) -> Camera:
         """The same with ``intrinsics`` (8,): fx fy cx cy and the distortion's coefficients."""
         fx, fy, cx, cy, *distortion = intrinsics.tolist()

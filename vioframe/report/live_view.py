@@ -81,9 +81,10 @@ _MEMORY_LIMIT = "2GB"
 _JITTER_NS = NS_PER_S // 200
 # What moves in the world is drawn so often, but for the body, which is moved with every frame.
 _DRAWING_NS = NS_PER_S // 10
-# Plots are sent so often, in columns: a message a row would take several times as long. A file keeps an index of its
-# messages until it is closed, 100 MB an hour: it gets plots more seldom, and all else in batches of so many seconds.
-_PLOT_NS, _SAVED_PLOT_NS, _SAVED_S = NS_PER_S, 5 * NS_PER_S, 1.0
+# Plots are sent so often, in columns: a message a row would take several times as long.
+_PLOT_NS = NS_PER_S
+# An index of what is in a file is in memory until it is closed: the file gets everything in batches of so many seconds.
+_SAVED_S = 10
 # The path, and the landmarks that went out of sight, grow by a piece so often.
 _PIECE_NS = NS_PER_S
 # So many frames may wait to be shown, and so many of them with pictures.
@@ -115,13 +116,13 @@ class LiveView:
     def __init__(self, name: str, calibration: Calibration, save: Path | None = None) -> None:
         with needs("rerun", "view", user="--view"):
             import rerun as rr
-        batches = None if save is None else rr.ChunkBatcherConfig(flush_tick=_SAVED_S)
+        batches = None if save is None else rr.ChunkBatcherConfig(flush_tick=float(_SAVED_S))
         # Not the name that finished runs are shown by: an open window would show this in their layout.
         stream = rr.RecordingStream("vioframe live", send_properties=False, batcher_config=batches)
         open_sink(stream, save, _blueprint(name, calibration.cameras), "--save-view", _MEMORY_LIMIT)
         self._waiting = _Waiting()
         self._pictures = [_Every(_PICTURE_NS) for _ in calibration.cameras]
-        plots = _Plots(stream, name, _PLOT_NS if save is None else _SAVED_PLOT_NS)
+        plots = _Plots(stream, name, _PLOT_NS if save is None else _SAVED_S * NS_PER_S)
         self._thread = Thread(target=self._show, args=(stream, name, calibration, plots), name="view", daemon=True)
 
     def __enter__(self) -> Self:
