@@ -28,6 +28,13 @@ def pytest_sessionstart(session: pytest.Session) -> None:
             warm_up(registry.load().create_backend(name), packaged_calibration("euroc", cameras=["cam0"]))
 
 
+@pytest.fixture
+def no_display(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As on a computer without a screen."""
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+
+
 @pytest.fixture(scope="session")
 def shared_data() -> Path:
     """The folder of real recordings that lies beside the checkout; tests that need it skip where it is absent."""

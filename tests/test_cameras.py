@@ -53,6 +53,14 @@ def test_projection_agrees_with_opencv(camera):
 
 
 @CASES
+def test_in_a_smaller_image_points_are_in_the_pixels_that_theirs_went_into(camera):
+    p_C = np.random.default_rng(1).uniform([-2.0, -1.5, 2.0], [2.0, 1.5, 6.0], (100, 3))
+    small = camera.shrunk(4)
+    np.testing.assert_allclose(small.project(p_C) + 0.5, (camera.project(p_C) + 0.5) / 4, atol=1e-9)
+    assert small.resolution == (camera.resolution[0] // 4, camera.resolution[1] // 4)
+
+
+@CASES
 def test_compiled_twins_agree(camera):
     (model, k), eps = intrinsics_of(camera), 1e-6
     n = camera.undistort(_pixels(camera))

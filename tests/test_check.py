@@ -188,6 +188,16 @@ def test_check_gives_all_of_it_as_json(in_g):
     assert tree["findings"][0]["figures"]["usual_length"] == pytest.approx(1.0, abs=0.05)
 
 
+def test_a_live_source_is_listened_to_for_a_while(in_g):
+    recorded = json.loads(vioframe_("check", in_g, "--json", "--duration", 3).stdout)
+    done = vioframe_("check", f"replay:{in_g}", "--json", "--duration", 3)
+    assert done.exit_code == 1
+    assert json.loads(done.stdout)["data"] == f"replay:{in_g}"
+    heard = {(each["camera"], each["kind"]) for each in json.loads(done.stdout)["findings"]}
+    assert heard == {(each["camera"], each["kind"]) for each in recorded["findings"]}
+    assert "nothing:" not in vioframe_("check", "nothing:here").stdout
+
+
 def test_images_that_do_not_fit_the_calibration_are_a_finding_too(tmp_path):
     flight = rendered_flight().write(tmp_path / "flight")
     calibration = tmp_path / "flight" / "mav0" / "cam0" / "sensor.yaml"

@@ -34,16 +34,10 @@ from vioframe.types import (
 
 pytest.importorskip("rerun")
 # rerun warns, and goes on, where it is given what it cannot take.
-pytestmark = pytest.mark.filterwarnings("error")
+pytestmark = [pytest.mark.filterwarnings("error"), pytest.mark.usefixtures("no_display")]
 
 AT = "/world/flight"
 IMAGE = np.zeros(CALIBRATION.cameras[0].model.resolution[::-1], np.uint8)
-
-
-@pytest.fixture(autouse=True)
-def _no_display(monkeypatch):
-    monkeypatch.delenv("DISPLAY", raising=False)
-    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
 
 
 @pytest.fixture(scope="module")

@@ -15,7 +15,9 @@ import vioframe
 from vioframe.errors import ConfigError, DatasetError, PluginError
 from vioframe.parts import hooks as hookspecs
 from vioframe.parts import registry
+from vioframe.parts.config import parse
 from vioframe.parts.options import REQUIRED, options_of, plugin_factory, validate_options
+from vioframe.pipeline import prepare
 
 if TYPE_CHECKING:
     from vioframe.types import Calibration
@@ -203,13 +205,13 @@ def test_what_is_wrong_with_a_path_is_said(tmp_path):
     (tmp_path / "empty").mkdir()
     (tmp_path / "photos" / "holiday").mkdir(parents=True)
     (tmp_path / "empty.xyz").touch()
-    (tmp_path / "talk.mp4").write_text("not a bag")
+    (tmp_path / "talk.mp3").write_text("not a bag")
     for name, why in [
         ("missing.bag", "does not exist"),
         ("empty", "is an empty folder"),
         ("photos", "is a folder without mav0/"),
         ("empty.xyz", "is an empty file"),
-        ("talk.mp4", "its extension is '.mp4'"),
+        ("talk.mp3", "its extension is '.mp3'"),
     ]:
         with pytest.raises(DatasetError, match=why):
             loaded.open_dataset(tmp_path / name)
@@ -226,8 +228,11 @@ def test_two_readers_for_one_path_ask_for_a_choice(add, tmp_path):
     add("rival_reader", code)
     (tmp_path / "flight" / "mav0").mkdir(parents=True)
     with pytest.raises(DatasetError, match=r"several readers accept .*: euroc, rival; choose one with --reader"):
-        registry.load().find_reader(tmp_path / "flight")
-    assert registry.load().find_reader(tmp_path / "flight", "rival").name == "rival"
+        registry.load().resolve(tmp_path / "flight")
+    assert registry.load().resolve(tmp_path / "flight", "rival")[0].name == "rival"
+    config = parse({"dataset": {"path": str(tmp_path / "flight"), "reader": "rival"}}, "test")
+    with pytest.raises(PluginError, match="'rival'"):  # which was asked for, and is no data set
+        prepare(config, registry.load())
 
 
 def test_a_reader_that_fails_to_look_is_passed_over(add, tmp_path, caplog):
@@ -240,7 +245,7 @@ def test_a_reader_that_fails_to_look_is_passed_over(add, tmp_path, caplog):
     """
     add("clumsy_reader", code)
     (tmp_path / "flight" / "mav0").mkdir(parents=True)
-    assert registry.load().find_reader(tmp_path / "flight").name == "euroc"
+    assert registry.load().resolve(tmp_path / "flight")[0].name == "euroc"
     assert "'clumsy'" in caplog.text
     assert "ZeroDivisionError" in caplog.text
 

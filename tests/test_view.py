@@ -23,16 +23,10 @@ from vioframe.types import FrameSet
 
 pytest.importorskip("rerun")
 # rerun warns, and goes on, where it is given what it cannot take.
-pytestmark = pytest.mark.filterwarnings("error")
+pytestmark = [pytest.mark.filterwarnings("error"), pytest.mark.usefixtures("no_display")]
 
 YAW_M = so3.exp(np.array([0.0, 0.0, 0.7])), np.array([4.0, -3.0, 1.0])
 SIGMA_M = 0.1
-
-
-@pytest.fixture(autouse=True)
-def _no_display(monkeypatch):
-    monkeypatch.delenv("DISPLAY", raising=False)
-    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
 
 
 @pytest.fixture(scope="module")

@@ -130,7 +130,7 @@ def prepare(config: Config, registry: Registry, *, warm: bool = False, tape: Pat
     config = configuration.complete(config, registry)
     if config.dataset.path is None:
         raise DatasetError("no data set given; name a bag or folder, or set dataset.path in the configuration")
-    live = registry.find_reader(config.dataset.path, config.dataset.reader).kind is SOURCE
+    live = registry.resolve(config.dataset.path, config.dataset.reader)[0].kind is SOURCE
     dataset, options, left_aside = _of_usable_cameras(registry, config)
     config = config.model_copy(update={"dataset": config.dataset.model_copy(update={"options": options})})
     loop_closure = config.loop_closure

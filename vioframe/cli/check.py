@@ -6,7 +6,8 @@ import json
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any
+from tempfile import TemporaryDirectory
+from typing import Any, cast
 
 import click
 from rich.console import Console
@@ -18,8 +19,9 @@ from vioframe.cli.common import FILE, Bar, PartName, calibration_option, cameras
 from vioframe.diagnosis import Certainty, Diagnosis, Finding, Severity, diagnose, gather
 from vioframe.diagnosis.images import wrong_size
 from vioframe.errors import ConfigError, DatasetError, ImageSizeError
-from vioframe.interfaces import Dataset
+from vioframe.interfaces import Dataset, Source
 from vioframe.io.synchronise import played
+from vioframe.live.tape import Tape
 from vioframe.odometry import limited_threads
 from vioframe.parts import registry
 from vioframe.parts.options import did_you_mean
@@ -38,6 +40,8 @@ from vioframe.parts.registry import (
 )
 from vioframe.types import FrameSet, Measurement
 
+# A live source is listened to for so long, s.
+_LISTENED_S = 20.0
 _COLOURS = {Severity.WRONG: "bold red", Severity.WORTH_KNOWING: "yellow"}
 
 
@@ -52,27 +56,61 @@ _COLOURS = {Severity.WRONG: "bold red", Severity.WORTH_KNOWING: "yellow"}
 @click.option("--json", "as_json", is_flag=True, help="Print all that was found as JSON.")
 @click.option("--quiet", is_flag=True, help="No progress bar.")
 def check(target: str, as_json: bool, quiet: bool, data: Path | None, **choices: Any) -> None:
-    """Say what is wrong with DATA, a bag or an ASL folder, or whether the plug-in NAME keeps its promises.
+    """Say what is wrong with DATA, a recording or a live source, or whether the plug-in NAME keeps its promises.
 
     Of a recording stamps, readings and images are looked at, and points are followed where it moves most, to compare
     camera and IMU with each other and with the calibration. What is found is listed with the likeliest cause first,
-    each with what to do about it. A plug-in is put through the conformance kit, `vioframe.testing`.
+    each with what to do about it. Of a live source, NAME:ADDRESS, the next 20 seconds are recorded and looked at
+    (--duration for others): turn and move it about all axes. A plug-in is put through the conformance kit,
+    `vioframe.testing`.
 
     The exit code is 1 where something is wrong.
     """
     installed = registry.load()
-    if Path(target).exists():
-        wrong = _check_recording(installed, Path(target), as_json=as_json, quiet=quiet or as_json, **choices)
-    else:
+    quiet = quiet or as_json
+    if not (Path(target).exists() or ":" in target):
         wrong = _check_parts(installed, target, data, as_json=as_json)
+    elif installed.resolve(target, choices["reader"])[0].kind is SOURCE:
+        wrong = _check_source(installed, target, as_json=as_json, quiet=quiet, **choices)
+    else:
+        wrong = _check_recording(installed, target, as_json=as_json, quiet=quiet, **choices)
     if wrong:
         click.get_current_context().exit(EXIT_FAILED)
 
 
+def _check_source(
+    installed: Registry,
+    address: str,
+    *,
+    calibration: tuple[Path, ...],
+    cameras: list[str] | None,
+    start_s: float,
+    duration_s: float | None,
+    quiet: bool,
+    **choices: Any,
+) -> bool:
+    """A recording of what comes in a while from now on is checked."""
+    given = {"calibration": list(calibration) or None, "cameras": cameras}
+    options = {name: value for name, value in given.items() if value}
+    source = cast(Source, installed.open_dataset(address, options=options))
+    duration_s = _LISTENED_S if duration_s is None else duration_s
+    with TemporaryDirectory() as folder, installed.blaming():
+        recording = Path(folder) / f"{source.name}.mcap"
+        with Tape(recording, source.calibration) as tape, Bar(None, source.name, quiet=quiet) as bar:
+            try:
+                for measurement in _watched(source, 0.0, start_s + duration_s, bar):
+                    tape.add(measurement)
+            finally:
+                source.close()
+        choices |= {"calibration": (), "cameras": cameras, "start_s": start_s, "duration_s": duration_s}
+        return _check_recording(installed, str(recording), called=address, quiet=quiet, **choices)
+
+
 def _check_recording(
     installed: Registry,
-    path: Path,
+    target: str,
     *,
+    called: str | None = None,
     as_json: bool,
     quiet: bool,
     calibration: tuple[Path, ...],
@@ -81,16 +119,16 @@ def _check_recording(
     start_s: float,
     duration_s: float | None,
 ) -> bool:
-    part = installed.find_reader(path, reader)
+    part, _ = installed.resolve(target, reader)
     options: dict[str, Any] = {"calibration": list(calibration)} if calibration else {}
     looked: dict[str, Diagnosis] = {}
     aside: list[str] = []
     try:
-        dataset = installed.open_dataset(path, part.name, options)
+        dataset = installed.open_dataset(target, part.name, options)
         rig = [camera.name for camera in dataset.calibration.cameras]
         for chosen in cameras or rig:
             if cameras or (len(rig) > 1 and any(option.name == "cameras" for option in part.options)):
-                dataset = installed.open_dataset(path, part.name, {**options, "cameras": [chosen]})
+                dataset = installed.open_dataset(target, part.name, {**options, "cameras": [chosen]})
             with Bar(dataset.frame_count, quiet=quiet, late=True) as bar, limited_threads(), installed.blaming():
                 found = diagnose(gather(_watched(dataset, start_s, duration_s, bar), dataset.calibration))
             looked[dataset.calibration.cameras[0].name] = _without_what_was_said(found, looked.values())
@@ -102,11 +140,11 @@ def _check_recording(
     if as_json:
         findings = [{"camera": name, **asdict(each)} for name, found in looked.items() for each in found.findings]
         facts = {name: found.facts for name, found in looked.items()}
-        tree = {"data": str(path), "reader": part.name, "wrong": wrong, "facts": facts}
+        tree = {"data": called or target, "reader": part.name, "wrong": wrong, "facts": facts}
         click.echo(json.dumps({**tree, "cameras_left_aside": aside, "findings": findings}, indent=2))
     else:
         for found in looked.values():
-            _show(path, part, found, aside)
+            _show(called or f"{target} (reader {part.name})", found, aside)
     return wrong
 
 
@@ -123,7 +161,7 @@ def _watched(dataset: Dataset, start_s: float, duration_s: float | None, bar: Ba
         yield measurement
 
 
-def _show(path: Path, part: Part, found: Diagnosis, aside: list[str]) -> None:
+def _show(called: str, found: Diagnosis, aside: list[str]) -> None:
     """What was looked at in a line each, then the findings, the cause first."""
     console = Console()
     facts = Table.grid(padding=(0, 2))
@@ -133,7 +171,7 @@ def _show(path: Path, part: Part, found: Diagnosis, aside: list[str]) -> None:
         facts.add_row(name, Text(fact))
     if aside:
         facts.add_row("left aside", Text(f"{', '.join(aside)}; look at them with --cameras {','.join(aside)}"))
-    console.print(Text(f"{path} (reader {part.name})", style="bold"))
+    console.print(Text(called, style="bold"))
     console.print(facts) if console.is_terminal else print_table(facts)
     if not found.findings:
         console.print(Text("Nothing wrong was found.", style="green"))

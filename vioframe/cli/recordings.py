@@ -209,7 +209,7 @@ def convert(
     """
     format = format or format_of(destination)
     installed = registry.load()
-    part = installed.find_reader(source, reader)
+    part, _ = installed.resolve(source, reader)
     chosen = {name: value for _, name, value in parse_assignments(options, {part.name: part.options})}
     if calibration:
         chosen["calibration"] = list(calibration)

@@ -238,14 +238,13 @@ def _report(folder: Path, summary: dict[str, Any]) -> None:
     else:
         went = f"initialised after {summary['initialised_after_s']:.2f} s, then {summary['completion']:.1%} tracked"
     click.echo(f"{summary['name']}: {summary['frames']} frames, {went}, {summary['resets']} resets")
+    speed = f"{summary['mean_frame_ms']:.1f} ms a frame"
     if (live := summary.get("live")) is None:
-        click.echo(f"{summary['mean_frame_ms']:.1f} ms a frame, {summary['real_time_factor']:.2f} x real time")
+        click.echo(f"{speed}, {summary['real_time_factor']:.2f} x real time")
     else:
-        late = live["latency_ms"]
-        click.echo(
-            f"{summary['mean_frame_ms']:.1f} ms a frame; from exposure to estimate {late['median']:.0f} ms (median), "
-            f"{late['p99']:.0f} ms (99 %); {live['frames_dropped']} of {live['frames']} frames dropped"
-        )
+        if late := live["latency_ms"]:
+            speed += f"; from exposure to estimate {late['median']:.0f} ms (median), {late['p99']:.0f} ms (99 %)"
+        click.echo(f"{speed}; {live['frames_dropped']} of {live['frames']} frames dropped")
     if summary["incidents"]:
         counts = ", ".join(f"{kind} {count}" for kind, count in summary["incidents"].items())
         click.echo(f"handled on the way: {counts}")

@@ -23,7 +23,7 @@ from vioframe.estimation.options import EstimationOptions
 from vioframe.frontend import FrontendOptions
 from vioframe.io.yaml import parse_yaml, read_yaml_text
 from vioframe.parts.options import Option, did_you_mean, options_of, validate_options
-from vioframe.parts.registry import BACKEND, DETECTOR, LOOP_CLOSER, SOURCE, Kind, Part, Registry
+from vioframe.parts.registry import BACKEND, DETECTOR, LOOP_CLOSER, Kind, Part, Registry
 
 SectionT = TypeVar("SectionT", bound="Section")
 
@@ -211,7 +211,8 @@ def complete(config: Config, registry: Registry) -> Config:
         named = getattr(config, section)
         found = {}
         if section == "dataset":
-            found = {"path": named.path if part.kind is SOURCE else named.path.absolute(), "reader": part.name}
+            _, given = registry.resolve(named.path, named.reader)
+            found = {"path": given.absolute() if isinstance(given, Path) else named.path, "reader": part.name}
         changes[section] = named.model_copy(update={"options": part.validate(named.options), **found})
     return config.model_copy(update=changes)
 
@@ -246,7 +247,7 @@ def _parts_by_section(config: Config, registry: Registry) -> dict[str, Part]:
     named = {section: (kind, getattr(config, section)) for section, kind in PART_SECTIONS.items()}
     parts = {section: registry.find(kind, part.name) for section, (kind, part) in named.items() if part is not None}
     if config.dataset.path is not None:
-        parts["dataset"] = registry.find_reader(config.dataset.path, config.dataset.reader)
+        parts["dataset"], _ = registry.resolve(config.dataset.path, config.dataset.reader)
     return parts
 
 

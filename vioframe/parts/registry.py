@@ -191,25 +191,32 @@ class Registry:
     ) -> Dataset:
         """Open the recording at ``path`` with the reader of that name, or with the one that accepts it.
 
-        Of a ``path`` that is ``NAME:ADDRESS`` it is a live :class:`~vioframe.interfaces.Source`, not started yet.
+        Of a ``path`` that is ``NAME:ADDRESS`` it is a live :class:`~vioframe.interfaces.Source`, not started yet, or
+        where a reader is called so the recording ``ADDRESS``.
         """
-        part = self.find_reader(path, reader)
-        given = str(path).partition(":")[2] if part.kind is SOURCE else Path(path)
+        part, given = self.resolve(path, reader)
         return cast(Dataset, part.create(given, options=options or {}))
 
-    def find_reader(self, path: str | Path, reader: str | None = None) -> Part:
-        """The reader or live source to open ``path`` with; raises :class:`DatasetError` saying what is wrong."""
+    def resolve(self, path: str | Path, reader: str | None = None) -> tuple[Part, str | Path]:
+        """The reader or live source to open ``path`` with, and what to give it: a recording, or an address.
+
+        Raises :class:`DatasetError` saying what is wrong.
+        """
+        name, colon, address = str(path).partition(":")
         path = Path(path)
         if not path.exists():
-            name, colon, _ = str(path).partition(":")
-            if colon and "/" not in name:
-                return self.find(SOURCE, name)
-            raise DatasetError(f"{path} does not exist")
+            if not colon or "/" in name:
+                raise DatasetError(f"{path} does not exist")
+            if name not in self.names(DATASET):
+                return self.find(SOURCE, name), address
+            if not address:
+                raise DatasetError(f"no recording named: {name}:FILE")
+            return self.resolve(address, name)
         if reader is not None:
-            return self.find(DATASET, reader)
+            return self.find(DATASET, reader), path
         accepting = [part for part in self.parts.get(DATASET.name, {}).values() if _accepts(part, path)]
         if len(accepting) == 1:
-            return accepting[0]
+            return accepting[0], path
         if accepting:
             names = ", ".join(sorted(part.name for part in accepting))
             raise DatasetError(f"several readers accept {path}: {names}; choose one with --reader")
