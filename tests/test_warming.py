@@ -1,7 +1,9 @@
 """Compiled code that is there in time, and clocks that leave out the waiting for it."""
 
+import os
 import subprocess
 import sys
+from pathlib import Path
 from time import perf_counter, thread_time
 
 import numpy as np
@@ -94,11 +96,45 @@ def test_what_helps_comes_to_its_end():
 
 def test_a_recording_waits_for_no_warming_up(monkeypatch):
     warmed = []
-    monkeypatch.setattr(odometry, "warm_up", lambda backend, calibration: warmed.append(backend))
+    monkeypatch.setattr(odometry, "warm_up", lambda backend, calibration, frontend: warmed.append(backend))
     Odometry(CALIBRATION, warm=False)
     assert warmed == []
     Odometry(CALIBRATION)
     assert len(warmed) == 1
+
+
+IN_FLIGHT = """
+import gc
+import sys
+from numba.core.dispatcher import Dispatcher
+from rendered_flight import CALIBRATION, rendered_flight
+from vioframe.odometry import Odometry
+
+def compiled():
+    kernels = [each for each in gc.get_objects() if isinstance(each, Dispatcher)]
+    ours = [k for k in kernels if k.__module__.startswith("vioframe")]
+    return {f"{k.__module__}.{k.__name__}{s}" for k in ours for s in k.signatures}
+
+measurements = rendered_flight().measurements
+first_ns = measurements[0].t_ns + int(sys.argv[2]) * 10**9
+odometry = Odometry(CALIBRATION, backend=sys.argv[1])
+before = compiled()
+steps = [step for m in measurements if first_ns <= m.t_ns < first_ns + 6 * 10**9 for step in odometry.add(m)]
+assert steps[-1].estimate.state is not None, steps[-1].estimate.events
+print(*sorted(compiled() - before), sep="\\n")
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("backend", ["msckf", "sliding_window", "loose_ekf"])
+@pytest.mark.parametrize("begin_s", [0, 2])
+def test_nothing_is_compiled_or_loaded_in_flight(backend: str, begin_s: int):
+    """In a process of its own, where nobody else has compiled anything; begun at rest and in motion."""
+    command = [sys.executable, "-c", IN_FLIGHT, backend, str(begin_s)]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(Path(__file__).parent), *sys.path])}
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.strip() == ""
 
 
 @pytest.mark.parametrize("p", [0.05, 0.5, 0.95, 0.999])

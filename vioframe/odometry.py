@@ -73,8 +73,8 @@ class Odometry:
     ``loop_closer``, named or a part likewise, recognises places beside the loop. The estimate is the same with it and
     without: ``Step.correction`` says where in the map it is, and :meth:`close_loops` corrects the whole flight.
 
-    A back-end named is ``warm`` before the first frame: its code is compiled, half a minute once after installation, or
-    loaded. A recording, whose frames wait for it, begins sooner without.
+    A back-end named is ``warm`` before the first frame, and a detector named with it: their code is compiled, half a
+    minute once after installation, or loaded. A recording, whose frames wait for it, begins sooner without.
 
     ``incidents`` counts what was handled on the way: dropped samples, unusable images, failing detectors.
     """
@@ -99,24 +99,25 @@ class Odometry:
     ) -> None:
         self._registry = registry.load() if installed is None else installed
         self.incidents = Incidents() if incidents is None else incidents
+        options, warm_frontend = frontend or FrontendOptions(), None
         if isinstance(detector, str):
             detector = self._registry.create_detector(detector, detector_options)
-        name = None
-        to_warm: Backend | None = None
+            warm_frontend = Frontend(detector, calibration, options, Incidents())
+        name, warm_backend = None, None
         if isinstance(backend, str):
             name = str(self._registry.find(registry.BACKEND, backend))
-            to_warm = self._registry.create_backend(backend, backend_options) if warm else None
+            warm_backend = self._registry.create_backend(backend, backend_options) if warm else None
             backend = self._registry.create_backend(backend, backend_options)
         self._loop_closer_name = f"the loop closer {type(loop_closer).__name__}"
         if isinstance(loop_closer, str):
             self._loop_closer_name = str(self._registry.find(registry.LOOP_CLOSER, loop_closer))
             loop_closer = self._registry.create_loop_closer(loop_closer, calibration, loop_closer_options)
         self._loop_closer = loop_closer
-        self._frontend = Frontend(detector, calibration, frontend or FrontendOptions(), self.incidents)
+        self._frontend = Frontend(detector, calibration, options, self.incidents)
         self._life = LifeCycle(backend, calibration, estimation, initial_state, name)
-        if to_warm is not None:
+        if warm_backend is not None:
             with self._registry.blaming(), limited_threads():
-                warm_up(to_warm, calibration)
+                warm_up(warm_backend, calibration, warm_frontend)
         self._synchroniser = Synchroniser(
             self.incidents, time_offset_ns=calibration.cameras[0].time_offset_ns, wait_ms=wait_ms
         )

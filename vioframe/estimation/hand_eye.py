@@ -194,7 +194,7 @@ class Turns:
             *path.at(self._first + x.offset_s),
             *path.at(self._second + x.offset_s),
             *seen,
-            x.R_BC,
+            np.ascontiguousarray(x.R_BC),
             x.log_focal,
             self._dt,
         )

@@ -384,3 +384,4 @@ def warm_up(calibration: Calibration) -> None:
     x = Variables(StateArrays.stack([state] * 4), Calibrated.of(*calibration.cameras), landmarks)
     problem, solution = adjusted_window(window, x, calibration, 1e-4 * np.eye(CALIBRATION_SIZE))
     explained(problem, solution.variables)
+    problem.reading_residuals(solution.variables.states)
