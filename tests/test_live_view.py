@@ -34,7 +34,10 @@ from vioframe.types import (
 
 pytest.importorskip("rerun")
 # rerun warns, and goes on, where it is given what it cannot take.
-pytestmark = [pytest.mark.filterwarnings("error"), pytest.mark.usefixtures("no_display")]
+pytestmark = [
+    pytest.mark.filterwarnings("error", "ignore:RRD file has no footer"),
+    pytest.mark.usefixtures("no_display"),
+]
 
 AT = "/world/flight"
 IMAGE = np.zeros(CALIBRATION.cameras[0].model.resolution[::-1], np.uint8)

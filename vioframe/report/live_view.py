@@ -8,6 +8,7 @@ estimator -> _Waiting -> _Scene (a thread) -> rerun, which has threads of its ow
 from __future__ import annotations
 
 import logging
+import os
 import re
 from collections import deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -83,8 +84,6 @@ _JITTER_NS = NS_PER_S // 200
 _DRAWING_NS = NS_PER_S // 10
 # Plots are sent so often, in columns: a message a row would take several times as long.
 _PLOT_NS = NS_PER_S
-# An index of what is in a file is in memory until it is closed: the file gets everything in batches of so many seconds.
-_SAVED_S = 10
 # The path, and the landmarks that went out of sight, grow by a piece so often.
 _PIECE_NS = NS_PER_S
 # So many frames may wait to be shown, and so many of them with pictures.
@@ -109,20 +108,21 @@ class LiveView:
 
     A context manager. :meth:`add` takes microseconds: what is to be shown waits for a thread, and where that does not
     keep up the oldest picture that waits is left out, so that no flight waits for a viewer. Nothing that is held grows
-    with the flight but the index of a file, and a window may be closed while flying. Raises :class:`VioframeError`
+    with the flight, and a window may be closed while flying. Raises :class:`VioframeError`
     where rerun, its viewer or a display is missing, or ``save`` cannot be written.
     """
 
     def __init__(self, name: str, calibration: Calibration, save: Path | None = None) -> None:
+        # As the index of a file is left out, which rerun warns of.
+        os.environ.setdefault("RUST_LOG", "warn,re_log_encoding::rrd::file_sink=error")
         with needs("rerun", "view", user="--view"):
             import rerun as rr
-        batches = None if save is None else rr.ChunkBatcherConfig(flush_tick=float(_SAVED_S))
         # Not the name that finished runs are shown by: an open window would show this in their layout.
-        stream = rr.RecordingStream("vioframe live", send_properties=False, batcher_config=batches)
-        open_sink(stream, save, _blueprint(name, calibration.cameras), "--save-view", _MEMORY_LIMIT)
+        stream = rr.RecordingStream("vioframe live", send_properties=False)
+        open_sink(stream, save, _blueprint(name, calibration.cameras), "--save-view", _MEMORY_LIMIT, index=False)
         self._waiting = _Waiting()
         self._pictures = [_Every(_PICTURE_NS) for _ in calibration.cameras]
-        plots = _Plots(stream, name, _PLOT_NS if save is None else _SAVED_S * NS_PER_S)
+        plots = _Plots(stream, name)
         self._thread = Thread(target=self._show, args=(stream, name, calibration, plots), name="view", daemon=True)
 
     def __enter__(self) -> Self:
@@ -414,12 +414,12 @@ class _Scene:
 
 
 class _Plots:
-    """Rows of plots, which are sent in columns, so many ns of each at once."""
+    """Rows of plots, which are sent in columns, a second of each at once."""
 
-    def __init__(self, stream: rr.RecordingStream, name: str, period_ns: int) -> None:
+    def __init__(self, stream: rr.RecordingStream, name: str) -> None:
         self._stream, self._name = stream, name
         self.begin_ns = 0
-        self._sendings = _Every(period_ns)
+        self._sendings = _Every(_PLOT_NS)
         self._rows: dict[str, list[tuple[int, list[float]]]] = {}
         self._stages: dict[str, int] = {}
 

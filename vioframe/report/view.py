@@ -372,8 +372,12 @@ def open_sink(
     blueprint: rrb.Blueprint,
     option: str = "--save",
     memory_limit: str = "75%",
+    *,
+    index: bool = True,
 ) -> None:
     """Have ``stream`` shown in a window, which keeps as much as ``memory_limit``, or written to ``save``.
+
+    The file ends in an ``index``, which grows in memory until then; a viewer opens one without, too.
 
     Raises :class:`RunError` where there is no display, which ``option`` does without, no viewer, or the file cannot be
     written.
@@ -395,7 +399,7 @@ def open_sink(
         save.touch()
     except OSError as error:
         raise RunError(f"cannot write {save}: {error.strerror}; choose another name") from error
-    stream.save(save, default_blueprint=blueprint)
+    stream.save(save, default_blueprint=blueprint, write_footer=index)
 
 
 def times(t_ns: Int, begin_ns: int) -> rr.TimeColumn:
