@@ -418,7 +418,7 @@ def memory() -> str:
 
 
 def live() -> str:
-    """Minutes of a live flight, as it is, with a slow back-end, and watched."""
+    """Minutes of a live flight, as it is, with a slow back-end, watched, and by an emulated camera."""
     rows = recorded("live*.json")
     shown = [
         {

@@ -131,7 +131,9 @@ def _readings(path: Path) -> Sequence[ImuSample]:
     try:
         parser = telemetry.Parser(str(path))
         rows = [row for row in parser.normalized_imu() if row["gyro"] is not None and row["accl"] is not None]
-    except Exception as error:  # a damaged file has it raise anything
+    except BaseException as error:  # a damaged file has it raise anything, and panic, which is no Exception
+        if isinstance(error, KeyboardInterrupt | SystemExit):
+            raise
         raise _none(path, shortened(error)) from error
     if not rows:
         raise _none(path, f"the telemetry of this {parser.camera} is of other kinds")

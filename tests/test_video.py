@@ -107,6 +107,18 @@ def test_what_is_no_video_is_refused(tmp_path: Path):
         registry.load().open_dataset("video:")
 
 
+def test_whatever_the_parser_raises_is_told(video: Path, monkeypatch: pytest.MonkeyPatch):
+    class Panic(BaseException):
+        """As those of Rust are."""
+
+    def panics(path: str) -> None:
+        raise Panic("index out of bounds")
+
+    monkeypatch.setattr("telemetry_parser.Parser", panics)
+    with pytest.raises(DatasetError, match=r"no readings of an IMU in it \(index out of bounds\)"):
+        VideoDataset(video)
+
+
 def test_a_video_that_ends_early_is_told(video: Path, monkeypatch: pytest.MonkeyPatch):
     class Cut:  # not a subclass, with which OpenCV crashes when it is collected
         def __init__(self, *arguments: Any) -> None:
