@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from threading import Event
-from time import monotonic
 from typing import TYPE_CHECKING, Annotated
 
 from pydantic import Field
@@ -13,9 +12,10 @@ from pydantic import Field
 from vioframe.errors import DatasetError
 from vioframe.geometry.trajectory import Trajectory
 from vioframe.io.ahead import read_ahead
+from vioframe.live.pace import paced
 from vioframe.parts import registry
 from vioframe.parts.hooks import hookimpl
-from vioframe.types import NS_PER_S, Calibration, Measurement, NavState, Unreadable
+from vioframe.types import Calibration, Measurement, NavState
 
 if TYPE_CHECKING:
     from vioframe.interfaces import SourceFactory
@@ -59,17 +59,7 @@ class Replay:
 
     def measurements(self) -> Iterator[Measurement]:
         """In the order of the recording, decoded ahead of time."""
-        first_ns: int | None = None
-        begin_s = monotonic()
-        for measurement in read_ahead(self._recording.measurements()):
-            if not isinstance(measurement, Unreadable):
-                if first_ns is None:
-                    first_ns, begin_s = measurement.t_ns, monotonic()
-                due_s = begin_s + (measurement.t_ns - first_ns) / NS_PER_S / self._speed
-                self._closed.wait(max(due_s - monotonic(), 0.0))
-            if self._closed.is_set():
-                return
-            yield measurement
+        return paced(read_ahead(self._recording.measurements()), self._closed, speed=self._speed)
 
     def tell(self, state: NavState) -> None:
         """Nobody listens."""

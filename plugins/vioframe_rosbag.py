@@ -21,7 +21,7 @@ import numpy as np
 
 from vioframe.errors import DatasetError
 from vioframe.interfaces import DatasetFactory
-from vioframe.io.calibration import PACKAGED, match_cameras, sidecar_folder
+from vioframe.io.calibration import PACKAGED, match_cameras, no_calibration, sidecar_folder
 from vioframe.io.images import check_bit_depth, frame_set, gathered
 from vioframe.io.ros import imu_sample, pixels, stamp_ns
 from vioframe.io.writers import GROUND_TRUTH_TOPIC, TRUE_VECTOR_TOPICS
@@ -170,10 +170,7 @@ class RosbagDataset:
                 "%s brings no calibration and looks like EuRoC: using EuRoC's published calibration", self._path.name
             )
             return [PACKAGED / "euroc"]
-        raise DatasetError(
-            f"{self._path} brings no calibration: --calibration FILE names one, and {sidecars[-1]} is where it is "
-            "looked for"
-        )
+        raise no_calibration(self._path, sidecars[-1])
 
 
 @contextmanager

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from heapq import merge
 from importlib import import_module
 from pathlib import Path
 from typing import Annotated, Any
@@ -12,7 +13,7 @@ from pydantic import Field
 
 from vioframe.errors import DatasetError, needs, shortened
 from vioframe.interfaces import DatasetFactory
-from vioframe.io.calibration import match_cameras, sidecar_folder
+from vioframe.io.calibration import match_cameras, no_calibration, sidecar_folder
 from vioframe.io.images import check_size, to_gray8
 from vioframe.parts.hooks import hookimpl
 from vioframe.types import FrameSet, Image, ImuSample, Measurement, Unreadable
@@ -44,10 +45,7 @@ class VideoDataset:
         if not files:
             files = [sidecar_folder(path)]
             if not files[0].is_dir():
-                raise DatasetError(
-                    f"{path} brings no calibration: --calibration FILE names one, and {files[0]} is where it is "
-                    "looked for"
-                )
+                raise no_calibration(path, files[0])
         rig, _ = match_cameras(files, [path.name], [cameras] if isinstance(cameras, str) else cameras)
         if len(rig.cameras) > 1:
             raise DatasetError(f"{path} is of one camera; choose which calibration is its own with --cameras")
@@ -71,19 +69,9 @@ class VideoDataset:
 
     def measurements(self) -> Iterator[Measurement]:
         """In the order of their stamps."""
-        readings = iter(self._readings)
-        reading = next(readings, None)
-        for t_ns, image in self._images():
-            while reading is not None and reading.t_ns <= t_ns:
-                yield reading
-                reading = next(readings, None)
-            yield Unreadable(t_ns, "frame_unreadable", image) if isinstance(image, str) else FrameSet(t_ns, (image,))
-        while reading is not None:
-            yield reading
-            reading = next(readings, None)
+        return merge(self._readings, self._images(), key=lambda measurement: measurement.t_ns)
 
-    def _images(self) -> Iterator[tuple[int, Image | str]]:
-        """Each image with its stamp, or why it cannot be had."""
+    def _images(self) -> Iterator[FrameSet | Unreadable]:
         import cv2
 
         video = _opened(self._path)
@@ -94,11 +82,14 @@ class VideoDataset:
             t_ns = round(video.get(cv2.CAP_PROP_POS_MSEC) * _NS_PER_MS)
             if number % self._every == 0:
                 there, image = video.retrieve()
-                yield t_ns, self._gray(image) if there else "the image is damaged"
+                if there:
+                    yield FrameSet(t_ns, (self._gray(image),))
+                else:
+                    yield Unreadable(t_ns, "frame_unreadable", "the image is damaged")
             number += 1
         promised = int(video.get(cv2.CAP_PROP_FRAME_COUNT))
         if number < promised:
-            yield t_ns, f"the video ends after {number} of {promised} images"
+            yield Unreadable(t_ns, "frame_unreadable", f"the video ends after {number} of {promised} images")
 
     def _gray(self, image: Any) -> Image:
         import cv2

@@ -102,7 +102,7 @@ class Odometry:
         options, warm_frontend = frontend or FrontendOptions(), None
         if isinstance(detector, str):
             detector = self._registry.create_detector(detector, detector_options)
-            warm_frontend = Frontend(detector, calibration, options, Incidents())
+            warm_frontend = Frontend(detector, calibration, options, Incidents()) if warm else None
         name, warm_backend = None, None
         if isinstance(backend, str):
             name = str(self._registry.find(registry.BACKEND, backend))

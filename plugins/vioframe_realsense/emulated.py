@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import time
+from collections import Counter
 from collections.abc import Iterable
+from itertools import count
 from typing import Any
 
 import numpy as np
 
 from vioframe.geometry.cameras import Camera
-from vioframe.types import NS_PER_S, Calibration, Float, FrameSet, Image, ImuSample, Measurement
+from vioframe.live.pace import paced
+from vioframe.types import Calibration, Float, FrameSet, Image, ImuSample, Measurement
 from vioframe_realsense.device import sdk
 from vioframe_realsense.timing import HARDWARE_CLOCK
 
@@ -33,7 +36,7 @@ class Emulated:
         domain: str = HARDWARE_CLOCK,
         domain_of_images: str | None = None,
     ) -> None:
-        rs = self._sdk = sdk()
+        rs = sdk()
         self.device = rs.software_device()
         self.device.register_info(rs.camera_info.serial_number, serial)
         self.device.register_info(rs.camera_info.name, "Intel RealSense D435I")
@@ -46,14 +49,13 @@ class Emulated:
         for sensor in (self.stereo, self.motion):
             sensor.add_option(rs.option.global_time_enabled, on, True)
         self._domain, self._domain_of_images = domain, domain_of_images or domain
-        self._uid = 0
-        self._numbers: dict[int, int] = {}
+        self._uids, self._numbers = count(1), Counter[int]()
         self.injected: list[int] = []
         """Stamps of the gyroscope's readings."""
         self._accel_ns: list[int] = []
-        count = len(rig.cameras) if cameras is None else cameras
-        self.cameras = [self._infrared(i, camera.model, rate_hz) for i, camera in enumerate(rig.cameras[:count])]
-        for i, camera in enumerate(rig.cameras[:count]):
+        there = rig.cameras[:cameras]
+        self.cameras = [self._infrared(i, camera.model, rate_hz) for i, camera in enumerate(there)]
+        for i, camera in enumerate(there):
             self._infrared(i, camera.model.zoomed(0.5), rate_hz // 2)  # another mode
         if not imu:
             return
@@ -70,30 +72,25 @@ class Emulated:
             self.gyro.register_extrinsics_to(stream, extrinsics)
 
     def _infrared(self, place: int, lens: Camera, rate_hz: int) -> Any:
-        rs = self._sdk
+        rs = sdk()
         stream = rs.video_stream()
-        stream.type, stream.index, stream.uid = rs.stream.infrared, place + 1, self._next_uid()
+        stream.type, stream.index, stream.uid = rs.stream.infrared, place + 1, next(self._uids)
         (stream.width, stream.height), stream.fps, stream.bpp, stream.fmt = lens.resolution, rate_hz, 1, rs.format.y8
         stream.intrinsics = librealsense_lens(lens)
         return self.stereo.add_video_stream(stream)
 
     def _motion_stream(self, kind: Any, rate_hz: int, variance: float) -> Any:
-        rs = self._sdk
+        rs = sdk()
         stream = rs.motion_stream()
-        stream.type, stream.index, stream.uid, stream.fps = kind, 0, self._next_uid(), rate_hz
-        stream.fmt, stream.intrinsics = rs.format.motion_xyz32f, rs.motion_device_intrinsic()
+        stream.type, stream.index, stream.uid, stream.fps = kind, 0, next(self._uids), rate_hz
         intrinsics = rs.motion_device_intrinsic()
         intrinsics.noise_variances = [variance] * 3
-        stream.intrinsics = intrinsics
+        stream.fmt, stream.intrinsics = rs.format.motion_xyz32f, intrinsics
         return self.motion.add_motion_stream(stream)
-
-    def _next_uid(self) -> int:
-        self._uid += 1
-        return self._uid
 
     def image(self, place: int, t_ns: int, image: Image) -> None:
         """The camera at ``place`` takes an image."""
-        rs = self._sdk
+        rs = sdk()
         frame = rs.software_video_frame()
         frame.pixels, frame.stride, frame.bpp = np.ascontiguousarray(image), image.shape[1], 1
         frame.timestamp, frame.domain = t_ns / _NS_PER_MS, getattr(rs.timestamp_domain, self._domain_of_images)
@@ -102,7 +99,7 @@ class Emulated:
 
     def reads(self, stream: Any, t_ns: int, values: Float) -> None:
         """``stream``, :attr:`gyro` or :attr:`accel`, reads ``values`` (3,)."""
-        rs = self._sdk
+        rs = sdk()
         vector, frame = rs.vector(), rs.software_motion_frame()
         vector.x, vector.y, vector.z = values.tolist()
         frame.data, frame.timestamp = vector, t_ns / _NS_PER_MS
@@ -125,17 +122,13 @@ class Emulated:
         return sum(self._accel_ns[0] <= t_ns <= self._accel_ns[-1] for t_ns in self.injected)
 
     def _number(self, key: int) -> int:
-        self._numbers[key] = self._numbers.get(key, 0) + 1
+        self._numbers[key] += 1
         return self._numbers[key]
 
     def play(self, measurements: Iterable[Measurement], *, at_once: bool = False) -> None:
         """At their own pace; readings at 200 Hz, where those of the accelerometer are means, in between."""
-        begin_s, first_ns = time.monotonic(), None
         before: list[ImuSample] = []
-        for m in measurements:
-            first_ns = m.t_ns if first_ns is None else first_ns
-            if not at_once:
-                time.sleep(max(0.0, begin_s + (m.t_ns - first_ns) / NS_PER_S - time.monotonic()))
+        for m in measurements if at_once else paced(measurements):
             if isinstance(m, FrameSet):
                 for place, image in enumerate(m.images):
                     if image is not None:

@@ -102,7 +102,8 @@ def _check_source(
                     tape.add(measurement)
             finally:
                 source.close()
-        choices |= {"calibration": (), "cameras": cameras, "start_s": start_s, "duration_s": duration_s}
+        # In the recording are the cameras that were chosen, by the names of their calibration.
+        choices |= {"calibration": (), "cameras": None, "start_s": start_s, "duration_s": duration_s}
         return _check_recording(installed, str(recording), called=address, quiet=quiet, **choices)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
-from vioframe.errors import CalibrationError, shown
+from vioframe.errors import CalibrationError, DatasetError, shown
 from vioframe.io.calibration.formats import (
     CameraPart,
     Document,
@@ -21,6 +21,7 @@ __all__ = [
     "PACKAGED",
     "load_calibration",
     "match_cameras",
+    "no_calibration",
     "packaged_calibration",
     "sidecar_folder",
     "write_calibration",
@@ -90,6 +91,13 @@ def sidecar_folder(recording: Path) -> Path:
     """Where the calibration of a recording that cannot hold one is kept: ``flight.bag.calib`` beside ``flight.bag``."""
     recording = recording.absolute()
     return recording.with_name(f"{recording.name}.calib")
+
+
+def no_calibration(recording: Path, sidecar: Path) -> DatasetError:
+    """What to say of a recording that was given no calibration, and has none in its ``sidecar`` folder."""
+    return DatasetError(
+        f"{recording} brings no calibration: --calibration FILE names one, and {sidecar} is where it is looked for"
+    )
 
 
 def _rig(cameras: Iterable[CameraPart], imu: ImuPart) -> Calibration:
