@@ -274,7 +274,7 @@ def test_what_the_reader_could_not_read_is_counted() -> None:
 
 
 def test_it_streams() -> None:
-    """A frame is released by the second reading from 50 ms behind it, not when the recording ends."""
+    """A frame is released by readings from 50 ms behind it, not when the recording ends."""
     measurements = recording()
     taken = 0
 
@@ -284,7 +284,7 @@ def test_it_streams() -> None:
             yield measurement
 
     next(synchronise(source(), incidents=Incidents()))
-    assert measurements[taken - 1].t_ns == 14 * IMU_PERIOD_NS  # the second from 62.3 ms on
+    assert measurements[taken - 1].t_ns == 14 * IMU_PERIOD_NS  # the second from 62.3 ms on: nobody knows their period yet
 
 
 def arriving_late(late_ns: int) -> list[Measurement]:
@@ -342,6 +342,22 @@ def test_one_wild_stamp_harms_nothing_however_long_frames_wait(wait_ms: float) -
     packets, counts = push(measurements, wait_ms)
     assert_same(packets, play(recording())[0])
     assert counts["imu_out_of_order"] == counts["frame_out_of_order"] == 1
+
+
+def test_a_frame_waits_for_one_reading_or_for_two_where_the_first_leaps_ahead() -> None:
+    synchroniser = Synchroniser(Incidents(), wait_ms=50.0)
+    by_then: dict[int, int] = {}
+    measurements = recording()
+    # One stamp leaps ahead by 0.3 s, while the frame before it waits.
+    leaping = next(i for i, m in enumerate(measurements) if m.t_ns == 100 * IMU_PERIOD_NS)
+    measurements[leaping] = reading(160 * IMU_PERIOD_NS)
+    for measurement in measurements:
+        by_then |= {frame.t_ns: measurement.t_ns for _, frame in synchroniser.add(measurement)}
+    late_ns = [come_ns - t_ns - 50_000_000 for t_ns, come_ns in by_then.items()]
+    assert len(late_ns) == 18
+    # To begin with nobody knows the period.
+    assert IMU_PERIOD_NS < late_ns.pop(0) < 2 * IMU_PERIOD_NS
+    assert all(0 <= late < IMU_PERIOD_NS for late in late_ns)
 
 
 @st.composite

@@ -130,6 +130,7 @@ class Odometry:
 
     def add(self, measurement: Measurement) -> list[Step]:
         """Take one measurement; the steps of the frames that are complete by it."""
+        self._prepare(measurement)
         return [self._step(imu, frames) for imu, frames in self._synchroniser.add(measurement)]
 
     def add_imu(self, t_ns: ArrayLike, gyro_B: ArrayLike, accel_B: ArrayLike) -> list[Step]:
@@ -186,11 +187,19 @@ class Odometry:
             with limited_threads(opencv=usable_cores() - 1):
                 yield from self._follow_ahead(self._packets(read_ahead(measurements)))
         else:
-            for imu, frames in self._packets(measurements):
+            for imu, frames in self._packets(measurements, prepared=True):
                 yield self._step(imu, frames)
 
-    def _packets(self, measurements: Iterable[Measurement]) -> Iterator[Packet]:
+    def _prepare(self, measurement: Measurement) -> None:
+        """Use the time for which a frame waits for readings."""
+        if isinstance(measurement, FrameSet) and measurement.t_ns not in self._waiting_tracks:
+            with limited_threads():
+                self._frontend.prepare(measurement)
+
+    def _packets(self, measurements: Iterable[Measurement], *, prepared: bool = False) -> Iterator[Packet]:
         for measurement in measurements:
+            if prepared:
+                self._prepare(measurement)
             yield from self._synchroniser.add(measurement)
         yield from self._synchroniser.finish()
 

@@ -1,6 +1,6 @@
 """Seconds by stage, for the timing columns of a run."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from time import perf_counter
 
 from vioframe.jit import waited_s
@@ -15,10 +15,10 @@ def working_s(clock: Callable[[], float] = perf_counter) -> float:
 
 
 class Stopwatch:
-    """Started when made; each :meth:`lap` books the working time since the last one under a stage's name."""
+    """Started when made; each :meth:`lap` adds the working time since the last one to ``seconds`` of a stage."""
 
-    def __init__(self) -> None:
-        self.seconds: dict[str, float] = {}
+    def __init__(self, seconds: Mapping[str, float] | None = None) -> None:
+        self.seconds = dict(seconds or {})
         self._last = working_s()
 
     def lap(self, stage: str) -> None:

@@ -2,16 +2,32 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
+from dataclasses import dataclass
+
 import numpy as np
 
+from vioframe.errors import DatasetError
 from vioframe.frontend.flow import body_rotation
 from vioframe.frontend.options import FrontendOptions
 from vioframe.frontend.stereo import MOST_APART_S, overlapping
-from vioframe.frontend.view import View
+from vioframe.frontend.view import Shown, View
 from vioframe.incidents import Incidents
 from vioframe.interfaces import Detector
 from vioframe.stopwatch import Stopwatch
-from vioframe.types import NS_PER_S, Calibration, FrameSet, FrameTracks, ImuSegment
+from vioframe.types import NS_PER_S, Calibration, FrameSet, FrameTracks, Image, ImuSegment
+
+# Frames that are prepared at once: more than wait at any rate of a camera, unless its IMU has fallen silent.
+_MOST_PREPARED = 8
+
+
+@dataclass(frozen=True, slots=True)
+class _Prepared:
+    """``frames``, what each camera's image shows, and the seconds that took by stage."""
+
+    frames: FrameSet
+    shown: dict[int, Shown]
+    stage_seconds: dict[str, float]
 
 
 class Frontend:
@@ -25,14 +41,22 @@ class Frontend:
     def __init__(
         self, detector: Detector, calibration: Calibration, options: FrontendOptions, incidents: Incidents
     ) -> None:
+        self._options = options
         self._views = tuple(View(detector, camera.model, options, incidents) for camera in calibration.cameras)
         self._pairs = overlapping(calibration)
         # How the body has turned since each camera's last image, R_B1B2, and when that was.
         self._turned = [np.eye(3) for _ in self._views]
         self._seen_ns: list[int | None] = [None for _ in self._views]
         self._next_id = 0
+        self._prepared: dict[int, _Prepared] = {}
         self.stage_seconds: dict[str, float] = {}
         """Seconds that the last call of :meth:`track` spent by stage: equalise, klt, reject, match, detect."""
+
+    def prepare(self, frames: FrameSet) -> None:
+        """Do for ``frames`` what takes the images alone, while they wait for readings: :meth:`track` is done sooner."""
+        if len(self._prepared) < _MOST_PREPARED:
+            with suppress(DatasetError):  # raised in its turn
+                self._prepared[id(frames)] = self._prepare(frames)
 
     def track(self, imu: ImuSegment, frames: FrameSet, calibration: Calibration) -> FrameTracks:
         """The tracks of ``frames``; ``imu`` spans the time since those before, ``calibration`` is the newest there is.
@@ -41,15 +65,16 @@ class Frontend:
         :class:`DatasetError` where an image does not fit the calibration, and :class:`PluginError` where the detector
         has never worked.
         """
-        watch = Stopwatch()
+        prepared = self._prepared.pop(id(frames), None) or self._prepare(frames)
+        self._prepared = {key: kept for key, kept in self._prepared.items() if kept.frames.t_ns > frames.t_ns}
+        watch = Stopwatch(prepared.stage_seconds)
         R_B1B2 = body_rotation(imu)
         self._turned = [turned @ R_B1B2 for turned in self._turned]
-        seeing = [c for c, image in enumerate(frames.images) if image is not None]
+        seeing = list(prepared.shown)
         for c in seeing:
-            camera, image = calibration.cameras[c], frames.images[c]
-            assert image is not None
+            camera = calibration.cameras[c]
             R_C2C1 = camera.R_BC.T @ self._turned[c].T @ camera.R_BC if camera.rotation_known else None
-            self._views[c].advance(image, R_C2C1, frames.t_ns, watch)
+            self._views[c].advance(prepared.shown[c], R_C2C1, frames.t_ns, watch)
             self._turned[c], self._seen_ns[c] = np.eye(3), frames.t_ns
         for c in seeing:
             for pair in self._pairs:
@@ -76,3 +101,21 @@ class Frontend:
         """Count with the lenses of ``calibration`` from the next images on."""
         for view, camera in zip(self._views, calibration.cameras, strict=True):
             view.recalibrate(camera.model)
+
+    def _prepare(self, frames: FrameSet) -> _Prepared:
+        watch, shown = Stopwatch(), {}
+        for c, image in enumerate(frames.images):
+            if image is not None:
+                _check_size(image, self._views[c].camera.resolution)
+                shown[c] = Shown.of(image, self._options, watch)
+        return _Prepared(frames, shown, watch.seconds)
+
+
+def _check_size(image: Image, resolution: tuple[int, int]) -> None:
+    width, height = resolution
+    if image.shape != (height, width) or image.dtype != np.uint8:
+        got = "x".join(str(n) for n in image.shape[1::-1]) + f" {image.dtype}"
+        raise DatasetError(
+            f"image is {got}, but the calibration is for {width}x{height} grey uint8; "
+            "use the calibration of this camera, or convert the images"
+        )

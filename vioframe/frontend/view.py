@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
-from vioframe.errors import DatasetError
 from vioframe.frontend.candidates import CandidateSource
 from vioframe.frontend.flow import equalise, follow, predict
 from vioframe.frontend.lucas_kanade import Pyramid
@@ -31,6 +32,24 @@ _CANDIDATES_PER_POINT = 3
 _FEWEST_TO_JUDGE = 10
 
 
+@dataclass(frozen=True, slots=True)
+class Shown:
+    """What an image shows whatever came before it: its contrast spread, and as a pyramid unless that is nothing."""
+
+    image: Image
+    pyramid: Pyramid | None
+
+    @staticmethod
+    def of(raw: Image, options: FrontendOptions, watch: Stopwatch) -> Shown:
+        image = equalise(raw, options.equalisation).view()
+        image.flags.writeable = False  # the detector is anybody's code
+        is_featureless = float(np.std(raw[::4, ::4])) < _FEATURELESS
+        watch.lap("equalise")
+        pyramid = None if is_featureless else Pyramid.of(image, options.klt_levels, options.klt_window_px)
+        watch.lap("klt")
+        return Shown(image, pyramid)
+
+
 class View:
     """``ids`` (N,), ``xy`` (N, 2) px and ``xy_normalised`` (N, 2) of the points in the newest image of ``camera``."""
 
@@ -53,28 +72,20 @@ class View:
         assert self._pyramid is not None
         return self._pyramid
 
-    def advance(self, raw: Image, R_C2C1: Float | None, t_ns: int, watch: Stopwatch) -> None:
-        """Follow the points to the next image, ``R_C2C1`` (3, 3) being how the camera turned, where that is known.
-
-        Raises :class:`DatasetError` where the image does not fit the calibration.
-        """
-        self._check(raw)
-        image = equalise(raw, self._options.equalisation).view()
-        image.flags.writeable = False  # the detector is anybody's code
-        watch.lap("equalise")
-        self.is_featureless = bool(np.std(raw[::4, ::4]) < _FEATURELESS)
-        if self.is_featureless:
+    def advance(self, shown: Shown, R_C2C1: Float | None, t_ns: int, watch: Stopwatch) -> None:
+        """Follow the points to the next image, ``R_C2C1`` (3, 3) being how the camera turned, where that is known."""
+        self.is_featureless = shown.pyramid is None
+        if shown.pyramid is None:
             self._incidents.add("featureless_image", t_ns)
             self.keep(np.zeros(len(self.ids), bool))
         else:
-            self._watch_for_frozen(image, R_C2C1, t_ns)
-            pyramid = Pyramid.of(image, self._options.klt_levels, self._options.klt_window_px)
-            xy_normalised_before = self._follow(pyramid, R_C2C1)
-            self._pyramid = pyramid
+            self._watch_for_frozen(shown.image, R_C2C1, t_ns)
+            xy_normalised_before = self._follow(shown.pyramid, R_C2C1)
+            self._pyramid = shown.pyramid
             watch.lap("klt")
             self._reject(xy_normalised_before, R_C2C1)
             watch.lap("reject")
-        self._image = image
+        self._image = shown.image
 
     def recalibrate(self, camera: Camera) -> None:
         """Count with ``camera`` from the next image on."""
@@ -117,15 +128,6 @@ class View:
     def keep(self, mask: Bool) -> None:
         """Only the points ``mask`` (N,)."""
         self.ids, self.xy, self.xy_normalised = self.ids[mask], self.xy[mask], self.xy_normalised[mask]
-
-    def _check(self, image: Image) -> None:
-        width, height = self.camera.resolution
-        if image.shape != (height, width) or image.dtype != np.uint8:
-            got = "x".join(str(n) for n in image.shape[1::-1]) + f" {image.dtype}"
-            raise DatasetError(
-                f"image is {got}, but the calibration is for {width}x{height} grey uint8; "
-                "use the calibration of this camera, or convert the images"
-            )
 
     def _watch_for_frozen(self, image: Image, R_C2C1: Float | None, t_ns: int) -> None:
         """Count an image that is the one before it to the last bit, though the camera turned: it was not taken anew."""

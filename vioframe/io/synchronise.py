@@ -54,8 +54,9 @@ class Synchroniser:
     linearly onto the frame stamps; the first packet's segment is a single reading.
 
     A frame waits until readings from ``wait_ms`` behind it are there: so much later may a reading arrive than one with
-    a later stamp, and still find its place. Of those two must have come, so that a single stamp from the far future
-    does no harm. With 0 the first reading at or behind the frame lets it go: the least latency, for a stream in order.
+    a later stamp, and still find its place. One that leaps ahead of those before it is believed when the next has come,
+    so that a single wild stamp does no harm. With 0 the first reading at or behind the frame lets it go: the least
+    latency, for a stream in order.
 
     ``incidents`` counts ``imu_nan``, ``imu_out_of_range``, ``imu_saturated``, ``imu_frozen``, ``imu_duplicate``,
     ``imu_out_of_order``, ``imu_gap``, ``frame_duplicate``, ``frame_out_of_order``, ``frame_before_imu``,
@@ -98,7 +99,7 @@ class Synchroniser:
 
     def finish(self) -> Iterator[Packet]:
         """The packets of the frames that still wait, as far as readings reach: nothing more will come."""
-        while self._frames.t_ns and self._imu.reaches(self._frames.t_ns[0], 1):
+        while self._frames.t_ns and self._imu.reaches(self._frames.t_ns[0]):
             yield from self._release()
         for t_ns in self._frames.t_ns:
             self._incidents.add("frame_after_imu", t_ns, "dropped: no IMU sample at or after it")
@@ -107,8 +108,8 @@ class Synchroniser:
     def _is_covered(self, t_ns: int) -> bool:
         """Whether the readings reach far enough behind the frame at ``t_ns``."""
         if self._wait_ns == 0 or len(self._frames.t_ns) > _MAX_WAITING_FRAMES:
-            return self._imu.reaches(t_ns, 1)
-        return self._imu.reaches(t_ns + self._wait_ns, 2)
+            return self._imu.reaches(t_ns)
+        return self._imu.reaches(t_ns + self._wait_ns, surely=True)
 
     def _release(self) -> Iterator[Packet]:
         (t_ns,), (frame,) = self._frames.take(1)
@@ -300,11 +301,23 @@ class _ImuBuffer(_Ordered[ImuSample]):
         if len(self.t_ns) > 2 * _MOST_IDLE_READINGS:
             del self.t_ns[:_MOST_IDLE_READINGS], self.items[:_MOST_IDLE_READINGS]
 
-    def reaches(self, t_ns: int, fewest: int) -> bool:
-        """Whether so many samples are at or after ``t_ns``; more where all are far from it, as wild stamps are."""
+    def reaches(self, t_ns: int, *, surely: bool = False) -> bool:
+        """Whether samples are at or after ``t_ns``: many where all are far from it, as wild stamps are.
+
+        ``surely``, two, or one that came in step with those before it.
+        """
         first = bisect_left(self.t_ns, t_ns)
-        far = first < len(self.t_ns) and self.t_ns[first] - t_ns >= NS_PER_S
-        return len(self.t_ns) - first >= (_READINGS_BEHIND_THE_END if far else fewest)
+        behind = len(self.t_ns) - first
+        if behind and self.t_ns[first] - t_ns >= NS_PER_S:
+            return behind >= _READINGS_BEHIND_THE_END
+        return behind > 1 or (behind == 1 and (not surely or self._is_in_step(first)))
+
+    def _is_in_step(self, place: int) -> bool:
+        """Whether the sample at ``place`` follows the one before it without a gap."""
+        before_ns = self.t_ns[place - 1] if place else self.last_used_ns
+        if before_ns is None or self._gap_limit_ns is None:
+            return False
+        return self.t_ns[place] - before_ns <= self._gap_limit_ns
 
     def covers(self, t_ns: int) -> bool:
         """Whether a reading at ``t_ns`` can be interpolated, given that there is a sample at or after it."""
