@@ -160,6 +160,7 @@ class TestLatency:
     def test_figures(self):
         latencies = Latencies()
         assert latencies.figures_ms() is None
+        assert latencies.last_s is None
         for k in range(101):
             latencies.add(1e-3 * k)
         assert latencies.figures_ms() == pytest.approx({"median": 50.0, "p99": 99.0, "longest": 100.0})
@@ -384,8 +385,11 @@ class TestLive:
         taken = live(source)
         none = FrameTracks(start.t_ns, *(np.empty(0, np.int64),) * 2, *(np.empty((0, 2)),) * 2)
         step = Step(FrameSet(start.t_ns, (None,)), none, Estimate(Status.TRACKING, start), {})
+        seeking = replace(step, estimate=Estimate(Status.INITIALISING, None))
         for measurement in taken.measurements():
             if measurement.t_ns == start.t_ns:
+                assert taken.estimated(seeking) == []
+                assert taken.latency_ms is None
                 assert taken.estimated(step) == []
                 begun.set()
         told = taken.estimated(step)

@@ -284,7 +284,8 @@ def test_it_streams() -> None:
             yield measurement
 
     next(synchronise(source(), incidents=Incidents()))
-    assert measurements[taken - 1].t_ns == 14 * IMU_PERIOD_NS  # the second from 62.3 ms on: nobody knows their period yet
+    # The second from 62.3 ms on, as there is no period yet that the first could be in step with.
+    assert measurements[taken - 1].t_ns == 14 * IMU_PERIOD_NS
 
 
 def arriving_late(late_ns: int) -> list[Measurement]:

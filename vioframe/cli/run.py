@@ -210,7 +210,9 @@ def _watched(bar: Bar, experiment: Experiment) -> Callable[[Step], None]:
         data_s = (step.frames.t_ns - first_t_ns) / NS_PER_S
         pace = f"{data_s / bar.elapsed_s:.2f}x real time"
         if (live := experiment.live) is not None:
-            pace = f"{live.latency_ms:.0f} ms after the exposure, {live.dropped} dropped"
+            late_ms = live.latency_ms
+            pace = "" if late_ms is None else f"{late_ms:.0f} ms after the exposure, "
+            pace += f"{live.dropped} dropped"
         bar(
             f"{(bar.completed + 1) / bar.elapsed_s:.1f} frames/s, {pace}, "
             f"{len(step.tracks.ids)} points, {step.estimate.status}",

@@ -38,7 +38,7 @@ class HostClock:
 
 
 class Latencies:
-    """Of all frames by now, s."""
+    """Of all frames with an estimate by now, s."""
 
     def __init__(self) -> None:
         self._seconds = array("d")
@@ -47,8 +47,8 @@ class Latencies:
         self._seconds.append(seconds)
 
     @property
-    def last_s(self) -> float:
-        return self._seconds[-1] if self._seconds else 0.0
+    def last_s(self) -> float | None:
+        return self._seconds[-1] if self._seconds else None
 
     def figures_ms(self) -> dict[str, float] | None:
         """Median, 99 % quantile and the longest, ms; None before the first frame."""

@@ -79,7 +79,8 @@ class Live:
 
     def estimated(self, step: Step) -> list[NavState]:
         """Take note of a frame's estimate; the states at the rate of the IMU since the one before."""
-        if not self._stopped.is_set():  # the last frame waits for readings until the end
+        # While a start is sought there is none, and the last frame waits for readings until the end.
+        if step.estimate.state is not None and not self._stopped.is_set():
             self._latencies.add(self._clock.since_s(step.frames.t_ns, monotonic_ns()))
         calibration = step.estimate.calibration
         if calibration is not None:
@@ -88,9 +89,9 @@ class Live:
         return [self._predicted.popleft() for _ in range(len(self._predicted))]
 
     @property
-    def latency_ms(self) -> float:
-        """From the exposure of the last frame to its estimate."""
-        return 1e3 * self._latencies.last_s
+    def latency_ms(self) -> float | None:
+        """From the exposure of the last frame that has an estimate to that; None before the first."""
+        return None if self._latencies.last_s is None else 1e3 * self._latencies.last_s
 
     @property
     def dropped(self) -> int:
