@@ -10,7 +10,7 @@ import pytest
 from vioframe.errors import ConfigError, DatasetError, PluginError
 from vioframe.evaluation.epipolar import epipolar_errors_px
 from vioframe.frontend import Frontend, FrontendOptions
-from vioframe.frontend.flow import body_rotation, predict
+from vioframe.frontend.flow import body_rotation, equalise, predict
 from vioframe.frontend.refill import GRID, spread, thin
 from vioframe.geometry import so3, two_view
 from vioframe.geometry.cameras import Camera
@@ -274,6 +274,39 @@ def test_the_image_that_a_detector_gets_is_read_only():
         assert incidents.counts["detector_failed"] == 2
         assert "read-only" in incidents.notes[0]["detail"]
         np.testing.assert_array_equal(image, kept)
+
+
+def test_what_was_prepared_is_not_made_again_and_the_points_are_the_same(monkeypatch):
+    made = []
+
+    def counted(image, *args):
+        made.append(image)
+        return equalise(image, *args)
+
+    monkeypatch.setattr("vioframe.frontend.view.equalise", counted)
+    frames = [FrameSet(k * PERIOD_NS, (texture((240, 320)),)) for k in range(1, 5)]
+    of_another_size = FrameSet(5 * PERIOD_NS, (np.zeros((24, 32), np.uint8),))
+    at_once, beforehand = frontend(), frontend()
+    expected = [at_once.track(segment(STILL, k), f, CALIBRATION) for k, f in enumerate(frames, start=1)]
+    for f in (*frames, of_another_size):
+        beforehand.prepare(f)
+    assert len(made) == 8
+    for k, f in enumerate(frames, start=1):
+        tracks = beforehand.track(segment(STILL, k), f, CALIBRATION)
+        np.testing.assert_array_equal(tracks.xy, expected[k - 1].xy)
+        assert beforehand.stage_seconds["equalise"] > 0.0
+    assert len(made) == 8
+    with pytest.raises(DatasetError, match="image is 32x24"):
+        beforehand.track(segment(STILL, 5), of_another_size, CALIBRATION)
+
+
+def test_frames_that_never_get_their_turn_are_not_kept():
+    followed = frontend()
+    for k in range(1, 101):
+        followed.prepare(FrameSet(k * PERIOD_NS, (texture((240, 320)),)))
+    assert len(followed._prepared) < 10
+    followed.track(segment(STILL, 101), FrameSet(101 * PERIOD_NS, (texture((240, 320)),)), CALIBRATION)
+    assert not followed._prepared
 
 
 def test_the_detector_is_asked_only_when_tracks_are_missing():
