@@ -6,8 +6,8 @@ A simulated flight at half of EuRoC's resolution is replayed at its own pace: as
 to half of real time; watched, the viewer's recording written; and by a RealSense camera that librealsense emulates.
 Each in a process of its own, whose memory is looked at every second. What it recorded is then run again. Targets: no
 reading lost; frames dropped by the slow one only, which stays tracking; after the first minute memory stays as it is;
-the same bytes again; latency at most 25 ms (median) and 60 ms (99 %) beyond the 50 ms that a frame waits for late
-readings. --data counts for nothing here.
+the same bytes again; latency, of frames with an estimate, at most 25 ms (median) and 60 ms (99 %) beyond the 50 ms that
+a frame waits for late readings. --data counts for nothing here.
 """
 
 import multiprocessing

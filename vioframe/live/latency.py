@@ -51,7 +51,7 @@ class Latencies:
         return self._seconds[-1] if self._seconds else None
 
     def figures_ms(self) -> dict[str, float] | None:
-        """Median, 99 % quantile and the longest, ms; None before the first frame."""
+        """Median, 99 % quantile and the longest, ms; None before the first estimate."""
         if not self._seconds:
             return None
         seconds = np.array(self._seconds)
