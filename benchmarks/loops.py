@@ -15,7 +15,7 @@ from tempfile import TemporaryDirectory
 import click
 from common import bags_option, benchmark, present
 from euroc_clips import run
-from rendered_flights import recording
+from rendered_flights import recording, seeds
 
 from vioframe.bench import Row
 from vioframe.bench.processes import installed, map_in_processes
@@ -61,7 +61,7 @@ def main(data: Path, backend: str, assignments: tuple[str, ...], keep: bool, wor
     """Rendered flights, with loop closure and without."""
     with TemporaryDirectory() as temporary:
         bags = bags or Path(temporary)
-        flown = list(product(FLIGHTS, range(worlds)))
+        flown = list(product(FLIGHTS, seeds(worlds)))
         recordings = [recording(bags, flight, world, data, installed()) for flight, world in flown]
         jobs = [
             Job(bag, *about, *parts, assignments)

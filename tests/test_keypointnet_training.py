@@ -26,7 +26,7 @@ from vioframe_keypointnet import (  # noqa: E402
 )
 from vioframe_keypointnet.options import TrainingOptions  # noqa: E402
 from vioframe_keypointnet.selection import padded_to_cells  # noqa: E402
-from vioframe_keypointnet.training import samples  # noqa: E402
+from vioframe_keypointnet.training import samples, trainer  # noqa: E402
 from vioframe_keypointnet.training.samples import Picture, batch, disturbed, gather, pair, split  # noqa: E402
 from vioframe_keypointnet.training.trainer import Training, step_losses, validate  # noqa: E402
 
@@ -76,6 +76,26 @@ def test_steps_lower_the_loss_of_a_fixed_batch(pictures, options, taught):
         totals.append(values["total"].item())
         assert np.isfinite(totals[-1])
     assert totals[-1] < 0.9 * totals[0]
+
+
+@pytest.mark.parametrize(
+    ("taught", "descriptors_only", "total"),
+    [(False, False, 1.0 + 2.0 * 10.0 + 100.0 + 1000.0), (False, True, 10.0), (True, False, 7.0), (True, True, 4.0)],
+)
+def test_losses_are_weighted_as_published(pictures, monkeypatch, taught, descriptors_only, total):
+    """Twice the descriptors', once the others (alpha 1, beta 2, lambda 1); of lessons, what they say themselves."""
+    of_each = {"location": 1.0, "descriptor": 10.0, "score": 100.0, "inlier": 1000.0}
+    told = {
+        "losses": lambda *_: {name: torch.tensor(value) for name, value in of_each.items()},
+        "matching_loss": lambda *_: torch.tensor(4.0),
+        "teach": lambda *_: {"place": torch.tensor(1.0), "corner": torch.tensor(2.0)},
+    }
+    for name, stand_in in told.items():
+        monkeypatch.setattr(trainer, name, stand_in)
+    training = Training(replace(SMALL, descriptors_only=descriptors_only), pictures)
+    pairs = batch(pictures, training.options, 0)
+    values = step_losses(training.network, training.judge, training.options, pairs, taught=taught)
+    assert float(values["total"]) == total
 
 
 @pytest.mark.parametrize("options", [SMALL, PUBLISHED], ids=["compact", "full"])
@@ -202,6 +222,57 @@ def test_images_come_from_recordings(shared_data):
     assert len({f.name for f in frames}) == 7
     assert frames[0].pixels.shape == (480, 752)
     assert not np.array_equal(frames[0].pixels, frames[-1].pixels)
+
+
+def simulated(recording, manifest):
+    """A recording of the simulator's, as far as it says so itself."""
+    images = recording / "mav0" / "cam0" / "data"
+    images.mkdir(parents=True)
+    for number in range(2):
+        cv2.imwrite(str(images / f"{number}.png"), scene(number))
+    (recording / "simulation").mkdir()
+    (recording / "simulation" / "manifest.yaml").write_text(manifest)
+    return recording
+
+
+def test_simulated_worlds_are_known_by_their_recordings_and_what_is_around_and_in_them(tmp_path):
+    flown = simulated(tmp_path / "flown", "seed: 5\nflight: {name: hover}\n")
+    along = simulated(tmp_path / "along", "seed: 6\nrecorded: /data/MH_05_difficult\n")
+    first = {"seed": 5, "flight": "hover", "world": "hall"}
+    second = {"seed": 6, "flight": "MH_05_difficult", "world": "hall"}
+    assert samples.simulated_worlds([flown, along]) == [first, second]
+    assert samples.simulated_worlds([flown / "mav0" / "cam0" / "data"]) == [first]
+    assert samples.simulated_worlds([tmp_path]) == [second, first]
+    bag = tmp_path / "elsewhere" / "flight.bag"
+    bag.with_name("flight.bag.simulation").mkdir(parents=True)
+    (bag.with_name("flight.bag.simulation") / "manifest.yaml").write_text("seed: 5\nflight: {name: hover}\n")
+    assert samples.simulated_worlds([bag]) == [first]
+    assert samples.simulated_worlds([bag.with_name("real.bag")]) == []
+
+
+def test_the_card_names_the_simulated_worlds_of_all_that_led_to_the_weights(folder, tmp_path):
+    """Those it began with, those before it was interrupted, and those after; each once."""
+    flown = [simulated(tmp_path / f"flight{seed}", f"seed: {seed}\n") for seed in (0, 1, 2)]
+    once = train("--images", flown[0] / "mav0", "--out", tmp_path / "a", "-o", "epochs=1", *FLAGS)
+    assert once.exit_code == 0, once.output
+    first = ["--images", flown[1] / "mav0", "--out", tmp_path / "b"]
+    fine = train(*first, "--finetune", tmp_path / "a" / "keypointnet.safetensors", "-o", "epochs=1", *FLAGS)
+    assert fine.exit_code == 0, fine.output
+    more = ["--images", flown[1] / "mav0", "--images", flown[2] / "mav0", "--images", folder, "--resume"]
+    rest = train(*more, "--out", tmp_path / "b", "-o", "epochs=2", *FLAGS)
+    assert rest.exit_code == 0, rest.output
+    worlds = weights.load(tmp_path / "b" / "keypointnet.safetensors").card["simulated_worlds"]
+    assert worlds == [{"seed": seed, "flight": "figure_eight", "world": "hall"} for seed in (0, 1, 2)]
+
+
+@pytest.mark.parametrize(("seed", "purpose"), [(1000, "tuning"), (2000, "reporting")])
+def test_worlds_for_tuning_and_reporting_are_not_trained_on(folder, tmp_path, seed, purpose):
+    flight = simulated(tmp_path / "flight", f"seed: {seed}\n")
+    result = train("--images", folder, "--images", flight, "--out", tmp_path / "out", *FLAGS[:2])
+    assert result.exit_code == 2
+    assert len(result.output.strip().splitlines()) == 1
+    assert f"seed {seed}, a world kept for {purpose}; simulate it with a --seed for training, 0 to 999" in result.output
+    assert not (tmp_path / "out").exists()
 
 
 def test_images_are_held_out_by_name(pictures):

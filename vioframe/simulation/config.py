@@ -38,7 +38,8 @@ class SimulationConfig(Section):
     readings of the IMU are then taken as they are. ``rig`` is one of :data:`RIGS`, or the files of a calibration.
     ``delay_ms`` says how much later than the frame's time a camera of the rig, by its name, takes its image: with a
     stamp of its own. ``readout_ms`` is that of a rolling shutter, which the estimator is told of, in place of the
-    calibration's. ``made`` is what came of it, in a manifest; nothing reads it.
+    calibration's. What the worlds of a ``seed`` are for is in :mod:`vioframe.simulation.seeds`. ``made`` is what came
+    of it, in a manifest; nothing reads it.
     """
 
     flight: PartConfig = PartConfig(name="figure_eight")
@@ -121,6 +122,12 @@ def complete(config: SimulationConfig, registry: Registry) -> SimulationConfig:
         if config.trajectory is None:
             parts["flight"] = completed(config.flight, FLIGHT)
     return config.model_copy(update=parts)
+
+
+def made_of(recording: Path) -> SimulationConfig | None:
+    """What a simulated recording was made of, as its manifest says; None for any other."""
+    manifest = simulation_folder(recording) / MANIFEST
+    return read(manifest) if manifest.is_file() else None
 
 
 def simulation_folder(recording: Path) -> Path:

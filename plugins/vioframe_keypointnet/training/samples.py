@@ -10,7 +10,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatch
 from pathlib import Path
-from typing import Generic, NamedTuple, TypeVar
+from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +22,8 @@ from vioframe.bench.detectors.images import find_images, frames_of, read_image
 from vioframe.errors import ConfigError, DatasetError
 from vioframe.io.images import to_gray8
 from vioframe.parts import registry
+from vioframe.simulation import config as simulation
+from vioframe.simulation.seeds import SEEDS, purpose_of
 from vioframe.types import Float
 from vioframe_keypointnet.options import TrainingOptions
 from vioframe_keypointnet.training.losses import corners, lesson
@@ -100,6 +102,31 @@ def gather(sources: Sequence[Path], channels: int, frames_per_recording: int) ->
                 image = next(image for image in frames.images if image is not None)
                 pictures.append(Picture(f"{source}#{number}", _with_channels(image, channels, str(source))))
     return [picture for picture in pictures if min(picture.pixels.shape[:2]) >= _SMALLEST_PX]
+
+
+def simulated_worlds(sources: Iterable[Path]) -> list[dict[str, Any]]:
+    """The simulated worlds that ``sources`` show: ``seed``, ``flight`` and ``world`` of each, for the card.
+
+    A source is a recording, or a folder in one or with some in it. Raises :class:`ConfigError` for a world that is kept
+    for tuning or reporting.
+    """
+    worlds: list[dict[str, Any]] = []
+    for source in map(Path.absolute, sources):
+        own = simulation.simulation_folder(source) / simulation.MANIFEST
+        beside = Path("simulation", simulation.MANIFEST)
+        around = [folder / beside for folder in source.parents]
+        for manifest in filter(Path.is_file, dict.fromkeys([own, *around, *sorted(source.rglob(str(beside)))])):
+            made = simulation.read(manifest)
+            if (purpose := purpose_of(made.seed)) in ("tuning", "reporting"):
+                training = SEEDS["training"]
+                raise ConfigError(
+                    f"{source} was simulated with the seed {made.seed}, a world kept for {purpose}; simulate it with a "
+                    f"--seed for training, {training[0]} to {training[-1]}"
+                )
+            along = made.recorded or made.trajectory
+            flight = made.flight.name if along is None else along.name
+            worlds.append({"seed": made.seed, "flight": flight, "world": made.world.name})
+    return worlds
 
 
 def split(pictures: Iterable[Picture], hold_out: Sequence[str]) -> tuple[list[Picture], list[Picture]]:

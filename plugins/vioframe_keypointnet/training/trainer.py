@@ -6,9 +6,10 @@ A step depends on nothing but its number, and the checkpoint holds all that the 
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -27,7 +28,7 @@ from vioframe_keypointnet.network import KeypointNet, fill
 from vioframe_keypointnet.options import KeypointNetOptions, TrainingOptions
 from vioframe_keypointnet.quantisation import measure_ranges
 from vioframe_keypointnet.training.losses import InlierOutlierNet, losses, matching_loss, teach
-from vioframe_keypointnet.training.samples import Pair, Picture, batch, gather, grey_of, split
+from vioframe_keypointnet.training.samples import Pair, Picture, batch, gather, grey_of, simulated_worlds, split
 
 CHECKPOINT, LOG, WEIGHTS = "checkpoint.pt", "log.csv", "keypointnet.safetensors"
 
@@ -54,6 +55,7 @@ class KeypointNetTrainer:
             raise ConfigError(f"{job.out} holds a training already; go on with --resume or choose another --out")
         if job.resume and not checkpoint.exists():
             raise ConfigError(f"{checkpoint} does not exist, so there is nothing to resume; leave out --resume")
+        worlds = simulated_worlds(job.images)
         pictures = gather(job.images, options.architecture.image_channels, options.frames_per_recording)
         train, held_out = split(pictures, job.hold_out)
         self._held_out = held_out[:_VALIDATION_IMAGES]
@@ -66,6 +68,7 @@ class KeypointNetTrainer:
             self._history = self._training.resume(checkpoint)
         elif job.start_from is not None:
             self._training.start_from(weights.load(job.start_from))
+        self._training.saw(worlds)
 
     def train(self) -> Iterator[TrainingStep]:
         """Train to the end; however it ends, what is done stays in the checkpoint."""
@@ -100,6 +103,7 @@ class KeypointNetTrainer:
             "images": [path.name for path in self._job.images],
             "trained_on": self._counts[0],
             "held_out": self._counts[1],
+            "simulated_worlds": self._training.worlds,
             "started_from": None if self._job.start_from is None else Path(self._job.start_from).name,
             "options": asdict(self._options),
             "result": dict(self._history[-1]) if self._history else {},
@@ -110,7 +114,10 @@ class KeypointNetTrainer:
 
 
 class Training:
-    """A network in training on ``pictures``; ``step`` counts what is done of it."""
+    """A network in training on ``pictures``; ``step`` counts what is done of it.
+
+    ``worlds`` are the simulated ones that it saw, now or before it was resumed or begun from other weights.
+    """
 
     def __init__(self, options: TrainingOptions, pictures: Sequence[Picture]) -> None:
         self.options = options
@@ -128,6 +135,7 @@ class Training:
         trained = [p for p in (*self.network.parameters(), *self.judge.parameters()) if p.requires_grad]
         self._optimiser = Adam(trained, lr=options.learning_rate)
         self.step = 0
+        self.worlds: list[dict[str, Any]] = []
 
     @property
     def epoch_steps(self) -> int:
@@ -146,6 +154,11 @@ class Training:
                 f"{self.options.architecture.name}; choose it with -o network= and -o width="
             )
         fill(self.network, other)
+        self.saw(other.card.get("simulated_worlds", ()))
+
+    def saw(self, worlds: Iterable[dict[str, Any]]) -> None:
+        """Keep in mind that ``worlds`` are among what it is trained on."""
+        self.worlds += [world for world in worlds if world not in self.worlds]
 
     def steps(self) -> Iterator[Mapping[str, float]]:
         """Train to the end; yields each step's losses by name."""
@@ -182,6 +195,7 @@ class Training:
                 "judge": self.judge.state_dict(),
                 "optimiser": self._optimiser.state_dict(),
                 "history": [dict(row) for row in history],
+                "simulated_worlds": self.worlds,
             },
             part,
         )
@@ -205,6 +219,7 @@ class Training:
         self.judge.load_state_dict(kept["judge"])
         self._optimiser.load_state_dict(kept["optimiser"])
         self.step = kept["step"]
+        self.saw(kept.get("simulated_worlds", ()))
         return list(kept["history"])
 
     def weights(self) -> weights.Weights:

@@ -21,6 +21,7 @@ from vioframe.runs.evaluated import create_metrics
 from vioframe.runs.results import CELL, CLEAR, Data
 from vioframe.simulation.config import RIGS, RigName, SimulationConfig
 from vioframe.simulation.flights import flight as named_flight
+from vioframe.simulation.seeds import seed_for
 from vioframe.warming import warm_up
 
 # About how long things take on one core, for the time that is left: a frame to render, to fly, and a second of a trial.
@@ -73,7 +74,7 @@ def _flights(suite: Suite, folders: Sequence[Path], installed: Registry) -> Iter
             duration_s=None if sequence.duration_s is None else sequence.duration_s + SEED_SHIFT_S * (suite.seeds - 1),
             conditions={condition: level} if level else {},
             rig=rig,
-            seed=seed if suite.seeds_vary == "recording" else 0,
+            seed=seed_for(suite.worlds, seed if suite.seeds_vary == "recording" else 0),
             installed=installed,
         )
         # What was recorded stays as it is, so that it can only be started later.

@@ -14,8 +14,9 @@ from vioframe.parts.options import did_you_mean
 from vioframe.parts.registry import FLIGHT, Registry
 from vioframe.runs.results import Data
 from vioframe.simulation import config as simulation
-from vioframe.simulation.config import MANIFEST, RigName, SimulationConfig, simulation_folder
+from vioframe.simulation.config import RigName, SimulationConfig, made_of, simulation_folder
 from vioframe.simulation.scenario import motion_files
+from vioframe.simulation.seeds import purpose_of
 
 DEFAULT_STAND_IN_S = 30.0
 # EuRoC's own site has MACHINE/SEQUENCE/SEQUENCE.bag.
@@ -118,14 +119,16 @@ def flown(
     if source.recording is not None and (not conditions or source.kind is not Data.REAL):
         if conditions:
             raise ConfigError(f"{source.recording} is a simulation already: conditions need the real recording")
-        made_of = {
+        what = {
             Data.REAL: "recorded images and IMU",
             Data.RENDERED: "recorded IMU and motion, images rendered",
             Data.SIMULATED: "simulated motion, IMU and images",
         }
         files = [source.recording] if source.ground_truth is None else [source.recording, source.ground_truth]
         digest = fingerprints.of_recordings(files)
-        note = f"{name}: {made_of[source.kind]}"
+        note = f"{name}: {what[source.kind]}"
+        if (made := made_of(source.recording)) and (purpose := purpose_of(made.seed)) not in (None, "reporting"):
+            note += f", in world {made.seed}, which is for {purpose} and not for reporting"
         return Flown(source.kind, note, begin_s, digest, source.recording, source.ground_truth)
     data, note = Data.SIMULATED, f"simulated flight {name}"
     settings: dict[str, Any] = {"seed": seed, "rig": (rig,), "conditions": dict(conditions)}
@@ -182,13 +185,12 @@ def _is_motion(path: Path) -> bool:
 
 def _kind_of(recording: Path, installed: Registry) -> Data:
     """A recording of vioframe's simulator says so itself, by what lies beside it."""
-    manifest = simulation_folder(recording) / MANIFEST
-    if manifest.is_file():
-        return Data.RENDERED if simulation.read(manifest).recorded is not None else Data.SIMULATED
+    if (made := made_of(recording)) is not None:
+        return Data.RENDERED if made.recorded is not None else Data.SIMULATED
     if recording.is_file() and installed.open_dataset(recording).ground_truth is not None:
         raise DatasetError(
-            f"{recording} holds ground truth, so the simulator wrote it, but {manifest.parent.name} with what it "
-            "was made of is not beside it; copy that too"
+            f"{recording} holds ground truth, so the simulator wrote it, but {simulation_folder(recording).name} with "
+            "what it was made of is not beside it; copy that too"
         )
     return Data.REAL
 

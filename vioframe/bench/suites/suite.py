@@ -17,6 +17,7 @@ from vioframe.parts.options import did_you_mean, validate_options
 from vioframe.runs.results import Reference
 from vioframe.simulation.conditions import Conditions
 from vioframe.simulation.config import RigName
+from vioframe.simulation.seeds import Purpose
 
 Kind = Literal["flights", "detector_speed", "trials"]
 Level = Annotated[float, Field(gt=0.0, le=1.0)]
@@ -51,8 +52,9 @@ class Suite(Section):
     ``flights`` runs every detector with every back-end on every sequence, as it is and under each of ``conditions`` at
     each level, ``seeds`` times; ``detector_speed`` times detectors; ``trials`` flies back-ends on simulated tracks.
     ``seeds_vary`` says what another seed changes: the ``start`` of the flight, by ``SEED_SHIFT_S``, or the simulated
-    ``recording`` itself. ``workers`` is for sweeps that must have it so, as one that measures time. ``reference`` is
-    for the report: what somebody claims, quotes and shows; a suite's file may name another that holds it.
+    ``recording`` itself. What is simulated flies in ``worlds`` kept for that purpose. ``workers`` is for sweeps that
+    must have it so, as one that measures time. ``reference`` is for the report: what somebody claims, quotes and shows;
+    a suite's file may name another that holds it.
     """
 
     name: str
@@ -66,6 +68,7 @@ class Suite(Section):
     clear: bool = True
     seeds: Annotated[int, Field(ge=1)] = 1
     seeds_vary: Literal["start", "recording"] = "start"
+    worlds: Purpose = "reporting"
     metrics: tuple[str, ...] = ()
     frontend: dict[str, Any] = Field(default_factory=dict)
     workers: Annotated[int | None, Field(ge=1)] = None
@@ -103,7 +106,8 @@ SEED_SHIFT_S = 0.5
 """How much later a flight starts with each seed, where seeds vary the start."""
 
 _USES: dict[Kind, str] = {
-    "flights": "detectors backends sequences conditions clear seeds seeds_vary metrics frontend workers published",
+    "flights": "detectors backends sequences conditions clear seeds seeds_vary worlds metrics frontend workers "
+    "published",
     "detector_speed": "detectors sequences rounds images",
     "trials": "backends seeds setup workers",
 }
