@@ -2,6 +2,7 @@
 
 import json
 import re
+from itertools import product
 from pathlib import Path
 
 import cv2
@@ -36,6 +37,8 @@ from vioframe.bench.detectors.speed import time_detectors
 from vioframe.cli import main
 from vioframe.errors import ConfigError, DatasetError, PluginError
 from vioframe.parts import registry
+from vioframe.parts.config import LabelledPart
+from vioframe.types import Keypoints
 
 SIZE = (320, 240)
 
@@ -245,7 +248,7 @@ def test_every_call_is_counted(with_broken):
     entrants = parse_entrants(["corner:weights=own", "shi_tomasi"], (), with_broken)
     rounds = []
     rows = time_detectors(
-        line_up(entrants, with_broken).ready, [textured(k) for k in range(4)], 3, on_round=rounds.append
+        line_up(entrants, with_broken).ready, {"textures": [textured(k) for k in range(4)]}, 3, on_round=rounds.append
     )
     assert len(rounds) == 4  # one of them to warm up
     corner, shi_tomasi = rows.to_dict("records")
@@ -259,7 +262,7 @@ def test_every_call_is_counted(with_broken):
 def test_a_detector_that_fails_on_the_way_is_named(with_broken):
     ready = line_up(parse_entrants(["corner:weights=own,fail_at=3"], (), with_broken), with_broken).ready
     with pytest.raises(PluginError, match="corner:weights=own,fail_at=3 failed: ZeroDivisionError"):
-        time_detectors(ready, [textured()], 2)
+        time_detectors(ready, {"textures": [textured()]}, 2)
 
 
 def test_speeds_are_shown_and_kept(tmp_path):
@@ -275,6 +278,35 @@ def test_speeds_are_shown_and_kept(tmp_path):
     assert [row["detector"] for row in content["results"]] == ["shi_tomasi", "orb"]
     assert content["settings"]["question"] == "speed"
     assert content["machine"]["cpu"] in content["settings"]["devices"][0]
+
+
+def test_one_run_times_drawn_surfaces_photographs_and_frames_alike(photographs, flight, tmp_path):
+    keep = tmp_path / "speed.json"
+    arguments = [flight[0], "--images", photographs, "--detector", "shi_tomasi", "--detector", "fast"]
+    out = bench(*arguments, "--rounds", 2, "--limit", 2, "--quiet", "--record", keep)
+    kinds = ["drawn surfaces", "photographs of photographs", "frames of flight"]
+    rows = json.loads(keep.read_text())["results"]
+    assert [(row["images"], row["detector"]) for row in rows] == list(product(kinds, ["shi_tomasi", "fast"]))
+    assert {(row["image_count"], row["calls"]) for row in rows} == {(2, 4)}
+    for kind in kinds:
+        _, _, table = out.stdout.partition(f"2 images, {kind}\n")
+        assert [line.split()[0] for line in table.splitlines()[1:3]] == ["shi_tomasi", "fast"]
+
+
+def test_figures_of_a_kind_of_images_are_of_its_calls_alone():
+    """Five points in white images and two in black ones, whatever order they come in."""
+
+    class Sees:
+        def detect(self, image, max_points):
+            count = 5 if image[0, 0] else 2
+            return Keypoints(np.zeros((count, 2), np.float32), np.ones(count, np.float32))
+
+    white, black = np.full((8, 8), 255, np.uint8), np.zeros((8, 8), np.uint8)
+    rows = time_detectors([(LabelledPart(name="sees"), Sees())], {"black": [black] * 3, "white": [white]}, 4)
+    assert rows[["images", "image_count", "keypoints", "calls"]].to_numpy().tolist() == [
+        ["black", 3, 2.0, 12],
+        ["white", 1, 5.0, 4],
+    ]
 
 
 # Quality
@@ -378,7 +410,8 @@ def test_a_recording_without_truth_or_images_is_refused(flight):
         (["--quality", "--frontend"], "two questions"),
         (["--quality"], "no images given"),
         (["--frontend"], "no recording given"),
-        (["somewhere"], "DATASET would do nothing here: it goes with --frontend"),
+        (["somewhere.bag"], "somewhere.bag does not exist"),
+        (["--quality", "somewhere.bag"], "DATASET would do nothing here: it goes with --frontend or is about speed"),
         (["--hpatches", "."], "--hpatches would do nothing here: it goes with --quality"),
         (["--degradation", "noise"], "--degradation would do nothing here: it goes with --quality or --frontend"),
         (["--quality", "--rounds", "3"], "--rounds would do nothing here: it is about speed alone"),

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 _SPEED_IMAGES, _SPEED_ROUNDS, _FLIGHT_S = 8, 10, 10.0
 _USES = {
-    "speed": ("images", "limit", "rounds"),
+    "speed": ("dataset", "images", "limit", "rounds"),
     "quality": ("images", "hpatches", "limit", "degradation", "baseline", "workers"),
     "frontend": ("dataset", "degradation", "baseline", "start", "duration", "ground_truth", "workers"),
 }
@@ -42,10 +42,13 @@ _Answer = tuple["pd.DataFrame", dict[str, Any], str]
     help="Detector.  [default: all]",
 )
 @click.option("-o", "--option", "options", metavar="NAME.KEY=VALUE", multiple=True, help="Set a detector's option.")
-@click.option("--images", type=FILE, metavar="DIR", help="Photographs.  [default for speed: drawn surfaces]")
+@click.option("--images", type=FILE, metavar="DIR", help="Photographs.")
 @click.option("--hpatches", type=FILE, metavar="DIR", help="HPatches, for --quality.")
 @click.option(
-    "--limit", type=click.IntRange(1), metavar="N", help=f"Images.  [default: {_SPEED_IMAGES} for speed, or all]"
+    "--limit",
+    type=click.IntRange(1),
+    metavar="N",
+    help=f"Images, of each kind.  [default: {_SPEED_IMAGES} for speed, or all]",
 )
 @click.option("--degradation", metavar="NAME", multiple=True, help="Degrade by this alone.  [default: each]")
 @click.option("--baseline", metavar="NAME[:...]", help="State leads over this detector.  [default: shi_tomasi]")
@@ -68,6 +71,9 @@ def detectors(
     **specific: Any,
 ) -> None:
     """Compare detectors: by default their speed at 640 x 480 with 300 keypoints.
+
+    Speed is timed on drawn surfaces, on photographs (--images DIR) and on frames
+    of DATASET alike: on some images some detectors have more to do than on others.
 
     \b
     --quality   the HPatches protocol at 320 x 240 with 300 keypoints, on
@@ -118,7 +124,8 @@ def _given(question: str, specific: dict[str, Any]) -> dict[str, Any]:
     for name, value in specific.items():
         if value not in (None, ()) and name not in _USES[question]:
             use = " or ".join(f"--{other}" for other, uses in _USES.items() if name in uses and other != "speed")
-            remedy = f"it goes with {use}" if use else "it is about speed alone"
+            alone = "or is about speed" if use else "it is about speed alone"
+            remedy = " ".join([f"it goes with {use}"] * bool(use) + [alone] * (name in _USES["speed"]))
             argument = "DATASET" if name == "dataset" else "--" + name.replace("_", "-")
             raise ConfigError(f"{argument} would do nothing here: {remedy}")
     return {name: specific[name] for name in _USES[question]}
@@ -126,16 +133,19 @@ def _given(question: str, specific: dict[str, Any]) -> dict[str, Any]:
 
 def _speed(given: dict[str, Any], lined_up: Callable[[], LineUp]) -> _Answer:
     from vioframe.bench.detectors import speed
+    from vioframe.parts import registry
 
     rounds = given["rounds"] or _SPEED_ROUNDS
-    pictures, source = speed.pictures(given["limit"] or _SPEED_IMAGES, folder=given["images"], seed=given["seed"])
+    recording = None if given["dataset"] is None else registry.load().open_dataset(given["dataset"])
+    each = given["limit"] or _SPEED_IMAGES
+    pictures = speed.pictures(each, folder=given["images"], recording=recording, seed=given["seed"])
     ready = lined_up().ready
     with Bar(rounds + 1, "rounds", quiet=given["quiet"]) as bar:
         result = speed.time_detectors(ready, pictures, rounds, on_round=lambda count: bar(advance=count))
-    settings = speed.speed_settings(source, len(pictures), rounds)
+    settings = speed.speed_settings(rounds)
     heading = (
         f"Frames a second at 640 x 480, {speed.MAX_POINTS} keypoints, one at a time, decoding excluded: "
-        f"{'; '.join(settings['devices'])}; {len(pictures)} images ({source}) in {rounds} rounds; median and quartiles"
+        f"{'; '.join(settings['devices'])}; {rounds} rounds; median and quartiles"
     )
     return result, settings, heading
 
@@ -171,6 +181,8 @@ def _quality(given: dict[str, Any], lined_up: Callable[[], LineUp]) -> _Answer:
 def _frontend(given: dict[str, Any], lined_up: Callable[[], LineUp]) -> _Answer:
     from vioframe.bench.detectors import flight
     from vioframe.bench.detectors.degradations import choose
+    from vioframe.simulation.config import made_of
+    from vioframe.simulation.seeds import purpose_of
 
     if given["dataset"] is None:
         raise DatasetError(
@@ -179,13 +191,15 @@ def _frontend(given: dict[str, Any], lined_up: Callable[[], LineUp]) -> _Answer:
     degradations, over = choose(given["degradation"]), given["baseline"]
     duration_s = _FLIGHT_S if given["duration"] is None else given["duration"]
     stretch = flight.Stretch(given["dataset"], given["start"] or 0.0, duration_s, given["ground_truth"])
-    name = flight.check(stretch)
+    name, made = flight.check(stretch), made_of(stretch.path)
+    where = "" if made is None else f" (simulated, seed {made.seed}, for {purpose_of(made.seed) or 'nothing special'})"
     entrants = [entrant for entrant, _ in lined_up().ready]
     with Bar(len(degradations), "flights", quiet=given["quiet"]) as bar:
         how = {"seed": given["seed"], "workers": given["workers"], "on_flight": lambda count: bar(advance=count)}
         result = flight.fly_detectors(entrants, stretch, degradations, baseline=over, **how)
     settings = {
         "dataset": name,
+        "simulated_seed": None if made is None else made.seed,
         "start_s": stretch.start_s,
         "duration_s": duration_s,
         "baseline": over,
@@ -193,7 +207,7 @@ def _frontend(given: dict[str, Any], lined_up: Callable[[], LineUp]) -> _Answer:
         "epipolar_inlier_px": flight.INLIER_PX,
     }
     heading = (
-        f"Followed by the front-end: {name}, {duration_s:g} s after the first {stretch.start_s:g} s; inliers within "
-        f"{flight.INLIER_PX:g} px of the true epipolar line over {flight.BASELINE_FRAMES} frames"
+        f"Followed by the front-end: {name}{where}, {duration_s:g} s after the first {stretch.start_s:g} s; inliers "
+        f"within {flight.INLIER_PX:g} px of the true epipolar line over {flight.BASELINE_FRAMES} frames"
     )
     return result, settings, heading

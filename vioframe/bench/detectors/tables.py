@@ -64,10 +64,11 @@ _BY_DEGRADATION: Mapping[str, Columns] = {
 
 
 def shown(question: str, heading: str, result: pd.DataFrame, baseline: str) -> list[str]:
-    """Images as they are, and, where there were others, each figure that matters to ``question`` by degradation."""
+    """Of speed a table a kind of images; else images as they are, and each figure that matters by degradation."""
     columns = {"speed": SPEED, "quality": QUALITY, "frontend": FRONTEND}[question]
     if question == "speed":
-        return [f"{heading}\n{overview(result, columns)}"]
+        of_each = result.groupby(["images", "image_count"], sort=False)
+        return [heading, *(f"{count} images, {kind}\n{overview(own, columns)}" for (kind, count), own in of_each)]
     tables = [f"{heading}\n{overview(result[result['degradation'] == Degradation().name], columns)}"]
     if result["degradation"].nunique() > 1:
         for figure, (title, spec) in _BY_DEGRADATION[question].items():

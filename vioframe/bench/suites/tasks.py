@@ -195,8 +195,8 @@ def speed(task: SpeedTask) -> list[Figures]:
     entrants = task.detectors or parse_entrants(everyone(installed(), "speed"), (), installed())
     lined_up = line_up(entrants, installed())
     recording = None if task.frames_of is None else installed().open_dataset(task.frames_of)
-    images, source = pictures(task.images, recording=recording)
-    settings = speed_settings(source, len(images), task.rounds)
+    images = pictures(task.images, drawn=recording is None, recording=recording)
+    settings = speed_settings(task.rounds)
     settings["width"], settings["height"] = settings.pop("resolution")
     timed: list[Any] = time_detectors(lined_up.ready, images, task.rounds).astype(object).to_dict("records")
     absent = [{"detector": name, "status": "absent", "error": why} for name, why in lined_up.absent.items()]
