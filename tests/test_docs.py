@@ -120,6 +120,20 @@ def test_no_figure_of_the_readme_is_typed_by_hand():
     assert re.findall(r"\d (?:mm|cm|m|ms|%|FPS|deg)\b", prose) == []
 
 
+def test_nothing_says_what_the_quoted_speeds_were_measured_on():
+    """Nobody knows: the thesis does not say."""
+    quoted = YAML(typ="safe", pure=True).load(ROOT / "benchmarks" / "thesis" / "thesis.yaml")["speed"]["detectors"]
+    assert quoted["keypointnet"]["fps"] == 184
+    assert [name for name, each in quoted.items() if not each["source"].endswith("hardware not stated")] == []
+    suffixes = {".md", ".yaml", ".py", ".j2", ".html", ".js"}
+    rooms = ("docs", "benchmarks", "vioframe", "plugins")
+    files = [*PAGES, *(path for room in rooms for path in (ROOT / room).rglob("*") if path.suffix in suffixes)]
+    about = re.compile(r"thesis|\b184\b", re.IGNORECASE)
+    device = re.compile(r"\bGPUs?\b|\bCUDA\b|graphics card|NVIDIA|GeForce|\bRTX\b|Jetson", re.IGNORECASE)
+    paragraphs = ((path, text) for path in files for text in path.read_text(encoding="utf-8").split("\n\n"))
+    assert [(path, text) for path, text in paragraphs if about.search(text) and device.search(text)] == []
+
+
 def test_every_detector_that_took_part_is_in_the_table():
     record = json.loads((ROOT / "benchmarks" / "results" / "detectors_quality.json").read_text())
     took_part = {row["detector"] for row in record["results"] if "absent" not in row}
