@@ -128,19 +128,69 @@ def test_inlier_loss_labels_matches_within_four_pixels(monkeypatch):
     class Judge(torch.nn.Module):
         def forward(self, matches):
             self.matches = matches
-            return torch.zeros(matches.shape[0], matches.shape[2], dtype=matches.dtype) + 0.5
+            return exact(0.5, -0.25)[None]
 
     judge = Judge()
     a = candidates([[10.0, 10.0], [40.0, 30.0], [70.0, 50.0]], [0.9, 0.8, 0.1])
-    b = candidates([[13.0, 10.0], [40.0, 39.0], [70.0, 50.0]], [0.5, 0.5, 0.5])
+    b = candidates([[13.9, 10.0], [40.0, 34.1], [70.0, 50.0]], [0.5, 0.5, 0.5])
     descriptors = torch.eye(3, dtype=torch.float64)[None]
     size = exact(96.0, 64.0)
     loss = losses.inlier_loss(judge, a, b, a.xy, descriptors, descriptors, size)
-    # Of the two best, the first match is 3 px off and right, the second 9 px off and wrong.
-    assert float(loss) == pytest.approx(0.5 * ((0.5 - 1.0) ** 2 + (0.5 + 1.0) ** 2) / 2)
+    # Of the two best, the first match is 3.9 px off and right, which is +1, the second 4.1 px off and wrong, -1: half
+    # of 0.5^2 and of 0.75^2, in the mean. The other way round it were half of 1.5^2 and of 1.25^2.
+    assert float(loss) == pytest.approx((0.125 + 0.28125) / 2)
     np.testing.assert_allclose(
-        judge.matches[0, :, 0], [20 / 96 - 1, 20 / 64 - 1, 26 / 96 - 1, 20 / 64 - 1, 1e-6], atol=1e-5
+        judge.matches[0, :, 0], [20 / 96 - 1, 20 / 64 - 1, 27.8 / 96 - 1, 20 / 64 - 1, 1e-6], atol=1e-5
     )
+
+
+def test_inlier_loss_is_over_the_three_hundred_strongest():
+    """The strongest 300 of 301 matches are right, the last one is not, and a judge that calls all right is right."""
+
+    class Trusting(torch.nn.Module):
+        def forward(self, matches):
+            return torch.ones(matches.shape[0], matches.shape[2], dtype=matches.dtype)
+
+    def loss(weakest):
+        a = candidates(np.zeros((301, 2)), [*np.linspace(0.9, 0.5, 300), weakest])
+        b = candidates([[0.0, 0.0]] * 300 + [[50.0, 50.0]], [0.5] * 301)
+        each = torch.eye(301, dtype=torch.float64)[None]
+        return float(losses.inlier_loss(Trusting(), a, b, a.xy, each, each, exact(96.0, 64.0)))
+
+    assert loss(0.1) == 0.0
+    assert loss(0.95) == pytest.approx(0.5 * 2.0**2 / 300)
+
+
+def test_the_losses_of_three_candidates_by_hand():
+    """Three candidates off the border of either view, the target 2 px to the right; the first at 1 px, the second at 2.
+
+    The third is found 5 px off, which is not the same point, so that location is (1 + 2) / 2 = 1.5 and the scores are
+    those of two: (0.8 + 0.6) / 2 (1 - 1.5) + (0.2 + 0.4) / 2 (2 - 1.5), over two, is -0.1, and (0.2^2 + 0.2^2) / 2 is
+    0.04. Descriptors are the same everywhere in a view, so that positives are as far as negatives: the margin is left.
+    """
+    places = torch.zeros(1, 2, 3, 5, dtype=torch.float64)
+    scores = [torch.zeros(1, 3, 5, dtype=torch.float64) for _ in range(2)]
+    xy = [places.clone(), places.clone()]
+    xy[0][0, :, 1, 1:4] = exact([11.0, 12.0], [19.0, 12.0], [27.0, 12.0]).T
+    xy[1][0, :, 1, 1:4] = exact([14.0, 12.0], [21.0, 14.0], [29.0, 17.0]).T
+    xy[1][0, :, 0, 0] = exact(13.0, 12.0)  # where the first one belongs, but at the border
+    scores[0][0, 1, 1:4], scores[1][0, 1, 1:4] = exact(0.8, 0.2, 0.9), exact(0.6, 0.4, 0.1)
+    alike = [exact(1.0, 0.0), exact(0.5, math.sqrt(0.75))]
+    fields = [each[None, :, None, None].expand(1, 2, 6, 10) for each in alike]
+    a, b = map(Detection, scores, xy, fields)
+    to_the_right = exact([1.0, 0.0, 2.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0])[None]
+    values = losses.losses(a, b, to_the_right, InlierOutlierNet().double().eval())
+    assert float(values["location"]) == pytest.approx(1.5)
+    assert float(values["score"]) == pytest.approx(-0.1 + 0.04)
+    assert float(values["descriptor"]) == pytest.approx(0.2)
+
+
+def test_the_loss_of_lessons_weighs_scores_four_times(monkeypatch):
+    """The mean of both views: places of 1 and 3 px, cross entropies of 0.5 and 0.7."""
+    told = iter([(torch.tensor(1.0), torch.tensor(0.5)), (torch.tensor(3.0), torch.tensor(0.7))])
+    monkeypatch.setattr(losses, "lesson_loss", lambda seen, wanted: next(told))
+    values = losses.teach(*[None] * 4)
+    assert {name: float(value) for name, value in values.items()} == pytest.approx({"place": 2.0, "corner": 2.4})
 
 
 def test_points_that_the_other_view_does_not_show_count_for_nothing():
