@@ -25,12 +25,9 @@ from vioframe.report.units import length
 HERE = Path(__file__).resolve().parent
 ROOT = HERE.parent
 _DOCS = ROOT / "docs"
-PAGES = (
-    ROOT / "README.md",
-    HERE / "README.md",
-    *(_DOCS / name for name in ("check.md", "data.md", "keypointnet.md", "montecarlo.md")),
-)
 BLOCK = re.compile(r"(<!-- figures: (\w+) -->\n).*?(<!-- end -->)", re.DOTALL)
+_MAY = (ROOT / "README.md", HERE / "README.md", *sorted(_DOCS.rglob("*.md")))
+PAGES = tuple(path for path in _MAY if BLOCK.search(path.read_text(encoding="utf-8")))
 _RENDERED = "MH_05_difficult"
 
 

@@ -107,9 +107,11 @@ def _recording(tmp_path: Path, request: pytest.FixtureRequest) -> Path:
 
 
 def test_every_figure_in_print_is_that_of_a_record():
-    for page in TABLES["PAGES"]:
+    for page in PAGES:
         text = page.read_text()
-        assert "<!-- figures: " in text
+        blocks = TABLES["BLOCK"].findall(text)
+        assert len(blocks) == text.count("<!-- figures") == text.count("<!-- end -->")
+        assert (page in TABLES["PAGES"]) == bool(blocks)
         assert TABLES["page"](text) == text, "run python benchmarks/make_tables.py"
     shown = {name for page in TABLES["PAGES"] for _, name, _ in TABLES["BLOCK"].findall(page.read_text())}
     assert shown == set(TABLES["FIGURES"])
@@ -118,6 +120,15 @@ def test_every_figure_in_print_is_that_of_a_record():
 def test_no_figure_of_the_readme_is_typed_by_hand():
     prose = TABLES["BLOCK"].sub("", README)
     assert re.findall(r"\d (?:mm|cm|m|ms|%|FPS|deg)\b", prose) == []
+
+
+@pytest.mark.parametrize("name", ["detectors", "bench_detectors", "keypointnet"])
+def test_no_figure_of_a_detector_is_typed_by_hand(name):
+    """Sizes in pixels and limits in per cent are settings; shares, times and their ratios are measured."""
+    prose = TABLES["BLOCK"].sub("", (ROOT / "docs" / f"{name}.md").read_text())
+    prose = re.sub(r"```.*?```|`[^`]*`", "", prose, flags=re.DOTALL)
+    measured = r"\b0\.\d\d+|\b0\.[1-9] px|\d+ ?(?:ms|FPS|fps|frames/s|(?:frames|images) a second)\b|\d times\b"
+    assert re.findall(measured, prose) == []
 
 
 def test_nothing_says_what_the_quoted_speeds_were_measured_on():
