@@ -122,6 +122,27 @@ def test_no_figure_of_the_readme_is_typed_by_hand():
     assert re.findall(r"\d (?:mm|cm|m|ms|%|FPS|deg)\b", prose) == []
 
 
+def test_speeds_are_shown_for_each_kind_of_images_and_so_is_who_is_faster(tmp_path, monkeypatch):
+    """One is faster on photographs, where its slower quartile is above the other's quicker one, and on nothing else."""
+
+    def row(detector, images, fps):
+        quartiles = {"fps": fps, "fps_low": 0.9 * fps, "fps_high": 1.1 * fps}
+        return {"detector": detector, "images": images, **quartiles, "on": "cpu"}
+
+    fps = {"drawn": (100.0, 110.0), "photographs": (50.0, 80.0), "frames": (70.0, 20.0)}
+    rows = [row(*each) for kind, (a, b) in fps.items() for each in (("shi_tomasi", kind, a), ("other", kind, b))]
+    record = {"results": rows, "settings": {}, "machine": {"commit": "0" * 40}, "recorded": "2026-01-01T00:00:00"}
+    (tmp_path / "results").mkdir()
+    (tmp_path / "results" / "detectors_speed.json").write_text(json.dumps(record))
+    monkeypatch.setitem(TABLES["speed"].__globals__, "HERE", tmp_path)
+    lines = TABLES["speed"]().splitlines()
+    assert lines[0] == "| detector | drawn | photographs | frames | faster than `shi_tomasi` on | on |"
+    assert lines[2:4] == [
+        "| `other` | 110 (9.1 ms) | 80 (12 ms) | 20 (50 ms) | photographs | cpu |",
+        "| `shi_tomasi` | 100 (10 ms) | 50 (20 ms) | 70 (14 ms) | - | cpu |",
+    ]
+
+
 @pytest.mark.parametrize("name", ["detectors", "bench_detectors", "keypointnet"])
 def test_no_figure_of_a_detector_is_typed_by_hand(name):
     """Sizes in pixels and limits in per cent are settings; shares, times and their ratios are measured."""

@@ -163,7 +163,9 @@ class TestSources:
     def test_what_the_simulator_wrote_is_never_called_real(self, tmp_path):
         config = complete(SimulationConfig(duration_s=0.3), INSTALLED)
         record(SimulatedRecording(config, INSTALLED), [tmp_path / "MH_01_easy.bag"])
-        assert self.flown("MH_01_easy", [tmp_path]).data is Data.SIMULATED
+        found = self.flown("MH_01_easy", [tmp_path])
+        assert found.data is Data.SIMULATED
+        assert found.note.endswith(", in world 0, which is for training and not for reporting")
         with pytest.raises(ConfigError, match="simulation already"):
             self.flown("MH_01_easy", [tmp_path], {"fog": 0.5})
         rmtree(tmp_path / "MH_01_easy.bag.simulation")
