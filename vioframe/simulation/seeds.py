@@ -12,7 +12,7 @@ from vioframe.errors import ConfigError
 
 Purpose = Literal["training", "tuning", "reporting"]
 
-SEEDS: dict[Purpose, range] = {"training": range(1000), "tuning": range(1000, 2000), "reporting": range(2000, 3000)}
+SEEDS: dict[Purpose, range] = {"training": range(1000), "tuning": range(1000, 3000), "reporting": range(3000, 4000)}
 
 
 def seed_for(purpose: Purpose, number: int) -> int:
