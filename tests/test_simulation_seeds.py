@@ -36,8 +36,8 @@ def test_what_anybody_simulates_may_be_trained_on():
 
 def test_worlds_are_counted_from_the_first_of_a_purpose():
     assert [seed_for("reporting", number) for number in (0, 1)] == list(SEEDS["reporting"][:2])
-    with pytest.raises(ConfigError, match="there are 1000 worlds for tuning, 0 to 999, and no 1000"):
-        seed_for("tuning", 1000)
+    with pytest.raises(ConfigError, match="there are 2000 worlds for tuning, 0 to 1999, and no 2000"):
+        seed_for("tuning", 2000)
 
 
 def test_a_seed_has_the_same_surfaces_wherever_one_flies_and_another_has_others(monkeypatch):
