@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from image_helpers import textured
 
-from vioframe.frontend.flow import follow
+from vioframe.frontend.flow import follow, returns
 from vioframe.frontend.lucas_kanade import Pyramid, search
 
 LEVELS = 4
@@ -99,7 +99,8 @@ def test_what_is_hidden_does_not_find_its_way_back():
     xy = cv2.goodFeaturesToTrack(before, 400, 0.01, 8.0)[:, 0]
     pyramids = Pyramid.of(before, LEVELS, 15), Pyramid.of(after, LEVELS, 15)
     _, forth = search(*pyramids, xy, xy.copy())
-    found, ok = follow(*pyramids, xy.astype(np.float64), xy.astype(np.float64), 0.5)
+    found, ok = follow(*pyramids, xy.astype(np.float64), xy.astype(np.float64))
+    ok &= returns(*pyramids, xy.astype(np.float64), found, 0.5)
     another, same, plain = ((xy[:, 0] > a) & (xy[:, 0] < b) for a, b in ((0, 130), (180, 300), (350, 480)))
     assert ok[same].all()
     np.testing.assert_allclose(found[same], xy[same], atol=0.01)

@@ -18,7 +18,7 @@ from vioframe import jit
 from vioframe.cores import usable_cores
 from vioframe.errors import DivergedError
 from vioframe.estimation import initialization
-from vioframe.frontend import lucas_kanade
+from vioframe.frontend import anchors, lucas_kanade
 from vioframe.frontend.tracker import Frontend
 from vioframe.interfaces import Backend
 from vioframe.io.calibration import packaged_calibration
@@ -50,6 +50,7 @@ def warm_up(backend: Backend, calibration: Calibration, frontend: Frontend | Non
         _fly_along_a_wall(backend, calibration)
     initialization.warm_up(calibration)
     lucas_kanade.warm_up()
+    anchors.warm_up()
     if frontend is not None:
         _look_at_noise(frontend, calibration)
 

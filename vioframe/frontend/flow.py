@@ -51,15 +51,20 @@ def projected(camera: Camera, p_C: Float) -> tuple[Float, Mask]:
     return xy, ahead & camera.contains(xy)
 
 
-def follow(before: Pyramid, after: Pyramid, xy: Float, guess: Float, tolerance_px: float) -> tuple[Float, Mask]:
-    """Lucas-Kanade from ``before`` to ``after``, checked by the way back.
+def follow(before: Pyramid, after: Pyramid, xy: Float, guess: Float) -> tuple[Float, Mask]:
+    """Lucas-Kanade from ``before`` to ``after``: where ``xy`` (N, 2) px went, and which of them were found (N,).
 
-    ``xy`` (N, 2) px in ``before``, ``guess`` (N, 2) px in ``after``. Returns (N, 2) px in ``after`` and (N,) whether
-    the point was found and returned to within ``tolerance_px``. The way back starts at its answer, in images a
-    quarter as fine: a patch that is another one does not stay there.
+    ``guess`` (N, 2) px is where in ``after`` to begin. What is found may be something else: see :func:`returns`.
     """
-    start, first = xy.astype(np.float32), guess.astype(np.float32)
-    found, forth = search(before, after, start, first)
-    returned, back = search(after, before, found, start, levels=_LEVELS_BACK)
-    ok: Mask = forth & back & (np.linalg.norm(returned - start, axis=1) < tolerance_px)
+    found, ok = search(before, after, xy.astype(np.float32), guess.astype(np.float32))
     return found.astype(np.float64), ok
+
+
+def returns(before: Pyramid, after: Pyramid, xy: Float, found: Float, tolerance_px: float) -> Mask:
+    """Which of ``found`` (N, 2) px in ``after`` come back to within ``tolerance_px`` of ``xy`` (N, 2) px in ``before``.
+
+    The way back starts at the answer, in images a quarter as fine: a patch that is another one does not stay there.
+    """
+    returned, back = search(after, before, found.astype(np.float32), xy.astype(np.float32), levels=_LEVELS_BACK)
+    ok: Mask = back & (np.linalg.norm(returned - xy, axis=1) < tolerance_px)
+    return ok

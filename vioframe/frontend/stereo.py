@@ -11,7 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from vioframe.frontend.flow import follow, projected
+from vioframe.frontend.flow import follow, projected, returns
 from vioframe.frontend.view import FORWARD_BACKWARD_PX, View
 from vioframe.geometry.two_view import essential_matrix, inverse_depths, rays, sampson_distance
 from vioframe.types import Bool, Calibration, Float, Int
@@ -70,7 +70,8 @@ class Pair:
         new, guess = new[in_view], guess[in_view]
         if not len(new):
             return
-        xy, found = follow(one.pyramid, other.pyramid, one.xy[new], guess, FORWARD_BACKWARD_PX)
+        xy, found = follow(one.pyramid, other.pyramid, one.xy[new], guess)
+        found &= returns(one.pyramid, other.pyramid, one.xy[new], xy, FORWARD_BACKWARD_PX)
         xy_normalised, usable = other.undistorted(xy)
         found &= usable
         there = np.where(found[:, None], xy_normalised, 0.0)

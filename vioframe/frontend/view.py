@@ -6,8 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from vioframe.frontend.anchors import Anchors
 from vioframe.frontend.candidates import CandidateSource
-from vioframe.frontend.flow import equalise, follow, predict
+from vioframe.frontend.flow import equalise, follow, predict, returns
 from vioframe.frontend.lucas_kanade import Pyramid
 from vioframe.frontend.options import FrontendOptions
 from vioframe.frontend.refill import spread, thin
@@ -59,6 +60,7 @@ class View:
         self._incidents = incidents
         self._image: Image | None = None
         self._pyramid: Pyramid | None = None
+        self._anchors: Anchors | None = None
         self.camera = camera
         self.is_featureless = True
         """Whether the newest image shows nothing that could be followed."""
@@ -124,10 +126,15 @@ class View:
         self.ids = np.concatenate([self.ids, ids])
         self.xy = np.concatenate([self.xy, xy])
         self.xy_normalised = np.concatenate([self.xy_normalised, xy_normalised])
+        if self._options.anchored:
+            anchors = Anchors.of(self.pyramid, xy)
+            self._anchors = anchors if self._anchors is None else self._anchors.joined(anchors)
 
     def keep(self, mask: Bool) -> None:
         """Only the points ``mask`` (N,)."""
         self.ids, self.xy, self.xy_normalised = self.ids[mask], self.xy[mask], self.xy_normalised[mask]
+        if self._anchors is not None:
+            self._anchors = self._anchors.keep(mask)
 
     def _watch_for_frozen(self, image: Image, R_C2C1: Float | None, t_ns: int) -> None:
         """Count an image that is the one before it to the last bit, though the camera turned: it was not taken anew."""
@@ -143,7 +150,17 @@ class View:
         if self._pyramid is None or not len(self.ids):
             return before
         guess = self.xy if R_C2C1 is None else predict(self.camera, self.xy, before, R_C2C1)
-        self.xy, found = follow(self._pyramid, pyramid, self.xy, guess, FORWARD_BACKWARD_PX)
+        xy, found = follow(self._pyramid, pyramid, self.xy, guess)
+        held = np.zeros(len(found), bool)
+        if self._anchors is not None:
+            self._anchors, xy, held = self._anchors.refine(pyramid, xy, found)
+        # What is like its anchor is the same point; others must find their way back, and begin anew where they are.
+        loose = np.flatnonzero(found & ~held)
+        back = returns(self._pyramid, pyramid, self.xy[loose], xy[loose], FORWARD_BACKWARD_PX)
+        found[loose] = back
+        if self._anchors is not None:
+            self._anchors = self._anchors.renewed(loose[back], pyramid, xy)
+        self.xy = xy
         self.xy_normalised, usable = self.undistorted(self.xy)
         found &= usable
         self.keep(found)
