@@ -114,6 +114,25 @@ def _at(image: Image, x: float, y: float) -> np.float32:
     return value
 
 
+@kernel(inlined=True)
+def _sample(
+    flat: Image, width: int, x: np.float32, y: np.float32, across: np.float32, down: np.float32, row: Pixels
+) -> None:
+    """``row`` becomes what an image has at ``x``, ``y`` and on from there, a step of ``across``, ``down`` each.
+
+    ``flat`` holds its rows, each ``width`` long, one after the other.
+    """
+    for k in range(len(row)):
+        u, v = x + across * np.float32(k), y + down * np.float32(k)
+        i, j = np.int32(u), np.int32(v)
+        a, b, at = u - np.float32(i), v - np.float32(j), np.uint64(j * width + i)
+        below = at + np.uint64(width)
+        left, under = np.float32(flat[at]), np.float32(flat[below])
+        upper = left + a * (np.float32(flat[at + np.uint64(1)]) - left)
+        lower = under + a * (np.float32(flat[below + np.uint64(1)]) - under)
+        row[k] = upper + b * (lower - upper)
+
+
 @kernel(reorder_sums=True)
 def _anchor(
     image: Image, xy: Float, patch: Pixels, by_x: Pixels, by_y: Pixels, information: Float, contrast: Float
@@ -170,6 +189,7 @@ def _refine(
     side = patch.shape[1]
     half, pixels = side // 2, side * side
     height, width = image.shape
+    flat = image.ravel()
     now, g = np.empty((side, side), np.float32), np.empty(6)
     for n in range(len(xy)):
         if not tried[n]:
@@ -185,9 +205,9 @@ def _refine(
             total, square, product = np.float32(0.0), np.float32(0.0), np.float32(0.0)
             for r in range(side):
                 from_x, from_y = x + b * (r - half) - a * half, y + d * (r - half) - c * half
+                _sample(flat, width, np.float32(from_x), np.float32(from_y), np.float32(a), np.float32(c), now[r])
                 for k in range(side):
-                    value = _at(image, from_x + a * k, from_y + c * k)
-                    now[r, k] = value
+                    value = now[r, k]
                     total += value
                     square += value * value
                     product += value * patch[n, r, k]
