@@ -83,6 +83,24 @@ def test_tracks_follow_the_known_motion_to_a_tenth_of_a_pixel():
         assert np.quantile(error, 0.95) < 0.1
 
 
+def test_points_stay_on_their_landmarks_through_an_approach():
+    """1 % nearer with every image, and half as bright in the end: KLT alone slides off by several times as much."""
+    growth = 1.01 ** np.arange(25)
+    images = [
+        (view(np.diag([s, s, 1.0])) * brightness).astype(np.uint8)
+        for s, brightness in zip(growth, np.linspace(1.0, 0.5, 25), strict=True)
+    ]
+    slid = {}
+    for anchored in (True, False):
+        first, *_, last = play(frontend(anchored=anchored, equalisation="none"), images)
+        _, i, j = np.intersect1d(first.ids, last.ids, return_indices=True)
+        middle = np.array([CAMERA.cx, CAMERA.cy])
+        slid[anchored] = np.linalg.norm(last.xy[j] - middle - growth[-1] * (first.xy[i] - middle), axis=1)
+        assert len(i) > 50
+    assert np.median(slid[True]) < 0.06
+    assert np.median(slid[True]) < 0.3 * np.median(slid[False])
+
+
 def test_points_are_undistorted():
     camera = Camera(300.0, 300.0, 159.5, 119.5, (-0.28, 0.07, 2e-4, 2e-5), (320, 240))
     (tracks,) = play(frontend(calibration=CALIBRATION.with_camera(0, model=camera)), [view(np.eye(3))])
