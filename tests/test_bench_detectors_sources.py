@@ -401,11 +401,11 @@ def test_the_front_end_by_the_command(flight):
 def test_of_a_simulated_recording_its_seed_is_shown_and_kept(flight, tmp_path):
     copytree(flight[0], tmp_path / "flight")
     (tmp_path / "flight" / "simulation").mkdir()
-    (tmp_path / "flight" / "simulation" / "manifest.yaml").write_text("seed: 2001\n")
+    (tmp_path / "flight" / "simulation" / "manifest.yaml").write_text("seed: 3001\n")
     arguments = ["--frontend", tmp_path / "flight", "--ground-truth", flight[1], "--duration", 1, "--workers", 1]
     out = bench(*arguments, "--detector", "fast", "--degradation", "none", "--record", tmp_path / "kept.json")
-    assert "flight (simulated, seed 2001, for reporting), 1 s" in out.stdout
-    assert json.loads((tmp_path / "kept.json").read_text())["settings"]["simulated_seed"] == 2001
+    assert "flight (simulated, seed 3001, for reporting), 1 s" in out.stdout
+    assert json.loads((tmp_path / "kept.json").read_text())["settings"]["simulated_seed"] == 3001
 
 
 def test_a_recording_without_truth_or_images_is_refused(flight):

@@ -205,7 +205,8 @@ def _connected(workers: int | None, scheduler: str | None) -> Iterator[Client]:
     with dask.config.set(_SETTINGS):
         if scheduler is None:
             count = usable_cores() if workers is None else workers
-            quiet: dict[str, Any] = {"dashboard_address": None, "memory_limit": 0, "silence_logs": _SILENT}
+            # Where nobody asks for it, its page takes whatever port is free: several sweeps may run side by side.
+            quiet: dict[str, Any] = {"dashboard_address": "127.0.0.1:0", "memory_limit": 0, "silence_logs": _SILENT}
             with _deaf_to_ctrl_c():
                 cluster = LocalCluster(n_workers=count, threads_per_worker=1, **quiet)
             with cluster, Client(cluster) as client:
