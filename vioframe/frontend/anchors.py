@@ -5,6 +5,7 @@ found a little off, the same way image after image: a point slides off its landm
 first patch, its anchor, is laid over each new image by an affine map that is refined from image to image, so that
 nothing adds up (Shi and Tomasi, "Good features to track", CVPR 1994; solved inversely as by Baker and Matthews,
 "Lucas-Kanade 20 years on", IJCV 2004). Brightness and contrast of a patch may change.
+Derivation: ``docs/derivations/anchors.md``.
 """
 
 from __future__ import annotations
