@@ -1,6 +1,6 @@
 """Whole EuRoC flights with their real IMU, camera stamps and true poses, and images rendered from those poses.
 
-    python benchmarks/rendered_flights.py [--record] [--against landmark_drift_px=0.3] [--bags DIR]
+    python benchmarks/rendered_flights.py [--record] [--against anchored=false] [--bags DIR]
 
 Each flight in several of the worlds kept for reporting, which differ by what stands in them and by their textures;
 --against has every recording flown a second time, with other options. Nothing is tuned on these flights. Targets.
