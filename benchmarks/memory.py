@@ -20,9 +20,10 @@ import psutil
 from common import present
 
 from vioframe.bench import Row
+from vioframe.cores import limited_threads
 from vioframe.incidents import Incidents
 from vioframe.io.calibration import packaged_calibration
-from vioframe.odometry import Odometry, limited_threads
+from vioframe.odometry import Odometry
 from vioframe.runs.recorder import Recorder
 from vioframe.simulation import TrackOptions, simulated_stream
 from vioframe.types import FrameTracks, ImuSample

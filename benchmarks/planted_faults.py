@@ -23,11 +23,11 @@ import numpy as np
 from common import benchmark, present
 
 from vioframe.bench import Row
+from vioframe.cores import limited_threads
 from vioframe.diagnosis import Diagnosis, diagnose, gather
 from vioframe.geometry import so3
 from vioframe.geometry.cameras import Camera
 from vioframe.io.calibration import packaged_calibration, write_calibration
-from vioframe.odometry import limited_threads
 from vioframe.parts import registry
 from vioframe.parts.config import PartConfig
 from vioframe.parts.registry import FLIGHT

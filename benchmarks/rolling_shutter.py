@@ -20,10 +20,10 @@ import numpy as np
 from common import benchmark, present, render
 
 from vioframe.bench import Row, backend_row, run_backend
+from vioframe.cores import limited_threads
 from vioframe.frontend import Frontend, FrontendOptions
 from vioframe.incidents import Incidents
 from vioframe.io.synchronise import synchronise
-from vioframe.odometry import limited_threads
 from vioframe.parts import config as configuration
 from vioframe.parts import registry
 from vioframe.parts.config import Config, PartConfig

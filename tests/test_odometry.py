@@ -17,18 +17,20 @@ from time import perf_counter
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from plugin_helpers import install
 from rendered_flight import CALIBRATION, RenderedFlight, rendered_flight
 
 from vioframe import pipeline
 from vioframe.cli import main
-from vioframe.errors import ConfigError, DatasetError, PluginError
+from vioframe.cores import limited_threads
+from vioframe.errors import ConfigError, DatasetError, PluginError, RunError
 from vioframe.estimation.lifecycle import LifeCycle
 from vioframe.geometry import so3
 from vioframe.incidents import Incidents
 from vioframe.io.calibration import load_calibration
 from vioframe.io.memory import ArrayDataset
 from vioframe.io.synchronise import synchronise
-from vioframe.odometry import Odometry, limited_threads
+from vioframe.odometry import Odometry
 from vioframe.parts import registry
 from vioframe.runs.folder import RunFolder
 from vioframe.runs.recorder import CALIBRATION_COLUMNS, Recorder
@@ -42,7 +44,6 @@ from vioframe.types import (
     Image,
     ImuSample,
     ImuSegment,
-    Keypoints,
     LoopClosure,
     MapCorrection,
     Measurement,
@@ -140,15 +141,15 @@ def test_pieces_of_any_size_give_the_bytes_of_the_recording(backend):
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-def test_two_threads_give_the_bytes_of_one(backend: str):
+def test_two_processes_give_the_bytes_of_one(backend: str):
     """At the start, in flight, and where it is lost and begins anew with another calibration."""
     measurements = short_flight()
     frames = [m.t_ns for m in measurements if isinstance(m, FrameSet)]
 
     def flown(pipelined: bool) -> list[Step]:
-        odometry = Odometry(CALIBRATION, "shi_tomasi", backend, installed=INSTALLED)
+        odometry = Odometry(CALIBRATION, "shi_tomasi", backend, pipelined=pipelined, installed=INSTALLED)
         steps = []
-        for step in odometry.follow(measurements, pipelined=pipelined):
+        for step in odometry.follow(measurements):
             steps.append(step)
             if step.frames.t_ns == frames[len(frames) * 2 // 3]:
                 lose(odometry)
@@ -178,22 +179,22 @@ def test_two_threads_give_the_bytes_of_one(backend: str):
     assert sum(step.estimate.status is Status.LOST for step in alone) == 1
 
 
-def test_with_two_threads_the_next_frame_is_seen_before_the_last_is_estimated():
-    odometry = Odometry(CALIBRATION, "shi_tomasi", "msckf", installed=INSTALLED)
-    seen, most = [], 0
-    track = odometry._frontend.track
+def test_the_next_frame_is_begun_before_the_last_is_estimated():
+    odometry = Odometry(CALIBRATION, "shi_tomasi", "msckf", pipelined=True, installed=INSTALLED)
+    begun, most = [], 0
+    begin = odometry._frontend.begin
 
-    def counted(imu: ImuSegment, frames: FrameSet, calibration: Calibration) -> FrameTracks:
-        seen.append(frames.t_ns)
-        return track(imu, frames, calibration)
+    def counted(imu: ImuSegment, frames: FrameSet, calibration: Calibration) -> None:
+        begun.append(frames.t_ns)
+        begin(imu, frames, calibration)
 
-    odometry._frontend.track = counted
-    for k, step in enumerate(odometry.follow(short_flight(), pipelined=True)):
+    odometry._frontend.begin = counted
+    for k, step in enumerate(odometry.follow(short_flight())):
         if step.estimate.status is Status.INITIALISING:
-            assert len(seen) == k + 1
-        most = max(most, len(seen) - k)
+            assert len(begun) == k + 1
+        most = max(most, len(begun) - k)
     assert most >= 2
-    assert len(seen) == k + 1
+    assert len(begun) == k + 1
 
 
 @pytest.mark.parametrize("pipelined", [False, True])
@@ -208,22 +209,114 @@ def test_what_came_before_a_source_failed_is_estimated(pipelined: bool):
 
     steps: list[Step] = []
     with pytest.raises(DatasetError, match="cut off"):
-        steps.extend(Odometry(CALIBRATION, installed=INSTALLED).follow(broken(), pipelined=pipelined))
+        steps.extend(Odometry(CALIBRATION, pipelined=pipelined, installed=INSTALLED).follow(broken()))
     whole = list(Odometry(CALIBRATION, installed=INSTALLED).follow(measurements))
     assert len(steps) >= 30
     assert tracked(steps) > 10
     assert all_bytes(steps) == all_bytes(whole[: len(steps)])
 
 
-def test_a_detector_that_fails_in_its_thread_is_named():
-    class Never:
-        def detect(self, image: Image, max_points: int) -> Keypoints:
-            raise ValueError("no")
+# Detectors of a distribution of their own, as a process of its own finds them.
+DETECTORS = """
+import os
+import sys
+import numpy as np
+from vioframe.types import Keypoints
 
-    odometry = Odometry(CALIBRATION, Never(), "msckf", installed=INSTALLED)
-    odometry._tracking = True
+
+class Never:
+    def detect(self, image, max_points):
+        raise ValueError("no")
+
+
+class Talkative:
+    def detect(self, image, max_points):
+        print("looking", max_points)
+        return Keypoints(np.float32([[20.0 + i, 20.0] for i in range(0, 40, 20)]), np.ones(2, np.float32))
+
+
+class Deadly(Talkative):
+    def detect(self, image, max_points):
+        os._exit(3)
+
+
+class Picky:
+    def __init__(self):
+        raise RuntimeError("not on a Tuesday")
+
+
+@hookimpl
+def vioframe_detectors():
+    return {"never": Never, "talkative": Talkative, "deadly": Deadly, "picky": Picky}
+"""
+
+
+def apart(detector: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, **options: object) -> Odometry:
+    """With a detector of a distribution that is there only now, in a process of its own."""
+    install(tmp_path, monkeypatch, distribution="odd-detectors", module="odd_detectors", code=DETECTORS)
+    return Odometry(CALIBRATION, detector, pipelined=True, warm=False, **options)
+
+
+def test_a_detector_that_fails_in_its_process_is_named(tmp_path, monkeypatch):
     with pytest.raises(PluginError, match="Never failed on each"):
-        list(odometry.follow(short_flight(), pipelined=True))
+        list(apart("never", tmp_path, monkeypatch).follow(short_flight()))
+
+
+def test_one_that_cannot_be_made_there_is_named(tmp_path, monkeypatch):
+    with pytest.raises(PluginError, match=r"picky.*odd-detectors 1.0.*not on a Tuesday"):
+        list(apart("picky", tmp_path, monkeypatch).follow(short_flight()))
+
+
+def test_what_a_detector_prints_does_no_harm(tmp_path, monkeypatch, capfd):
+    odometry = apart("talkative", tmp_path, monkeypatch)
+    assert len(next(odometry.follow(short_flight())).tracks.ids) == 2
+    out, err = capfd.readouterr()
+    assert (out, err.splitlines()[0]) == ("", "looking 450")
+
+
+def test_a_process_that_dies_is_an_error_with_a_remedy(tmp_path, monkeypatch):
+    with pytest.raises(RunError, match=r"exit code 3.*--cores 1"):
+        list(apart("deadly", tmp_path, monkeypatch).follow(short_flight()))
+
+
+def test_incidents_of_the_other_process_are_counted(tmp_path, monkeypatch):
+    incidents = Incidents()
+    odometry = apart("never", tmp_path, monkeypatch, incidents=incidents)
+    frames = [m for m in short_flight() if isinstance(m, FrameSet)]
+    for frame in frames[:3]:
+        odometry._frontend.track(ImuSegment(np.array([0]), np.zeros((1, 3)), np.zeros((1, 3))), frame, CALIBRATION)
+    assert incidents.counts == {"detector_failed": 3}
+    assert [note["t_ns"] for note in incidents.notes] == [frame.t_ns for frame in frames[:3]]
+
+
+def test_an_image_of_another_size_is_refused_there_as_here():
+    def refused(pipelined: bool) -> str:
+        (frame, *_) = (m for m in short_flight() if isinstance(m, FrameSet))
+        odometry = Odometry(CALIBRATION, pipelined=pipelined, warm=False, installed=INSTALLED)
+        imu = ImuSegment(np.array([0]), np.zeros((1, 3)), np.zeros((1, 3)))
+        with pytest.raises(DatasetError) as raised:
+            odometry._frontend.track(imu, FrameSet(frame.t_ns, (frame.images[0][:-2],)), CALIBRATION)
+        return str(raised.value)
+
+    assert refused(True) == refused(False)
+
+
+def test_a_process_ends_with_who_made_it():
+    odometry = Odometry(CALIBRATION, pipelined=True, warm=False, installed=INSTALLED)
+    process = odometry._frontend._process
+    following = odometry.follow(short_flight())
+    next(following)
+    assert process.poll() is None
+    following.close()
+    assert process.poll() is not None
+    forgotten = Odometry(CALIBRATION, pipelined=True, warm=False, installed=INSTALLED)._frontend._process
+    gc.collect()
+    assert forgotten.poll() is not None
+
+
+def test_a_detector_that_is_no_name_has_no_process():
+    with pytest.raises(ConfigError, match="name an installed detector"):
+        Odometry(CALIBRATION, INSTALLED.create_detector("fast"), pipelined=True, installed=INSTALLED)
 
 
 def test_a_recording_from_files_is_the_same_pushed(shared_data):
@@ -286,8 +379,9 @@ class Turning:
 
 @pytest.mark.parametrize("pipelined", [False, True])
 def test_steps_carry_the_correction_so_far_and_the_estimate_is_the_same(pipelined):
-    with_it, without = (Odometry(CALIBRATION, loop_closer=c, installed=INSTALLED) for c in (Turning(), None))
-    steps = list(pipeline.run(in_memory(short_flight()), with_it, pipelined=pipelined))
+    with_it = Odometry(CALIBRATION, loop_closer=Turning(), pipelined=pipelined, installed=INSTALLED)
+    without = Odometry(CALIBRATION, installed=INSTALLED)
+    steps = list(pipeline.run(in_memory(short_flight()), with_it))
     assert [step.correction.p_MW[2] for step in steps] == list(range(1, len(steps) + 1))
     assert all(step.stage_seconds["loop_closure"] >= 0.0 for step in steps)
     assert with_it.close_loops().keyframe_t_ns.tolist() == [step.frames.t_ns for step in steps]

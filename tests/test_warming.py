@@ -96,7 +96,7 @@ def test_what_helps_comes_to_its_end():
 
 def test_a_recording_waits_for_no_warming_up(monkeypatch):
     warmed = []
-    monkeypatch.setattr(odometry, "warm_up", lambda backend, calibration, frontend: warmed.append(backend))
+    monkeypatch.setattr(odometry, "warm_up", lambda backend, calibration: warmed.append(backend))
     Odometry(CALIBRATION, warm=False)
     assert warmed == []
     Odometry(CALIBRATION)

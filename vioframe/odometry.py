@@ -10,21 +10,20 @@ closer, the first of them: what it knows by then goes along with the step.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
-from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from functools import cache
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from vioframe.cores import usable_cores
-from vioframe.errors import DatasetError, PluginError
+from vioframe.cores import limited_threads, usable_cores
+from vioframe.errors import ConfigError, DatasetError, PluginError
 from vioframe.estimation.lifecycle import LifeCycle
 from vioframe.estimation.options import EstimationOptions
 from vioframe.estimation.soundness import defect_of_correction
 from vioframe.frontend import Frontend, FrontendOptions
+from vioframe.frontend import warming as frontend_warming
+from vioframe.frontend_process import FrontendProcess
 from vioframe.incidents import Incidents
 from vioframe.interfaces import Backend, Detector, LoopCloser
 from vioframe.io.ahead import read_ahead
@@ -46,9 +45,6 @@ from vioframe.types import (
     Step,
 )
 from vioframe.warming import warm_up
-
-# More threads than this gain nothing on images of this size, and cost on machines that have many.
-_MAX_OPENCV_THREADS = 4
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,6 +72,9 @@ class Odometry:
     A back-end named is ``warm`` before the first frame, and a detector named with it: their code is compiled, half a
     minute once after installation, or loaded. A recording, whose frames wait for it, begins sooner without.
 
+    ``pipelined``, the front-end has a process of its own, so that :meth:`follow` has the points of a frame followed
+    while the one before it is estimated from: the same bytes, sooner where there are two cores. Its detector is named.
+
     ``incidents`` counts what was handled on the way: dropped samples, unusable images, failing detectors.
     """
 
@@ -94,15 +93,25 @@ class Odometry:
         initial_state: NavState | None = None,
         wait_ms: float = 50.0,
         warm: bool = True,
+        pipelined: bool = False,
         incidents: Incidents | None = None,
         installed: Registry | None = None,
     ) -> None:
         self._registry = registry.load() if installed is None else installed
         self.incidents = Incidents() if incidents is None else incidents
         options, warm_frontend = frontend or FrontendOptions(), None
-        if isinstance(detector, str):
-            detector = self._registry.create_detector(detector, detector_options)
-            warm_frontend = Frontend(detector, calibration, options, Incidents()) if warm else None
+        self._frontend: Frontend | FrontendProcess
+        if pipelined:
+            if not isinstance(detector, str):
+                raise ConfigError("pipelined, the front-end has a process of its own: name an installed detector")
+            part = self._registry.find(registry.DETECTOR, detector)
+            complete = part.validate(detector_options or {})
+            self._frontend = FrontendProcess(part, complete, calibration, options, self.incidents, warm=warm)
+        else:
+            if isinstance(detector, str):
+                detector = self._registry.create_detector(detector, detector_options)
+                warm_frontend = Frontend(detector, calibration, options, Incidents()) if warm else None
+            self._frontend = Frontend(detector, calibration, options, self.incidents)
         name, warm_backend = None, None
         if isinstance(backend, str):
             name = str(self._registry.find(registry.BACKEND, backend))
@@ -113,11 +122,12 @@ class Odometry:
             self._loop_closer_name = str(self._registry.find(registry.LOOP_CLOSER, loop_closer))
             loop_closer = self._registry.create_loop_closer(loop_closer, calibration, loop_closer_options)
         self._loop_closer = loop_closer
-        self._frontend = Frontend(detector, calibration, options, self.incidents)
         self._life = LifeCycle(backend, calibration, estimation, initial_state, name)
-        if warm_backend is not None:
-            with self._registry.blaming(), limited_threads():
-                warm_up(warm_backend, calibration, warm_frontend)
+        with self._registry.blaming(), limited_threads():
+            if warm_backend is not None:
+                warm_up(warm_backend, calibration)
+            if warm_frontend is not None:
+                frontend_warming.warm_up(warm_frontend, calibration)
         self._synchroniser = Synchroniser(
             self.incidents, time_offset_ns=calibration.cameras[0].time_offset_ns, wait_ms=wait_ms
         )
@@ -177,15 +187,16 @@ class Odometry:
             raise PluginError(f"{what}; repair the plug-in")
         return closure
 
-    def follow(self, measurements: Iterable[Measurement], *, pipelined: bool = False) -> Iterator[Step]:
-        """The steps of a whole stream, to its end.
-
-        ``pipelined``, a thread reads ahead, and a frame's points are followed in another while the one before it is
-        estimated from: the same bytes, sooner where there are two cores.
-        """
-        if pipelined:
-            with limited_threads(opencv=usable_cores() - 1):
-                yield from self._follow_ahead(self._packets(read_ahead(measurements)))
+    def follow(self, measurements: Iterable[Measurement]) -> Iterator[Step]:
+        """The steps of a whole stream, to its end; ``pipelined``, a thread reads ahead where a core is left for it."""
+        if isinstance(self._frontend, FrontendProcess):
+            cores = usable_cores()
+            try:
+                with limited_threads(opencv=cores - 1):
+                    packets = self._packets(read_ahead(measurements) if cores > 2 else measurements)
+                    yield from self._follow_ahead(packets, self._frontend)
+            finally:
+                self._frontend.close()
         else:
             for imu, frames in self._packets(measurements, prepared=True):
                 yield self._step(imu, frames)
@@ -203,38 +214,37 @@ class Odometry:
             yield from self._synchroniser.add(measurement)
         yield from self._synchroniser.finish()
 
-    def _follow_ahead(self, packets: Iterator[Packet]) -> Iterator[Step]:
+    def _follow_ahead(self, packets: Iterator[Packet], frontend: FrontendProcess) -> Iterator[Step]:
         """Each step when the points of the next frame are already being followed.
 
         Only in flight: at a start the next frame depends on what was found.
         """
-        with ThreadPoolExecutor(1, "frontend") as thread:
-            ahead: Future[_Seen] | None = None
-            failure: Exception | None = None
-            while True:
-                try:
-                    packet = next(packets)
-                except StopIteration:
-                    break
-                except Exception as error:  # of whoever brings the measurements: what came before it still counts
-                    failure = error
-                    break
-                if ahead is None and not self._tracking:
-                    yield self._step(*packet)
-                    continue
-                before = None if ahead is None else ahead.result()
-                self._recalibrate()
-                ahead = thread.submit(self._see, *packet)
-                if before is not None:
-                    yield self._estimate(before)
-                    self._retime()
-                    if not self._tracking:
-                        seen, ahead = ahead.result(), None
-                        yield self._estimate_next(seen)
-            if ahead is not None:
-                yield self._estimate_next(ahead.result())
-            if failure is not None:
-                raise failure
+        ahead: Packet | None = None
+        failure: Exception | None = None
+        while True:
+            try:
+                packet = next(packets)
+            except StopIteration:
+                break
+            except Exception as error:  # of whoever brings the measurements: what came before it still counts
+                failure = error
+                break
+            if ahead is None and not self._tracking:
+                yield self._step(*packet)
+                continue
+            self._recalibrate()
+            frontend.begin(*packet, self._seen_with)
+            before, ahead = ahead, packet
+            if before is not None:
+                yield self._estimate(self._seen(*before, frontend.end()))
+                self._retime()
+                if not self._tracking:
+                    seen, ahead = self._seen(*ahead, frontend.end()), None
+                    yield self._estimate_next(seen)
+        if ahead is not None:
+            yield self._estimate_next(self._seen(*ahead, frontend.end()))
+        if failure is not None:
+            raise failure
 
     def _step(self, imu: ImuSegment, frames: FrameSet) -> Step:
         self._retime()
@@ -252,10 +262,13 @@ class Odometry:
             # Those before it belong to frames that were dropped.
             self._waiting_tracks = {t_ns: kept for t_ns, kept in self._waiting_tracks.items() if t_ns > frames.t_ns}
             if tracks is None:
-                tracks = self._frontend.track(imu, frames, self._seen_with)
-                return _Seen(imu, frames, tracks, self._frontend.stage_seconds)
+                return self._seen(imu, frames, self._frontend.track(imu, frames, self._seen_with))
             lenses = self._life.calibration.lenses
             return _Seen(imu, frames, tracks if lenses == self._given else tracks.undistorted(*lenses), {})
+
+    def _seen(self, imu: ImuSegment, frames: FrameSet, tracks: FrameTracks) -> _Seen:
+        """What the front-end has just given for a frame."""
+        return _Seen(imu, frames, tracks, self._frontend.stage_seconds)
 
     def _estimate(self, seen: _Seen) -> Step:
         """Estimate from one frame that was seen."""
@@ -301,31 +314,3 @@ def _own(image: Image) -> Image:
     copy = np.array(image)
     copy.flags.writeable = False
     return copy
-
-
-@contextmanager
-def limited_threads(opencv: int = _MAX_OPENCV_THREADS) -> Iterator[None]:
-    """One BLAS thread, and few of OpenCV's, as long as it lasts.
-
-    numpy and scipy bring a BLAS each; on matrices this small their threads only wait for one another.
-    """
-    import cv2
-
-    before, most = cv2.getNumThreads(), min(max(opencv, 1), _MAX_OPENCV_THREADS)
-    if before > most:
-        cv2.setNumThreads(most)
-    try:
-        with _blas_libraries().limit(limits=1):
-            yield
-    finally:
-        if before > most:
-            cv2.setNumThreads(before)
-
-
-@cache
-def _blas_libraries() -> Any:
-    """A handle on the libraries that are loaded by now: finding them takes a while, so it is done once."""
-    import scipy.linalg  # noqa: F401  its BLAS is to be among them
-    from threadpoolctl import ThreadpoolController
-
-    return ThreadpoolController().select(user_api="blas")

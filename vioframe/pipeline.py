@@ -13,6 +13,7 @@ from itertools import chain
 from pathlib import Path
 from typing import Any, cast
 
+from vioframe.cores import limited_threads
 from vioframe.diagnosis import HOPELESS, Certainty, Diagnosis, Gatherer, diagnose, gather
 from vioframe.diagnosis.stamps import span_s
 from vioframe.errors import DatasetError, RunError
@@ -25,7 +26,7 @@ from vioframe.io.trajectories import load_trajectory, write_tum
 from vioframe.live.ahead import Ahead
 from vioframe.live.stream import Live
 from vioframe.live.tape import Tape
-from vioframe.odometry import Odometry, limited_threads
+from vioframe.odometry import Odometry
 from vioframe.parts import config as configuration
 from vioframe.parts.config import Config
 from vioframe.parts.registry import BACKEND, DATASET, DETECTOR, LOOP_CLOSER, SOURCE, Registry
@@ -45,12 +46,11 @@ def run(
     start_s: float = 0.0,
     duration_s: float | None = None,
     listeners: Sequence[Callable[[Measurement], None]] = (),
-    pipelined: bool = False,
 ) -> Iterator[Step]:
     """Push a data set through ``odometry``, yielding one :class:`~vioframe.types.Step` a frame.
 
     ``start_s`` seconds are skipped, counted from the first frame's stamp; ``duration_s`` is how much is then played.
-    ``listeners`` hear every measurement ahead of the odometry. ``pipelined`` as in :meth:`Odometry.follow`.
+    ``listeners`` hear every measurement ahead of the odometry.
     """
 
     def heard() -> Iterator[Measurement]:
@@ -59,7 +59,7 @@ def run(
                 listen(measurement)
             yield measurement
 
-    return odometry.follow(heard(), pipelined=pipelined)
+    return odometry.follow(heard())
 
 
 @dataclass(frozen=True)
@@ -90,11 +90,8 @@ class Experiment:
     def incidents(self) -> Incidents:
         return self.odometry.incidents
 
-    def steps(self, *, pipelined: bool = False) -> Iterator[Step]:
-        """The main loop; what a plug-in raises comes out as an error that names it.
-
-        ``pipelined`` as in :meth:`~vioframe.odometry.Odometry.follow`.
-        """
+    def steps(self) -> Iterator[Step]:
+        """The main loop; what a plug-in raises comes out as an error that names it."""
         with ExitStack() as within:
             # Around all of it, not each frame alone: a loop closer's own thread works between frames.
             within.enter_context(limited_threads())
@@ -108,7 +105,6 @@ class Experiment:
                 start_s=self.config.start_s,
                 duration_s=self.config.duration_s,
                 listeners=listeners,
-                pipelined=pipelined,
             )
 
     def look_closely(self) -> Diagnosis:
@@ -121,11 +117,16 @@ class Experiment:
             return diagnose(gather(measurements, self.dataset.calibration))
 
 
-def prepare(config: Config, registry: Registry, *, warm: bool = False, tape: Path | None = None) -> Experiment:
+def prepare(
+    config: Config, registry: Registry, *, warm: bool = False, tape: Path | None = None, pipelined: bool = False
+) -> Experiment:
     """Check the whole of ``config``, then open the data set and create the parts.
 
     ``warm``, the back-end has flown once: it begins later, but one that fails does so before anything is replaced. A
     live source, which waits for nobody, always finds it so; all that is used of it is written to ``tape``.
+
+    ``pipelined`` as of :class:`~vioframe.odometry.Odometry`, but for a live source: there a frame that was read ahead
+    would only be older.
     """
     config = configuration.complete(config, registry)
     if config.dataset.path is None:
@@ -151,6 +152,7 @@ def prepare(config: Config, registry: Registry, *, warm: bool = False, tape: Pat
         estimation=config.estimation_options,
         wait_ms=config.wait_ms,
         warm=warm or live,
+        pipelined=pipelined and not live,
         installed=registry,
     )
     return Experiment(
@@ -190,16 +192,15 @@ def record(
     overwrite: bool = False,
     on_step: Callable[[Step], None] = lambda step: None,
     explain: bool = False,
-    pipelined: bool = False,
 ) -> dict[str, Any]:
-    """Run ``experiment``, perhaps ``pipelined``, and write ``folder`` as it goes; returns the summary.
+    """Run ``experiment`` and write ``folder`` as it goes; returns the summary.
 
     Nothing is created or replaced before the first frame has gone through; after that the folder is completed
     however the run ends. The summary has the ``findings`` about the recording: those of its stamps and readings, or
     with ``explain`` all that can be found (:meth:`Experiment.look_closely`) where the run never initialised.
     """
     begin_s = working_s()
-    steps = experiment.steps(pipelined=pipelined)
+    steps = experiment.steps()
     first = next(steps, None)
     if first is None:
         raise DatasetError(f"{experiment.dataset.name} has no image to process: {_why_none(experiment)}")

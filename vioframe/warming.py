@@ -11,15 +11,12 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 
-import cv2
 import numpy as np
 
 from vioframe import jit
 from vioframe.cores import usable_cores
 from vioframe.errors import DivergedError
 from vioframe.estimation import initialization
-from vioframe.frontend import anchors, lucas_kanade
-from vioframe.frontend.tracker import Frontend
 from vioframe.interfaces import Backend
 from vioframe.io.calibration import packaged_calibration
 from vioframe.parts import registry
@@ -27,7 +24,6 @@ from vioframe.types import (
     NS_PER_S,
     Calibration,
     CalibrationEstimate,
-    FrameSet,
     FrameTracks,
     ImuSegment,
     NavState,
@@ -39,20 +35,16 @@ from vioframe.types import (
 _FRAMES, _PERIOD_NS, _STEP_M = 30, NS_PER_S // 10, 0.2
 
 
-def warm_up(backend: Backend, calibration: Calibration, frontend: Frontend | None = None) -> None:
-    """Come once through all that is compiled for following points, ``backend`` and its starts, or load it.
+def warm_up(backend: Backend, calibration: Calibration) -> None:
+    """Come once through all that is compiled for ``backend`` and its starts, or load it.
 
-    ``backend`` and ``frontend`` are of no use afterwards; the former may find its flight too odd to follow.
+    ``backend`` is of no use afterwards; it may find its flight too odd to follow.
     """
     if not calibration.cameras[0].rotation_known:
         calibration = calibration.with_camera(0, R_BC=np.eye(3), rotation_known=True)
     with suppress(DivergedError, np.linalg.LinAlgError):
         _fly_along_a_wall(backend, calibration)
     initialization.warm_up(calibration)
-    lucas_kanade.warm_up()
-    anchors.warm_up()
-    if frontend is not None:
-        _look_at_noise(frontend, calibration)
 
 
 @contextmanager
@@ -106,16 +98,6 @@ def _fly_along_a_wall(backend: Backend, calibration: Calibration) -> None:
     # A body that rests is held: many a flight comes to that late, and none may wait then.
     backend.begin(replace(start, state=replace(state, v_WB=np.zeros(3))))
     backend.process(*resting, True)
-
-
-def _look_at_noise(frontend: Frontend, calibration: Calibration) -> None:
-    """A few images at rest, for detectors compile and load what they need as they see the first of them."""
-    rng = np.random.default_rng(0)
-    sizes = [camera.model.resolution for camera in calibration.cameras]
-    images = tuple(cv2.blur(rng.integers(0, 256, (h, w), np.uint8), (5, 5)).astype(np.uint8) for w, h in sizes)
-    for k in range(3):
-        t_ns = np.array([k - 1, k]) * _PERIOD_NS
-        frontend.track(ImuSegment(t_ns, np.zeros((2, 3)), np.tile(-g_W, (2, 1))), FrameSet(k, images), calibration)
 
 
 if __name__ == "__main__":

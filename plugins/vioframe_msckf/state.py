@@ -265,20 +265,6 @@ class FilterState:
         """
         self._correct(reduce(self.cov, HP, S, residual))
 
-    def update_joseph(self, H: Float, residual: Float, variances: Float) -> None:
-        """The same for measurements of the body alone, ``H`` (m, 15): by filterpy, in Joseph's form.
-
-        The error state is the filter's x = 0. It takes O(n^3), which a frame without visual updates can spare.
-        """
-        from filterpy.kalman import KalmanFilter  # with scipy.stats, half a second that few flights have to wait for
-
-        n = len(self.cov)
-        kalman = KalmanFilter(dim_x=n, dim_z=len(residual))
-        kalman.P = self.cov
-        kalman.update(residual[:, None], R=np.diag(variances), H=np.hstack([H, np.zeros((len(H), n - IMU))]))
-        self.cov = 0.5 * (kalman.P + kalman.P.T)
-        self._correct(kalman.x[:, 0])
-
     def _correct(self, dx: Float) -> None:
         self.R_WB = self.R_WB @ kernels.exp(dx[DTHETA])
         self.p_WB = self.p_WB + dx[DP]

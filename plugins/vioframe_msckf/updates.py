@@ -43,7 +43,7 @@ def hold_still(state: FilterState, imu: ImuSegment, noise: ImuNoise, first_estim
     if not still.agrees(residual, H, state.cov[:IMU, :IMU]):
         return False
     state.drift_biases(imu.duration_s, noise)
-    state.update_joseph(H, residual, still.sigma**2)
+    state.update(H, residual, slice(0, IMU), still.sigma**2)
     return True
 
 

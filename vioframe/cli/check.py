@@ -16,13 +16,13 @@ from rich.text import Text
 
 from vioframe.cli import EXIT_FAILED
 from vioframe.cli.common import FILE, Bar, PartName, calibration_option, cameras_option, print_table
+from vioframe.cores import limited_threads
 from vioframe.diagnosis import Certainty, Diagnosis, Finding, Severity, diagnose, gather
 from vioframe.diagnosis.images import wrong_size
 from vioframe.errors import ConfigError, DatasetError, ImageSizeError
 from vioframe.interfaces import Dataset, Source
 from vioframe.io.synchronise import played
 from vioframe.live.tape import Tape
-from vioframe.odometry import limited_threads
 from vioframe.parts import registry
 from vioframe.parts.options import did_you_mean
 from vioframe.parts.registry import (

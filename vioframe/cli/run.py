@@ -57,11 +57,10 @@ _MOST_REASONS = 4
     "[default: 50]",
 )
 @click.option(
-    "--threads",
+    "--cores",
     type=click.IntRange(1, 2),
-    help="With 2, points are followed while the frame before is estimated from, and the next ones are read; the "
-    "results are the same.  "
-    "[default: 2 where there are as many cores]",
+    help="With 2, another process follows points while the frame before is estimated from; the results are the same.  "
+    "[default: 2 where there are as many]",
 )
 @click.option("--out", type=FILE, help="Run folder.  [default: runs/DATASET_DETECTOR_BACKEND]")
 @click.option("--overwrite", is_flag=True, help="Replace the run that is in --out.")
@@ -75,7 +74,7 @@ _MOST_REASONS = 4
 @click.option("--save-view", type=FILE, metavar="FILE", help="Write what would be watched to FILE.rrd.")
 @quiet_option
 def run(
-    threads: int | None,
+    cores: int | None,
     out: Path | None,
     overwrite: bool,
     tape: Path | None,
@@ -101,7 +100,8 @@ def run(
     installed = registry.load()
     config = _configure(installed, **choices)
     with Bar(None, quiet=quiet, late=True) as bar, helped(config.backend.name):
-        experiment = prepare(config, installed, warm=overwrite, tape=tape)
+        pipelined = (cores or usable_cores()) > 1
+        experiment = prepare(config, installed, warm=overwrite, tape=tape, pipelined=pipelined)
         folder = out or free_run_folder(Path("runs"), experiment.name)
         told = _watched(bar, experiment)
         with _ended_by_signals(experiment.live), _viewer(experiment, view, save_view) as shown:
@@ -116,8 +116,6 @@ def run(
                 overwrite=overwrite,
                 on_step=on_step,
                 explain=True,
-                # Live, a frame that was read ahead would only be older.
-                pipelined=(threads or usable_cores()) > 1 and experiment.live is None,
             )
     if not quiet:
         if others := experiment.left_aside:

@@ -261,14 +261,14 @@ def load(found: Iterable[EntryPoint] | None = None) -> Registry:
     manager.add_hookspecs(hookspecs)
     every: list[Part] = []
     failures = []
-    chosen = entry_points(group=hookspecs.PROJECT) if found is None else found
+    chosen = entries() if found is None else found
     # One at a time: pluggy's own loader gives up on all of them at the first ImportError.
-    for origin, entry in sorted(((_origin(entry), entry) for entry in chosen), key=lambda pair: astuple(pair[0])):
+    for came_from, entry in sorted(((origin(entry), entry) for entry in chosen), key=lambda pair: astuple(pair[0])):
         try:
-            every += _parts_of(manager, origin, entry.load())
+            every += _parts_of(manager, came_from, entry.load())
         except Exception as error:
-            failures.append(Failure(origin, str(error) if isinstance(error, PluginError) else describe(error)))
-            _LOG.warning("plug-in %s (%s) is skipped: %s", origin.entry_point, origin, failures[-1].reason)
+            failures.append(Failure(came_from, str(error) if isinstance(error, PluginError) else describe(error)))
+            _LOG.warning("plug-in %s (%s) is skipped: %s", came_from.entry_point, came_from, failures[-1].reason)
     parts: dict[str, dict[str, Part]] = {kind.name: {} for kind in KINDS}
     clashes = []
     for (kind, name), named in _by_name(every).items():
@@ -355,7 +355,13 @@ def _is_interrupt(error: BaseException | None) -> bool:
     return False
 
 
-def _origin(entry: EntryPoint) -> Origin:
+def entries() -> Iterable[EntryPoint]:
+    """Of all plug-ins that are installed; none is imported for it."""
+    return entry_points(group=hookspecs.PROJECT)
+
+
+def origin(entry: EntryPoint) -> Origin:
+    """Where the plug-in of ``entry`` comes from."""
     name, version = (entry.dist.name, entry.dist.version) if entry.dist else ("unknown", "?")
     return Origin(entry.name, entry.module, name, version)
 

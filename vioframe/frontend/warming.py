@@ -1,0 +1,27 @@
+"""Compiled code of the front-end that is there before the first frame."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from vioframe.frontend import anchors, lucas_kanade
+from vioframe.frontend.tracker import Frontend
+from vioframe.types import NS_PER_S, Calibration, FrameSet, ImuSegment, g_W
+
+_FRAMES, _PERIOD_NS = 3, NS_PER_S // 10
+
+
+def warm_up(frontend: Frontend, calibration: Calibration) -> None:
+    """Come once through all that is compiled for following points, or load it; ``frontend`` is of no use afterwards.
+
+    A few images at rest are looked at, for detectors compile and load what they need as they see the first of them.
+    """
+    lucas_kanade.warm_up()
+    anchors.warm_up()
+    rng = np.random.default_rng(0)
+    sizes = [camera.model.resolution for camera in calibration.cameras]
+    images = tuple(cv2.blur(rng.integers(0, 256, (h, w), np.uint8), (5, 5)).astype(np.uint8) for w, h in sizes)
+    for k in range(_FRAMES):
+        t_ns = np.array([k - 1, k]) * _PERIOD_NS
+        frontend.track(ImuSegment(t_ns, np.zeros((2, 3)), np.tile(-g_W, (2, 1))), FrameSet(k, images), calibration)
