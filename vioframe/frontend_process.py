@@ -2,55 +2,57 @@
 
 Not in a thread: the two halves of the work are short compiled loops with Python between them, and threads would wait
 for the interpreter's lock many times a frame. Images go through memory that both see, the rest through pipes; what
-comes back is what :class:`~vioframe.frontend.Frontend` gives, to the last bit.
+comes back is what :class:`~vioframe.frontend.Frontend` gives, to the last bit. This is the side of whoever estimates,
+:mod:`vioframe.frontend_worker` the other one.
+
+Little is imported here: the other process is to be begun before this one loads what it needs itself.
 """
 
 from __future__ import annotations
 
-import logging
 import os
 import pickle
-import signal
 import subprocess
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from mmap import mmap
-from queue import SimpleQueue
 from tempfile import TemporaryFile
-from threading import Thread
-from traceback import format_exc
-from typing import IO, Any
+from typing import IO, TYPE_CHECKING, Any, Self
 from weakref import finalize
 
 import numpy as np
+from numpy.typing import NDArray
 
-from vioframe.cores import limited_threads, usable_cores
 from vioframe.errors import RunError, VioframeError
-from vioframe.frontend import Frontend, FrontendOptions, warming
 from vioframe.incidents import Incidents
-from vioframe.parts import registry
 from vioframe.types import Calibration, FrameSet, FrameTracks, Image, ImuSegment
+
+if TYPE_CHECKING:
+    from vioframe.frontend import FrontendOptions
+    from vioframe.parts.registry import Origin, Part
 
 # Frames whose images lie in memory at once: one that is being taken from there, one that waits, one that is being put.
 _SLOTS = 3
+# Images come and go with every frame. glibc would give their memory back each time, and have it filled with zeros anew.
+_KEPT_MEMORY = {"MALLOC_TOP_PAD_": str(64 << 20)}
 
 
 @dataclass(frozen=True, slots=True)
-class _Setup:
-    origin: registry.Origin
-    name: str
+class Setup:
+    """What the other process needs to know ahead of the first frame; ``detector`` is called so by its plug-in."""
+
+    origin: Origin
+    detector: str
     detector_options: Mapping[str, Any]
     calibration: Calibration
     options: FrontendOptions
     warm: bool
-    memory: int
-    """The descriptor of a file that :class:`_Images` are in."""
 
 
 @dataclass(frozen=True, slots=True)
-class _Job:
+class Job:
     """A frame to follow points to; lenses are those of ``lenses``, the cameras' poses those of ``calibration``."""
 
     imu: ImuSegment
@@ -60,33 +62,45 @@ class _Job:
     lenses: Calibration
 
 
+Incident = tuple[str, int | None, str]
+"""What :meth:`vioframe.incidents.Incidents.add` takes."""
+
+
 @dataclass(frozen=True, slots=True)
-class _Done:
+class Done:
+    """What has come of a frame, or of the set-up, of which there are no tracks."""
+
     tracks: FrameTracks
     stage_seconds: dict[str, float]
-    incidents: list[tuple[str, int | None, str]]
+    incidents: list[Incident]
 
 
 @dataclass(frozen=True, slots=True)
-class _Failed:
+class Failed:
     """By an ``error`` that is told to users, or one that is a bug, with its ``trace``."""
 
     error: VioframeError | MemoryError | None
     trace: str
+    incidents: list[Incident]
 
 
-class _Images:
-    """Images of a rig's cameras in memory that two processes see, a few frames in turn."""
+class Images:
+    """Images of a rig's cameras in ``memory`` (B,) bytes that two processes see, a few frames in turn."""
 
-    def __init__(self, memory: int, calibration: Calibration) -> None:
+    def __init__(self, memory: NDArray[np.uint8], calibration: Calibration) -> None:
+        self._memory = memory
         self._shapes = [camera.model.resolution[::-1] for camera in calibration.cameras]
         sizes = [height * width for height, width in self._shapes]
-        self._begins = np.cumsum([0, *sizes[:-1]])
-        self._frame_bytes = sum(sizes)
-        if os.fstat(memory).st_size == 0:
-            os.truncate(memory, _SLOTS * self._frame_bytes)
-        self._memory = np.frombuffer(mmap(memory, _SLOTS * self._frame_bytes), np.uint8)
+        self._begins, self._frame_bytes = np.cumsum([0, *sizes[:-1]]), sum(sizes)
         self._slot = 0
+
+    @classmethod
+    def in_file(cls, descriptor: int, calibration: Calibration) -> Images:
+        """In an open file, which is made as long as need be."""
+        widths_heights = [camera.model.resolution for camera in calibration.cameras]
+        size = _SLOTS * sum(width * height for width, height in widths_heights)
+        os.truncate(descriptor, size)
+        return cls(np.frombuffer(mmap(descriptor, size), np.uint8), calibration)
 
     def put(self, images: tuple[Image | None, ...]) -> tuple[Image | int | None, ...]:
         """Where each image now is; itself, if it is none or not as calibrated, which the front-end will refuse."""
@@ -115,38 +129,49 @@ class _Images:
 class FrontendProcess:
     """Does what :class:`~vioframe.frontend.Frontend` does, with a detector made there of an installed part.
 
-    It gets ready beside whoever made it. Between :meth:`begin` and :meth:`end` a frame is followed meanwhile.
+    It begins to load at once, and needs :meth:`set_up` ahead of the first frame. Between :meth:`begin` and :meth:`end`
+    a frame is followed meanwhile.
     """
 
-    def __init__(
+    def __init__(self) -> None:
+        self._memory = _file_in_memory()
+        descriptor = self._memory.fileno()
+        # The same modules are to be found there, whatever has been done to the path here.
+        begin = f"from vioframe.frontend_worker import serve; serve({descriptor})"
+        self._process = subprocess.Popen(
+            [sys.executable, "-c", f"import sys; sys.path[:] = {sys.path!r}; {begin}"],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            pass_fds=[descriptor],
+            env={**os.environ, **_KEPT_MEMORY},
+        )
+        self._end = finalize(self, _end, self._process)
+        self._is_ready = False
+        self.stage_seconds: Mapping[str, float] = {}
+        """Seconds that the last frame took, by stage."""
+
+    def set_up(
         self,
-        detector: registry.Part,
+        detector: Part,
         detector_options: Mapping[str, Any],
         calibration: Calibration,
         options: FrontendOptions,
         incidents: Incidents,
         *,
-        warm: bool = False,
+        warm: bool,
     ) -> None:
-        # The same modules are to be found there, whatever has been done to the path here.
-        code = f"import sys; sys.path[:] = {sys.path!r}; from vioframe.frontend_process import serve; serve()"
-        with TemporaryFile(prefix="vioframe-") as memory:  # which stays as long as it is mapped
-            self._images = _Images(memory.fileno(), calibration)
-            self._process = subprocess.Popen(
-                [sys.executable, "-c", code],
-                stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE,
-                pass_fds=[memory.fileno()],
-            )
-            self._end = finalize(self, _end, self._process)
-            name = detector.name.partition("@")[0]
-            setup = _Setup(detector.origin, name, detector_options, calibration, options, warm, memory.fileno())
-        self._incidents = incidents
-        self._lenses = calibration
-        self.stage_seconds: Mapping[str, float] = {}
-        """Seconds that the last frame took, by stage."""
-        self._send(setup)
-        self._is_ready = False
+        """Make the front-end there; what goes wrong in that is raised with the first frame.
+
+        ``warm``, it has looked at some images before.
+        """
+        self._incidents, self._lenses = incidents, calibration
+        try:
+            self._images = Images.in_file(self._memory.fileno(), calibration)
+        except OSError as error:
+            what = f"no memory for the images that two processes share: {error.strerror}"
+            raise RunError(f"{what}; --cores 1 does with one process") from error
+        name = detector.name.partition("@")[0]
+        self._send(Setup(detector.origin, name, detector_options, calibration, options, warm))
 
     def prepare(self, frames: FrameSet) -> None:
         """Nothing that it would be worth to send a frame twice for."""
@@ -163,37 +188,43 @@ class FrontendProcess:
     def begin(self, imu: ImuSegment, frames: FrameSet, calibration: Calibration) -> None:
         """Have points followed to ``frames`` when those begun before are through, each of which has its :meth:`end`."""
         self._wait_until_ready()
-        self._send(_Job(imu, frames.t_ns, self._images.put(frames.images), calibration, self._lenses))
+        self._send(Job(imu, frames.t_ns, self._images.put(frames.images), calibration, self._lenses))
 
     def end(self) -> FrameTracks:
         """The tracks of what was begun first of all that has not ended; raises what following them raised."""
-        done: _Done = self._receive()
+        done = self._receive()
         self.stage_seconds = done.stage_seconds
-        for incident in done.incidents:
-            self._incidents.add(*incident)
         return done.tracks
 
     def close(self) -> None:
         """End the process, whatever it does."""
         self._end()
 
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
     def _wait_until_ready(self) -> None:
         if not self._is_ready:
             self._receive()
             self._is_ready = True
 
-    def _send(self, message: _Setup | _Job) -> None:
+    def _send(self, message: Setup | Job) -> None:
         try:
-            _put(message, self._process.stdin)
+            put(message, self._process.stdin)
         except (OSError, ValueError) as error:  # it has gone, or was closed
             raise self._gone() from error
 
-    def _receive(self) -> Any:
+    def _receive(self) -> Done:
         try:
-            answer = pickle.load(self._process.stdout)  # type: ignore[arg-type]
+            answer: Done | Failed = pickle.load(self._process.stdout)  # type: ignore[arg-type]
         except (EOFError, ValueError, pickle.UnpicklingError) as error:
             raise self._gone() from error
-        if not isinstance(answer, _Failed):
+        for incident in answer.incidents:
+            self._incidents.add(*incident)
+        if isinstance(answer, Done):
             return answer
         self.close()
         if answer.error is not None:
@@ -209,6 +240,13 @@ class FrontendProcess:
         )
 
 
+def _file_in_memory() -> IO[bytes]:
+    """One without a name; where the system has none, one on disk that has lost its name."""
+    if hasattr(os, "memfd_create"):
+        return os.fdopen(os.memfd_create("vioframe-images"), "r+b")
+    return TemporaryFile(prefix="vioframe-images-")
+
+
 def _end(process: subprocess.Popen[bytes]) -> None:
     process.kill()
     for pipe in (process.stdin, process.stdout):
@@ -217,76 +255,8 @@ def _end(process: subprocess.Popen[bytes]) -> None:
     process.wait()
 
 
-def _put(message: object, pipe: IO[bytes] | None) -> None:
+def put(message: object, pipe: IO[bytes] | None) -> None:
+    """Send it at once."""
     assert pipe is not None
     pickle.dump(message, pipe, pickle.HIGHEST_PROTOCOL)
     pipe.flush()
-
-
-@dataclass
-class _Noted(Incidents):
-    """What is to be told of this frame."""
-
-    new: list[tuple[str, int | None, str]] = field(default_factory=list)
-
-    def add(self, kind: str, t_ns: int | None = None, detail: str = "") -> None:
-        self.new.append((kind, t_ns, detail))
-
-    def taken(self) -> list[tuple[str, int | None, str]]:
-        new, self.new = self.new, []
-        return new
-
-
-def serve() -> None:
-    """The process: one :class:`_Setup` comes in, then a :class:`_Job` a frame, until the pipe ends."""
-    # Signals, and a plug-in that does not load, reach every process of a group; one that says so is enough.
-    for each in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(each, signal.SIG_IGN)
-    logging.getLogger("vioframe").addHandler(logging.NullHandler())
-    source, answers = sys.stdin.buffer, os.fdopen(os.dup(1), "wb")
-    os.dup2(2, 1)  # a detector, which is anybody's code, may print
-    with suppress(EOFError, BrokenPipeError):
-        try:
-            with limited_threads(opencv=usable_cores() - 1):
-                _follow(pickle.load(source), source, answers)
-        except EOFError:
-            raise
-        except Exception as error:
-            told = error if isinstance(error, VioframeError | MemoryError) else None
-            _put(_Failed(told, format_exc()), answers)
-
-
-def _follow(setup: _Setup, source: IO[bytes], answers: IO[bytes]) -> None:
-    # That one alone, under its own name: what others are called is no matter here.
-    installed = registry.load(entry for entry in registry.entries() if registry.origin(entry) == setup.origin)
-    incidents, images = _Noted(), _Images(setup.memory, setup.calibration)
-    with installed.blaming():
-
-        def frontend(told: Incidents) -> Frontend:
-            detector = installed.create_detector(setup.name, setup.detector_options)
-            return Frontend(detector, setup.calibration, setup.options, told)
-
-        if setup.warm:
-            warming.warm_up(frontend(Incidents()), setup.calibration)
-        follower = frontend(incidents)
-        _put(_Done(FrameTracks.none(0), {}, []), answers)
-        for job in _ahead(source):
-            follower.recalibrate(job.lenses)
-            frames = FrameSet(job.t_ns, images.taken(job.places))
-            tracks = follower.track(job.imu, frames, job.calibration)
-            _put(_Done(tracks, follower.stage_seconds, incidents.taken()), answers)
-
-
-def _ahead(source: IO[bytes]) -> Iterator[_Job]:
-    """Jobs as they come, the next one read meanwhile: whoever sends it never waits for this process to take it."""
-    jobs: SimpleQueue[_Job | None] = SimpleQueue()
-
-    def read() -> None:
-        with suppress(EOFError):
-            while True:
-                jobs.put(pickle.load(source))
-        jobs.put(None)
-
-    Thread(target=read, name="jobs", daemon=True).start()
-    while (job := jobs.get()) is not None:
-        yield job

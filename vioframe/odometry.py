@@ -74,6 +74,7 @@ class Odometry:
 
     ``pipelined``, the front-end has a process of its own, so that :meth:`follow` has the points of a frame followed
     while the one before it is estimated from: the same bytes, sooner where there are two cores. Its detector is named.
+    One that is given has begun to load already.
 
     ``incidents`` counts what was handled on the way: dropped samples, unusable images, failing detectors.
     """
@@ -93,7 +94,7 @@ class Odometry:
         initial_state: NavState | None = None,
         wait_ms: float = 50.0,
         warm: bool = True,
-        pipelined: bool = False,
+        pipelined: FrontendProcess | bool = False,
         incidents: Incidents | None = None,
         installed: Registry | None = None,
     ) -> None:
@@ -106,7 +107,8 @@ class Odometry:
                 raise ConfigError("pipelined, the front-end has a process of its own: name an installed detector")
             part = self._registry.find(registry.DETECTOR, detector)
             complete = part.validate(detector_options or {})
-            self._frontend = FrontendProcess(part, complete, calibration, options, self.incidents, warm=warm)
+            self._frontend = FrontendProcess() if pipelined is True else pipelined
+            self._frontend.set_up(part, complete, calibration, options, self.incidents, warm=warm)
         else:
             if isinstance(detector, str):
                 detector = self._registry.create_detector(detector, detector_options)

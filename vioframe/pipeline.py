@@ -17,6 +17,7 @@ from vioframe.cores import limited_threads
 from vioframe.diagnosis import HOPELESS, Certainty, Diagnosis, Gatherer, diagnose, gather
 from vioframe.diagnosis.stamps import span_s
 from vioframe.errors import DatasetError, RunError
+from vioframe.frontend_process import FrontendProcess
 from vioframe.geometry.trajectory import Trajectory
 from vioframe.incidents import Incidents
 from vioframe.interfaces import Dataset, Source
@@ -70,7 +71,8 @@ class Experiment:
     registry: Registry
     dataset: Dataset
     odometry: Odometry
-    ground_truth: Trajectory | None
+    given_truth: Trajectory | None
+    """That of a file of its own, which counts before the data set's."""
     gatherer: Gatherer
     left_aside: tuple[str, ...] = ()
     """Cameras of the rig that are not used."""
@@ -81,6 +83,11 @@ class Experiment:
     def live(self) -> Live | None:
         """The data set, where it is a live source: then it is not run a second time, and can be told to stop."""
         return self.dataset if isinstance(self.dataset, Live) else None
+
+    @property
+    def ground_truth(self) -> Trajectory | None:
+        """Read when it is asked for, as a bag is gone through for it."""
+        return self.dataset.ground_truth if self.given_truth is None else self.given_truth
 
     @property
     def name(self) -> str:
@@ -118,7 +125,12 @@ class Experiment:
 
 
 def prepare(
-    config: Config, registry: Registry, *, warm: bool = False, tape: Path | None = None, pipelined: bool = False
+    config: Config,
+    registry: Registry,
+    *,
+    warm: bool = False,
+    tape: Path | None = None,
+    pipelined: FrontendProcess | bool = False,
 ) -> Experiment:
     """Check the whole of ``config``, then open the data set and create the parts.
 
@@ -152,7 +164,7 @@ def prepare(
         estimation=config.estimation_options,
         wait_ms=config.wait_ms,
         warm=warm or live,
-        pipelined=pipelined and not live,
+        pipelined=not live and pipelined,
         installed=registry,
     )
     return Experiment(
@@ -160,7 +172,7 @@ def prepare(
         registry,
         dataset,
         odometry,
-        dataset.ground_truth if config.ground_truth is None else load_trajectory(config.ground_truth),
+        None if config.ground_truth is None else load_trajectory(config.ground_truth),
         Gatherer(dataset.calibration, _LOOK_EVERY, _LOOK_S),
         left_aside,
         tape,
@@ -241,8 +253,8 @@ def _write(
     (folder / "config.yaml").write_text(configuration.render(config, registry), encoding="utf-8")
     write_json(folder / "machine.json", machine.describe())
     write_calibration(experiment.dataset.calibration, folder / "calibration")
-    if experiment.ground_truth is not None:
-        write_tum(experiment.ground_truth, folder / "ground_truth.tum")
+    if (truth := experiment.ground_truth) is not None:
+        write_tum(truth, folder / "ground_truth.tum")
     with Recorder(folder, _about(experiment), experiment.incidents, begin_s) as recorder:
         try:
             for step in steps:

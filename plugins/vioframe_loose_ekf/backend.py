@@ -11,7 +11,7 @@ import numpy as np
 from vioframe.estimation.inertial.noise import noise_over
 from vioframe.estimation.inertial.preintegration import join_segments
 from vioframe.geometry import so3
-from vioframe.quantiles import chi2_quantile
+from vioframe.quantiles import gate
 from vioframe.stopwatch import Stopwatch
 from vioframe.types import Estimate, Float, FrameTracks, ImuSegment, Start, Status
 from vioframe_loose_ekf.fusion import Fusion
@@ -20,7 +20,7 @@ from vioframe_loose_ekf.options import LooseEkfOptions
 from vioframe_loose_ekf.state import VisionPose
 
 # A pose of the odometry beyond this quantile is left out.
-_GATE = float(chi2_quantile(0.99, 6))
+_GATE_QUANTILE = 0.99
 # Drift of the vision frame from one keyframe to the next: scale, relative; orientation, rad; position by the distance
 # between them. Measured on EuRoC's flights and simulated ones.
 _DRIFT_SCALE, _DRIFT_ROTATION, _DRIFT_POSITION = 0.003, float(np.deg2rad(0.03)), 0.01
@@ -115,7 +115,7 @@ class LooseEkf:
             fusion.move_anchor(pose.p_VC, _drift_over(pose.p_VC - fusion.state.p_VA))
 
         noise = self._options.vision_noise_factor**2 * sighting.placement.cov
-        if fusion.update_pose(pose, noise, _GATE):
+        if fusion.update_pose(pose, noise, gate(_GATE_QUANTILE, 6)):
             self._fitting_ns = tracks.t_ns
             return True, ()
         if (tracks.t_ns - self._fitting_ns) * 1e-9 < _CONTRADICTED_S:

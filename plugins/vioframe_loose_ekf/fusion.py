@@ -15,7 +15,7 @@ from filterpy.kalman import ExtendedKalmanFilter
 
 from vioframe.errors import DivergedError
 from vioframe.estimation.inertial.propagation import propagate
-from vioframe.estimation.standstill import STANDSTILL_GATE, Standstill
+from vioframe.estimation.standstill import Standstill, standstill_gate
 from vioframe.geometry import so3
 from vioframe.types import DBA, DBG, DP, DTHETA, CameraOnBody, Float, ImuNoise, ImuSegment, NavState
 from vioframe_loose_ekf.state import DP_WA, DTHETA_WV, IMU, LOG_SCALE, SIZE, FilterState, VisionPose
@@ -132,7 +132,7 @@ class Fusion:
         residual = still.residual(s.R_WB, s.v_WB, s.bias_gyro_B, s.bias_accel_B)
         H = np.zeros((9, SIZE))
         H[:, :IMU] = still.jacobian(s.R_WB)
-        if not self._update(residual, H, np.diag(still.sigma**2), STANDSTILL_GATE):
+        if not self._update(residual, H, np.diag(still.sigma**2), standstill_gate()):
             return False
         Q = np.zeros((SIZE, SIZE))
         Q[DBG, DBG] = noise.gyro_walk**2 * imu.duration_s * np.eye(3)

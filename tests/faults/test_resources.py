@@ -37,12 +37,19 @@ def limited(kind: int, most: int) -> Iterator[None]:
 
 def test_a_full_disk_is_one_line_and_keeps_what_was_written(here):
     with limited(resource.RLIMIT_FSIZE, 65536):
-        line = error_line(*RUN)
+        line = error_line(*RUN, "--cores", 1)
     assert line == "vioframe: error: cannot write to out: File too large; is the disk full?\n"
     run = RunFolder.open("out")
     assert run.summary["finished"] is False
     assert 0 < len(run.trajectory()) < 10 * DURATION_S
     assert vioframe_("evaluate", "out", "--ground-truth", "truth.tum").exit_code == 0
+
+
+def test_no_memory_for_images_is_one_line_with_a_remedy(here):
+    with limited(resource.RLIMIT_FSIZE, 65536):
+        line = error_line(*RUN, "--cores", 2)
+    assert "no memory for the images that two processes share: File too large; --cores 1" in line
+    assert not Path("out").exists()
 
 
 @pytest.mark.parametrize("name", ["copy", "copy.bag", "copy.ros2", "copy.mcap"])
@@ -120,7 +127,7 @@ def test_memory_that_runs_out_is_one_line(here, monkeypatch):
     def ask(*_: object, **__: object) -> None:
         bytearray(2**62)
 
-    monkeypatch.setattr("vioframe.cli.run.prepare", ask)
+    monkeypatch.setattr("vioframe.pipeline.prepare", ask)
     assert error_line(*RUN) == "vioframe: error: out of memory; give it less at a time, or a larger machine\n"
 
 

@@ -1,33 +1,32 @@
-"""``vioframe run``: from a recording to a run folder, with a progress bar."""
+"""``vioframe run``: from a recording to a run folder, with a progress bar.
+
+What takes long to import is imported where it is needed, when the front-end's process loads already.
+"""
 
 from __future__ import annotations
 
 import signal
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from math import inf
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from vioframe.cli import EXIT_FAILED
 from vioframe.cli.common import FILE, Bar, PartName, calibration_option, cameras_option, print_notes, quiet_option
 from vioframe.cores import usable_cores
-from vioframe.diagnosis import Severity
 from vioframe.errors import DatasetError, TrajectoryError
-from vioframe.evaluation import evaluate
-from vioframe.geometry.trajectory import Trajectory
-from vioframe.live import Live
-from vioframe.parts import config as configuration
-from vioframe.parts import registry
-from vioframe.parts.config import Config
-from vioframe.pipeline import Experiment, prepare, record
-from vioframe.report.units import length
-from vioframe.runs.folder import RunFolder
-from vioframe.runs.recorder import check_run_folder, free_run_folder
+from vioframe.frontend_process import FrontendProcess
 from vioframe.types import NS_PER_S, Step
-from vioframe.warming import helped
+
+if TYPE_CHECKING:
+    from vioframe.geometry.trajectory import Trajectory
+    from vioframe.live import Live
+    from vioframe.parts.config import Config
+    from vioframe.parts.registry import Registry
+    from vioframe.pipeline import Experiment
 
 _MOST_REASONS = 4
 
@@ -95,28 +94,11 @@ def run(
     """
     if view and save_view is not None:
         raise click.UsageError("--view opens a window and --save-view writes a file; choose one")
-    if out is not None:
-        check_run_folder(out, overwrite=overwrite)
-    installed = registry.load()
-    config = _configure(installed, **choices)
-    with Bar(None, quiet=quiet, late=True) as bar, helped(config.backend.name):
-        pipelined = (cores or usable_cores()) > 1
-        experiment = prepare(config, installed, warm=overwrite, tape=tape, pipelined=pipelined)
-        folder = out or free_run_folder(Path("runs"), experiment.name)
-        told = _watched(bar, experiment)
-        with _ended_by_signals(experiment.live), _viewer(experiment, view, save_view) as shown:
-
-            def on_step(step: Step) -> None:
-                shown(step)
-                told(step)
-
-            summary = record(
-                experiment,
-                folder,
-                overwrite=overwrite,
-                on_step=on_step,
-                explain=True,
-            )
+    with ExitStack() as within:
+        pipelined: FrontendProcess | bool = False
+        if (cores or usable_cores()) > 1:
+            pipelined = within.enter_context(FrontendProcess())
+        summary, experiment, folder = _run(pipelined, out, overwrite, tape, view, save_view, quiet, choices)
     if not quiet:
         if others := experiment.left_aside:
             used = experiment.dataset.calibration.cameras[0].name
@@ -127,10 +109,46 @@ def run(
         click.get_current_context().exit(EXIT_FAILED)
 
 
+def _run(
+    pipelined: FrontendProcess | bool,
+    out: Path | None,
+    overwrite: bool,
+    tape: Path | None,
+    view: bool,
+    save_view: Path | None,
+    quiet: bool,
+    choices: dict[str, Any],
+) -> tuple[dict[str, Any], Experiment, Path]:
+    """The summary of a run, of what, and where it is."""
+    from vioframe.parts import registry
+    from vioframe.pipeline import prepare, record
+    from vioframe.runs.recorder import check_run_folder, free_run_folder
+    from vioframe.warming import helped
+
+    if out is not None:
+        check_run_folder(out, overwrite=overwrite)
+    installed = registry.load()
+    config = _configure(installed, **choices)
+    with Bar(None, quiet=quiet, late=True) as bar, helped(config.backend.name):
+        experiment = prepare(config, installed, warm=overwrite, tape=tape, pipelined=pipelined)
+        folder = out or free_run_folder(Path("runs"), experiment.name)
+        told = _watched(bar, experiment)
+        with _ended_by_signals(experiment.live), _viewer(experiment, view, save_view) as shown:
+
+            def on_step(step: Step) -> None:
+                shown(step)
+                told(step)
+
+            return record(experiment, folder, overwrite=overwrite, on_step=on_step, explain=True), experiment, folder
+
+
 def _configure(
-    installed: registry.Registry, file: Path | None, data: Path | None, options: tuple[str, ...], **chosen: Any
+    installed: Registry, file: Path | None, data: Path | None, options: tuple[str, ...], **chosen: Any
 ) -> Config:
     """The configuration file, if any, with the command line's choices over it."""
+    from vioframe.parts import config as configuration
+    from vioframe.parts.config import Config
+
     tree = (Config() if file is None else configuration.read(file)).model_dump()
     for section in ("detector", "backend", "loop_closure"):
         if (name := chosen[section]) is not None and (tree[section] is None or name != tree[section]["name"]):
@@ -233,6 +251,9 @@ def _likeliest_cause(summary: dict[str, Any]) -> str:
 
 def _report(folder: Path, summary: dict[str, Any]) -> None:
     """A few lines on how it went, and what to do next."""
+    from vioframe.diagnosis import Severity
+    from vioframe.runs.folder import RunFolder
+
     if summary["initialised_t_ns"] is None:
         went = "never initialised"
     else:
@@ -265,6 +286,9 @@ def _report(folder: Path, summary: dict[str, Any]) -> None:
 
 
 def _accuracy(estimate: Trajectory, truth: Trajectory) -> str:
+    from vioframe.evaluation import evaluate
+    from vioframe.report.units import length
+
     try:
         errors = evaluate(estimate, truth)
     except TrajectoryError as error:

@@ -12,11 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from vioframe.geometry import so3
-from vioframe.quantiles import chi2_quantile
+from vioframe.quantiles import gate
 from vioframe.types import DBA, DBG, DTHETA, DV, NS_PER_S, Float, FrameTracks, ImuNoise, ImuSegment, g_W
 
-STANDSTILL_GATE = float(chi2_quantile(0.95, 9))
-"""Squared Mahalanobis distance below which the readings agree with standstill."""
 _MIN_COMMON_TRACKS = 10
 _LOOK_BACK_NS = NS_PER_S // 2
 SETTLED_NS = NS_PER_S // 6
@@ -26,6 +24,11 @@ leave a body that is shaken at rest without corrections for longer."""
 _VELOCITY_SIGMA_M_S = 0.01
 # A body that stands still may yet shake, so its readings scatter this many times more than the sensor's noise.
 _SHAKING = 10.0
+
+
+def standstill_gate() -> float:
+    """Squared Mahalanobis distance, of nine degrees of freedom, below which the readings agree with standstill."""
+    return gate(0.95, 9)
 
 
 class StandstillDetector:
@@ -105,4 +108,4 @@ class Standstill:
     def agrees(self, residual: Float, H: Float, cov: Float) -> bool:
         """Whether the readings bear standstill out, by ``residual`` (9,) and ``H`` (9, 15) of a state with ``cov``."""
         S = H @ cov @ H.T + np.diag(self.sigma**2)
-        return bool(residual @ np.linalg.solve(S, residual) <= STANDSTILL_GATE)
+        return bool(residual @ np.linalg.solve(S, residual) <= standstill_gate())
