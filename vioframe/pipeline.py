@@ -216,9 +216,10 @@ def record(
     first = next(steps, None)
     if first is None:
         raise DatasetError(f"{experiment.dataset.name} has no image to process: {_why_none(experiment)}")
+    taken_s = working_s() - begin_s
     new_run_folder(folder, overwrite=overwrite)
     try:
-        return _write(experiment, folder, chain([first], steps), begin_s, on_step, explain)
+        return _write(experiment, folder, chain([first], steps), taken_s, on_step, explain)
     except OSError as error:
         raise RunError(f"cannot write to {folder}: {error.strerror}; is the disk full?") from error
 
@@ -245,7 +246,7 @@ def _write(
     experiment: Experiment,
     folder: Path,
     steps: Iterable[Step],
-    begin_s: float,
+    taken_s: float,
     on_step: Callable[[Step], None],
     explain: bool,
 ) -> dict[str, Any]:
@@ -255,7 +256,8 @@ def _write(
     write_calibration(experiment.dataset.calibration, folder / "calibration")
     if (truth := experiment.ground_truth) is not None:
         write_tum(truth, folder / "ground_truth.tum")
-    with Recorder(folder, _about(experiment), experiment.incidents, begin_s) as recorder:
+    # The clock stood still meanwhile: no frame was under way.
+    with Recorder(folder, _about(experiment), experiment.incidents, working_s() - taken_s) as recorder:
         try:
             for step in steps:
                 between = () if live is None else live.estimated(step)
