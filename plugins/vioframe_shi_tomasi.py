@@ -18,6 +18,7 @@ from vioframe.types import Image, Keypoints
 
 # Gradients as Sobel's filter sums them, over the 3 x 3 pixels about each, in terms of grey levels from 0 to 1.
 _SCALE = np.float32((1.0 / (4.0 * 3.0 * 255.0)) ** 2)
+_HALF, _LOWER_HALF = np.uint64(32), np.uint64(0xFFFFFFFF)
 
 
 class ShiTomasi:
@@ -39,12 +40,13 @@ class ShiTomasi:
         if min(image.shape) < 3:
             return Keypoints(np.empty((0, 2), np.float32), np.empty(0, np.float32))
         eigenvalue = _least_eigenvalue(*(np.asarray(d, np.int16) for d in cv2.spatialGradient(image)))
-        highest_near = np.asarray(cv2.dilate(eigenvalue, None))
-        least = eigenvalue.max() * self._quality_level
-        rows, columns = np.divmod(np.flatnonzero((eigenvalue == highest_near) & (eigenvalue > least)), image.shape[1])
-        score = eigenvalue[rows, columns]
-        order = np.argsort(-score, kind="stable")
-        xy = np.column_stack([columns[order], rows[order]]).astype(np.float32)
+        peaks = _peaks(eigenvalue, eigenvalue.max() * np.float32(self._quality_level))
+        score = eigenvalue.ravel()[peaks]
+        # Strongest first, of equal ones the first: positive floats are in the order of their bits.
+        order = np.sort((~score.view(np.uint32)).astype(np.uint64) << _HALF | np.arange(len(peaks), dtype=np.uint64))
+        order &= _LOWER_HALF
+        rows, columns = np.divmod(peaks[order], image.shape[1])
+        xy = np.column_stack([columns, rows]).astype(np.float32)
         taken = distinct(xy, self._min_distance_px, max_points)
         return Keypoints(xy[taken], score[order[taken]])
 
@@ -71,6 +73,27 @@ def _least_eigenvalue(dx: NDArray[np.int16], dy: NDArray[np.int16]) -> NDArray[n
             c = np.float32(0.5) * (yy[k] + yy[m] + yy[n])
             out[r, m] = _SCALE * (a + c - np.sqrt((a - c) * (a - c) + b * b))
     return out
+
+
+@kernel
+def _peaks(eigenvalue: NDArray[np.float32], least: float) -> NDArray[np.int64]:
+    """Places in the flattened image that are higher than ``least``, and than none of the eight about them is."""
+    height, width = np.uint64(eigenvalue.shape[0]), np.uint64(eigenvalue.shape[1])
+    one, two = np.uint64(1), np.uint64(2)
+    out, n = np.empty(eigenvalue.size // 4 + 1, np.int64), 0
+    is_peak = np.zeros(width, np.uint8)
+    for r in range(one, height - one):
+        above, here, below = eigenvalue[r - one], eigenvalue[r], eigenvalue[r + one]
+        for c in range(width - two):  # without a branch: several at once
+            highest = max(least, max(above[c], above[c + one], above[c + two]))
+            highest = max(highest, here[c], here[c + two], below[c], below[c + one], below[c + two])
+            v = here[c + one]
+            is_peak[c + one] = (v >= highest) & (v > least)
+        for c in range(one, width - one):
+            if is_peak[c]:
+                out[n] = r * width + c
+                n += 1
+    return out[:n]
 
 
 @hookimpl

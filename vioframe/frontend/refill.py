@@ -3,24 +3,26 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-from vioframe.types import Float, Int
+from vioframe.jit import kernel
+from vioframe.types import Bool, Float, Int
 
 # Rows and columns of the grid whose emptiest cells are refilled first: cells of some 90 px on EuRoC's images.
 GRID = (6, 8)
 
 
-def thin(xy: Float, ids: Int, min_distance_px: float) -> NDArray[np.bool_]:
+@kernel
+def thin(xy: Float, ids: Int, min_distance_px: float) -> Bool:
     """(N,) which tracks stay when of any two closer than ``min_distance_px`` the younger (larger id) goes."""
+    keep = np.ones(len(xy), np.bool_)
     order = np.argsort(ids)
-    close = np.tril(_squared_distances(xy[order], xy[order]) < min_distance_px**2, -1)
-    keep = np.ones(len(xy), bool)
-    for younger in np.flatnonzero(close.any(axis=1)):
-        keep[younger] = not np.any(close[younger] & keep)
-    out = np.empty(len(xy), bool)
-    out[order] = keep
-    return out
+    for n in range(len(order)):
+        younger = order[n]
+        for m in range(n):
+            if keep[order[m]] and _are_close(xy[younger], xy[order[m]], min_distance_px):
+                keep[younger] = False
+                break
+    return keep
 
 
 def spread(
@@ -44,23 +46,38 @@ def spread(
         row = np.clip(xy[:, 1] * rows / size[1], 0, rows - 1).astype(np.int64)
         return row * columns + column
 
-    limit = min_distance_px**2
-    free = ~(_squared_distances(candidates, live) < limit).any(axis=1)
-    cells = cell(candidates)
     population = np.bincount(cell(live), minlength=rows * columns)
-    taken: list[int] = []
-    while len(taken) < count and free.any():
-        remaining = np.flatnonzero(free)
-        # argmin takes the first of equals, and candidates are sorted: the strongest of the emptiest cells.
-        best = remaining[np.argmin(population[cells[remaining]])]
-        taken.append(int(best))
+    return _spread(candidates, cell(candidates), live, population, count, min_distance_px)
+
+
+@kernel
+def _spread(candidates: Float, cells: Int, live: Float, population: Int, count: int, min_distance_px: float) -> Int:
+    """The same, with the cell of each candidate (N,), and how many points each cell holds, which grows."""
+    free = np.ones(len(candidates), np.bool_)
+    for n in range(len(candidates)):
+        for m in range(len(live)):
+            if _are_close(candidates[n], live[m], min_distance_px):
+                free[n] = False
+                break
+    taken = np.empty(max(count, 0), np.int64)
+    for k in range(count):
+        best = -1
+        for n in range(len(candidates)):
+            if free[n] and (best < 0 or population[cells[n]] < population[cells[best]]):
+                best = n
+        if best < 0:
+            return taken[:k]
+        taken[k] = best
         population[cells[best]] += 1
-        free &= ((candidates - candidates[best]) ** 2).sum(axis=1) >= limit
         free[best] = False
-    return np.array(taken, np.int64)
+        for n in range(len(candidates)):
+            if free[n] and _are_close(candidates[n], candidates[best], min_distance_px):
+                free[n] = False
+    return taken
 
 
-def _squared_distances(a: Float, b: Float) -> Float:
-    """(N, M) between (N, 2) and (M, 2); a coordinate at a time is several times faster than one (N, M, 2) array."""
-    squared: Float = np.subtract.outer(a[:, 0], b[:, 0]) ** 2 + np.subtract.outer(a[:, 1], b[:, 1]) ** 2
-    return squared
+@kernel(inlined=True)
+def _are_close(a: Float, b: Float, distance: float) -> bool:
+    dx, dy = a[0] - b[0], a[1] - b[1]
+    close: bool = dx * dx + dy * dy < distance * distance
+    return close

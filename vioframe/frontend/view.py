@@ -132,6 +132,8 @@ class View:
 
     def keep(self, mask: Bool) -> None:
         """Only the points ``mask`` (N,)."""
+        if mask.all():
+            return
         self.ids, self.xy, self.xy_normalised = self.ids[mask], self.xy[mask], self.xy_normalised[mask]
         if self._anchors is not None:
             self._anchors = self._anchors.keep(mask)
