@@ -10,7 +10,8 @@ import pytest
 from vioframe.errors import ConfigError, DatasetError, PluginError
 from vioframe.evaluation.epipolar import epipolar_errors_px
 from vioframe.frontend import Frontend, FrontendOptions
-from vioframe.frontend.flow import body_rotation, equalise, predict
+from vioframe.frontend.equalisation import clahe, equalise
+from vioframe.frontend.flow import body_rotation, predict
 from vioframe.frontend.refill import GRID, spread, thin
 from vioframe.geometry import so3, two_view
 from vioframe.geometry.cameras import Camera
@@ -469,3 +470,17 @@ def test_a_gap_between_images_restarts_lost_tracks(shared_data):
     counts = [len(tracker.track(imu, frames, dataset.calibration).ids) for imu, frames in packets]
     assert incidents.counts["camera_gap"] == 1
     assert min(counts) >= 120
+
+
+@pytest.mark.parametrize("shape", [(480, 752), (123, 77), (64, 65), (9, 9)])
+@pytest.mark.parametrize("contrast", [1.0, 0.1])
+def test_contrast_is_spread_as_opencv_does(shape: tuple[int, int], contrast: float):
+    rng = np.random.default_rng(3)
+    smooth = cv2.GaussianBlur(rng.uniform(0.0, 255.0, shape), (0, 0), 3.0)
+    image = np.clip(128.0 + contrast * (4.0 * (smooth - 128.0) + rng.normal(0.0, 3.0, shape)), 0, 255).astype(np.uint8)
+    image.flags.writeable = False
+    np.testing.assert_array_equal(clahe(image), cv2.createCLAHE(3.0, (8, 8)).apply(image))
+
+
+def test_an_image_without_contrast_stays_so():
+    assert len(np.unique(clahe(np.full((64, 64), 7, np.uint8)))) == 1

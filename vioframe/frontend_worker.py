@@ -17,7 +17,7 @@ from typing import IO
 
 from vioframe.cores import limited_threads, usable_cores
 from vioframe.errors import VioframeError
-from vioframe.frontend import Frontend, anchors, lucas_kanade, warming
+from vioframe.frontend import Frontend, warming
 from vioframe.frontend_process import Done, Failed, Images, Incident, Job, Setup, put
 from vioframe.incidents import Incidents
 from vioframe.parts import registry
@@ -39,8 +39,7 @@ def serve(memory: int) -> None:
     with suppress(EOFError, BrokenPipeError), limited_threads(opencv=usable_cores() - 1):
         try:
             # While the other process is busy with itself.
-            lucas_kanade.warm_up()
-            anchors.warm_up()
+            warming.load_kernels()
             setup = pickle.load(source)
             _follow(setup, Images.in_file(memory, setup.calibration), incidents, source, answers)
         except EOFError:

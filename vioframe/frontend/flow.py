@@ -5,25 +5,13 @@ from __future__ import annotations
 import numpy as np
 
 from vioframe.frontend.lucas_kanade import Pyramid, search
-from vioframe.frontend.options import Equalisation
 from vioframe.geometry import so3
 from vioframe.geometry.cameras import Camera
 from vioframe.geometry.two_view import Mask, rays
-from vioframe.types import Float, Image, ImuSegment
+from vioframe.types import Float, ImuSegment
 
 # Above the full images, on the way back.
 _LEVELS_BACK = 2
-
-
-def equalise(image: Image, method: Equalisation) -> Image:
-    """``image`` with its contrast spread: over 8 x 8 tiles (clahe, clip limit 3) or as a whole (histogram)."""
-    import cv2
-
-    if method == "clahe":
-        return cv2.createCLAHE(3.0, (8, 8)).apply(image).astype(np.uint8, copy=False)
-    if method == "histogram":
-        return cv2.equalizeHist(image).astype(np.uint8, copy=False)
-    return image
 
 
 def body_rotation(imu: ImuSegment) -> Float:

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from typing import Literal, get_args
 
 from vioframe.errors import ConfigError
+from vioframe.frontend.equalisation import Equalisation
 
-Equalisation = Literal["none", "clahe", "histogram"]
 Rejection = Literal["none", "fundamental", "magsac", "two_point"]
 
 

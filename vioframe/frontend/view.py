@@ -8,7 +8,8 @@ import numpy as np
 
 from vioframe.frontend.anchors import Anchors
 from vioframe.frontend.candidates import CandidateSource
-from vioframe.frontend.flow import equalise, follow, predict, returns
+from vioframe.frontend.equalisation import equalise
+from vioframe.frontend.flow import follow, predict, returns
 from vioframe.frontend.lucas_kanade import Pyramid
 from vioframe.frontend.options import FrontendOptions
 from vioframe.frontend.refill import spread, thin

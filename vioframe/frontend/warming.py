@@ -5,11 +5,18 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from vioframe.frontend import anchors, lucas_kanade
+from vioframe.frontend import anchors, equalisation, lucas_kanade
 from vioframe.frontend.tracker import Frontend
 from vioframe.types import NS_PER_S, Calibration, FrameSet, ImuSegment, g_W
 
 _FRAMES, _PERIOD_NS = 3, NS_PER_S // 10
+
+
+def load_kernels() -> None:
+    """Compile those that any detector's points are followed by, or load them."""
+    equalisation.warm_up()
+    lucas_kanade.warm_up()
+    anchors.warm_up()
 
 
 def warm_up(frontend: Frontend, calibration: Calibration) -> None:
@@ -17,8 +24,7 @@ def warm_up(frontend: Frontend, calibration: Calibration) -> None:
 
     A few images at rest are looked at, for detectors compile and load what they need as they see the first of them.
     """
-    lucas_kanade.warm_up()
-    anchors.warm_up()
+    load_kernels()
     rng = np.random.default_rng(0)
     sizes = [camera.model.resolution for camera in calibration.cameras]
     images = tuple(cv2.blur(rng.integers(0, 256, (h, w), np.uint8), (5, 5)).astype(np.uint8) for w, h in sizes)
