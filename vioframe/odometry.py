@@ -284,7 +284,7 @@ class Odometry:
             self.calibration = estimate.calibration.calibration
         if not in_flight:
             # Another time offset or focal length may have been found while starting. In flight the next frame may have
-            # been cut, and its points followed, by now: then it counts from the one behind that, with one thread as
+            # been cut, and its points followed, by now: then it counts from the one behind that, with one process as
             # with two.
             self._retime()
             self._recalibrate()
