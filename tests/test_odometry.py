@@ -30,6 +30,7 @@ from vioframe.incidents import Incidents
 from vioframe.io.calibration import load_calibration
 from vioframe.io.memory import ArrayDataset
 from vioframe.io.synchronise import synchronise
+from vioframe.jit import heard
 from vioframe.odometry import Odometry
 from vioframe.parts import registry
 from vioframe.runs.folder import RunFolder
@@ -299,6 +300,33 @@ def test_an_image_of_another_size_is_refused_there_as_here():
         return str(raised.value)
 
     assert refused(True) == refused(False)
+
+
+def test_what_the_other_process_compiles_is_told(tmp_path, monkeypatch):
+    """Once: then it is there."""
+    code = f"""
+    import numpy as np
+    from vioframe.jit import kernel
+    from vioframe.types import Keypoints
+
+    @kernel
+    def never_seen_before(count):
+        return {perf_counter()} + np.arange(count)
+
+    class New:
+        def detect(self, image, max_points):
+            return Keypoints(20.0 + never_seen_before(4).astype(np.float32).reshape(2, 2) % 10, np.ones(2, np.float32))
+
+    @hookimpl
+    def vioframe_detectors():
+        return {{"new": New}}
+    """
+    install(tmp_path, monkeypatch, distribution="new-detector", module="new_detector", code=code)
+    for compiled in (["never_seen_before"], []):
+        told: list[str] = []
+        with heard(told.append):
+            next(Odometry(CALIBRATION, "new", pipelined=True, warm=False).follow(short_flight()))
+        assert told == compiled
 
 
 def test_a_process_ends_with_who_made_it():

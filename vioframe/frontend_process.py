@@ -76,6 +76,13 @@ class Done:
 
 
 @dataclass(frozen=True, slots=True)
+class Compiling:
+    """That it takes longer, as ``kernel`` is being compiled."""
+
+    kernel: str
+
+
+@dataclass(frozen=True, slots=True)
 class Failed:
     """By an ``error`` that is told to users, or one that is a bug, with its ``trace``."""
 
@@ -219,7 +226,10 @@ class FrontendProcess:
 
     def _receive(self) -> Done:
         try:
-            answer: Done | Failed = pickle.load(self._process.stdout)  # type: ignore[arg-type]
+            while isinstance(answer := pickle.load(self._process.stdout), Compiling):  # type: ignore[arg-type]
+                from vioframe.jit import pass_on
+
+                pass_on(answer.kernel)
         except (EOFError, ValueError, pickle.UnpicklingError) as error:
             raise self._gone() from error
         for incident in answer.incidents:

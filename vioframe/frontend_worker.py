@@ -18,8 +18,9 @@ from typing import IO
 from vioframe.cores import limited_threads, usable_cores
 from vioframe.errors import VioframeError
 from vioframe.frontend import Frontend, warming
-from vioframe.frontend_process import Done, Failed, Images, Incident, Job, Setup, put
+from vioframe.frontend_process import Compiling, Done, Failed, Images, Incident, Job, Setup, put
 from vioframe.incidents import Incidents
+from vioframe.jit import heard
 from vioframe.parts import registry
 from vioframe.types import FrameSet, FrameTracks
 
@@ -36,7 +37,11 @@ def serve(memory: int) -> None:
     source, answers = sys.stdin.buffer, os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)  # a detector, which is anybody's code, may print
     incidents = _Noted()
-    with suppress(EOFError, BrokenPipeError), limited_threads(opencv=usable_cores() - 1):
+
+    def compiling(kernel: str) -> None:
+        put(Compiling(kernel), answers)
+
+    with suppress(EOFError, BrokenPipeError), limited_threads(opencv=usable_cores() - 1), heard(compiling):
         try:
             # While the other process is busy with itself.
             warming.load_kernels()

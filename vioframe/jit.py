@@ -27,6 +27,8 @@ FunctionT = TypeVar("FunctionT", bound=Callable[..., object])
 
 _PACKAGE = Path(__file__).parent
 
+_told: list[Callable[[str], None]] = []
+
 
 @overload
 def kernel(function: FunctionT) -> FunctionT: ...
@@ -68,8 +70,18 @@ def _compiled(function: FunctionT, reorder_sums: bool, inlined: bool) -> Functio
 @contextmanager
 def heard(tell: Callable[[str], None]) -> Iterator[None]:
     """Within it ``tell`` is called with the name of each kernel that has to be compiled: none, once all are cached."""
-    with event.install_listener("numba:compile", _Listener(tell)):
-        yield
+    _told.append(tell)
+    try:
+        with event.install_listener("numba:compile", _Listener(tell)):
+            yield
+    finally:
+        _told.remove(tell)
+
+
+def pass_on(kernel: str) -> None:
+    """Tell whoever hears of kernels here of one that another process compiles."""
+    for tell in tuple(_told):
+        tell(kernel)
 
 
 _CLOCKS = (perf_counter, thread_time)
