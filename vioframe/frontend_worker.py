@@ -20,7 +20,7 @@ from vioframe.errors import VioframeError
 from vioframe.frontend import Frontend, warming
 from vioframe.frontend_process import Compiling, Done, Failed, Images, Incident, Job, Setup, put
 from vioframe.incidents import Incidents
-from vioframe.jit import heard
+from vioframe.jit import have_been_compiled, heard
 from vioframe.parts import registry
 from vioframe.types import FrameSet, FrameTracks
 
@@ -43,8 +43,8 @@ def serve(memory: int) -> None:
 
     with suppress(EOFError, BrokenPipeError), limited_threads(opencv=usable_cores() - 1), heard(compiling):
         try:
-            # While the other process is busy with itself.
-            warming.load_kernels()
+            if have_been_compiled():  # else the first frame needs but some of them
+                warming.load_kernels()  # while the other process is busy with itself
             setup = pickle.load(source)
             _follow(setup, Images.in_file(memory, setup.calibration), incidents, source, answers)
         except EOFError:

@@ -122,6 +122,12 @@ _waiting = _Waiting()
 event.register("numba:compiler_lock", _waiting)  # type: ignore[no-untyped-call]
 
 
+def have_been_compiled() -> bool:
+    """Whether vioframe's kernels lie in the cache, some of them at least: then what is loaded ahead costs little."""
+    settings: Any = numba.config
+    return any((_folder(settings.CACHE_DIR) / _fingerprint(_PACKAGE)).rglob("*.nbc"))
+
+
 def waited_s(clock: Callable[[], float] = perf_counter) -> float:
     """How long this thread has waited by now for kernels to be compiled or loaded from the cache, s.
 

@@ -59,16 +59,18 @@ def _curves(image: Image, tile_height: int, tile_width: int, limit: int) -> Curv
     counts = np.empty((4, 256), np.int32)  # side by side, so that equal neighbours do not wait for one another
     for i in range(_TILES):
         for j in range(_TILES):
-            counts[:] = 0
+            for v in range(256):
+                counts[0, v] = counts[1, v] = counts[2, v] = counts[3, v] = 0
             for r in range(i * tile_height, (i + 1) * tile_height):
                 for c in range(j * tile_width, (j + 1) * tile_width):
                     counts[c & 3, image[r, c]] += 1
-            count = counts[0] + counts[1] + counts[2] + counts[3]
-            cut = 0
+            count, cut = counts[0], 0
             for v in range(256):
+                count[v] += counts[1, v] + counts[2, v] + counts[3, v]
                 cut += max(count[v] - limit, 0)
                 count[v] = min(count[v], limit)
-            count += cut // 256
+            for v in range(256):
+                count[v] += cut // 256
             left = cut % 256
             if left:
                 for v in range(0, 256, max(256 // left, 1)):
@@ -87,7 +89,9 @@ def _mixed(image: Image, curves: Curves, tile_height: int, tile_width: int, heig
     """The first ``height`` rows and ``width`` columns by the curves of the four tiles about each pixel, bilinearly."""
     half, one = np.float32(0.5), np.float32(1.0)
     # Of each column: its share of the tile on the right. Between two tiles' middles are those from begin to begin.
-    share, begin = np.empty(width, np.float32), np.full(_TILES + 2, width)
+    share, begin = np.empty(width, np.float32), np.empty(_TILES + 2, np.int64)
+    for k in range(_TILES + 2):
+        begin[k] = width
     for x in range(width - 1, -1, -1):
         at = np.float32(x) * np.float32(one / np.float32(tile_width)) - half
         left = math.floor(at)
@@ -101,7 +105,9 @@ def _mixed(image: Image, curves: Curves, tile_height: int, tile_width: int, heig
         lower_share = at - np.float32(upper)
         upper_share = one - lower_share
         if upper != paired:  # the two curves above each other side by side, to be looked up at once
-            pair[:, :, 0], pair[:, :, 1] = curves[max(upper, 0)], curves[min(upper + 1, _TILES - 1)]
+            for k in range(_TILES):
+                for v in range(256):
+                    pair[k, v, 0], pair[k, v, 1] = curves[max(upper, 0), k, v], curves[min(upper + 1, _TILES - 1), k, v]
             paired = upper
         for k in range(_TILES + 1):
             on_left, on_right = pair[max(k - 1, 0)], pair[min(k, _TILES - 1)]

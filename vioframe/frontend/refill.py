@@ -11,12 +11,17 @@ from vioframe.types import Bool, Float, Int
 GRID = (6, 8)
 
 
-@kernel
 def thin(xy: Float, ids: Int, min_distance_px: float) -> Bool:
     """(N,) which tracks stay when of any two closer than ``min_distance_px`` the younger (larger id) goes."""
-    keep = np.ones(len(xy), np.bool_)
-    order = np.argsort(ids)
+    return _thin(xy, np.argsort(ids), min_distance_px)
+
+
+@kernel
+def _thin(xy: Float, order: Int, min_distance_px: float) -> Bool:
+    """The same by the ``order`` (N,) of age, the oldest first."""
+    keep = np.empty(len(xy), np.bool_)
     for n in range(len(order)):
+        keep[order[n]] = True
         younger = order[n]
         for m in range(n):
             if keep[order[m]] and _are_close(xy[younger], xy[order[m]], min_distance_px):
@@ -53,8 +58,9 @@ def spread(
 @kernel
 def _spread(candidates: Float, cells: Int, live: Float, population: Int, count: int, min_distance_px: float) -> Int:
     """The same, with the cell of each candidate (N,), and how many points each cell holds, which grows."""
-    free = np.ones(len(candidates), np.bool_)
+    free = np.empty(len(candidates), np.bool_)
     for n in range(len(candidates)):
+        free[n] = True
         for m in range(len(live)):
             if _are_close(candidates[n], live[m], min_distance_px):
                 free[n] = False
