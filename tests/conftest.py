@@ -1,10 +1,12 @@
 """Fixtures shared by all tests."""
 
 import signal
+from functools import partial
 from pathlib import Path
 
 import pytest
 
+from vioframe.frontend.warming import load_kernels
 from vioframe.io.calibration import packaged_calibration
 from vioframe.parts import registry
 from vioframe.warming import warm_up
@@ -24,8 +26,10 @@ def pytest_sessionstart(session: pytest.Session) -> None:
     """In a checkout that is new every worker would compile every kernel: each compiles a part ahead, for all."""
     worker = getattr(session.config, "workerinput", None)
     if worker is not None:
-        for name in BACKENDS[int(worker["workerid"].removeprefix("gw")) :: worker["workercount"]]:
-            warm_up(registry.load().create_backend(name), packaged_calibration("euroc", cameras=["cam0"]))
+        installed, calibration = registry.load(), packaged_calibration("euroc", cameras=["cam0"])
+        parts = [partial(warm_up, installed.create_backend(name), calibration) for name in BACKENDS]
+        for compile_part in [*parts, load_kernels][int(worker["workerid"].removeprefix("gw")) :: worker["workercount"]]:
+            compile_part()
 
 
 @pytest.fixture

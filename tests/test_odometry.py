@@ -220,7 +220,6 @@ def test_what_came_before_a_source_failed_is_estimated(pipelined: bool):
 # Detectors of a distribution of their own, as a process of its own finds them.
 DETECTORS = """
 import os
-import sys
 import numpy as np
 from vioframe.types import Keypoints
 
@@ -261,6 +260,14 @@ def apart(detector: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, **opti
 def test_a_detector_that_fails_in_its_process_is_named(tmp_path, monkeypatch):
     with pytest.raises(PluginError, match="Never failed on each"):
         list(apart("never", tmp_path, monkeypatch).follow(short_flight()))
+
+
+def test_a_name_that_two_give_is_that_of_the_one_asked_for(tmp_path, monkeypatch):
+    code = DETECTORS.replace('"never"', '"orb"')
+    install(tmp_path, monkeypatch, distribution="odd-detectors", module="odd_detectors", code=code)
+    odometry = Odometry(CALIBRATION, "orb@odd-detectors", pipelined=True, warm=False)
+    with pytest.raises(PluginError, match="Never failed on each"):
+        list(odometry.follow(short_flight()))
 
 
 def test_one_that_cannot_be_made_there_is_named(tmp_path, monkeypatch):

@@ -142,6 +142,15 @@ def test_a_name_taken_twice_is_an_error_only_where_it_is_used(add):
     assert {"orb@thief", "orb@vioframe"} <= set(loaded.names(registry.DETECTOR))
 
 
+def test_one_plugin_alone_has_its_part_by_its_own_name(add):
+    add("thief", detector('"orb": Blank'), version="0.3")
+    part = registry.load().find(registry.DETECTOR, "orb@thief")
+    alone = registry.load_alone(part.origin)
+    assert (part.own_name, alone.names(registry.DETECTOR)) == ("orb", ["orb"])
+    assert alone.create_detector(part.own_name, {"size": 5}).size == 5
+    assert not any(alone.names(kind) for kind in registry.KINDS if kind is not registry.DETECTOR)
+
+
 def test_a_name_taken_twice_within_a_distribution_is_told_by_the_entry_points(add):
     for module in ("first_half", "second_half"):
         add(module, detector('"blank": Blank'))

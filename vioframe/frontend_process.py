@@ -17,13 +17,13 @@ import sys
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
+from itertools import accumulate
 from mmap import mmap
 from tempfile import TemporaryFile
 from typing import IO, TYPE_CHECKING, Any, Self
 from weakref import finalize
 
 import numpy as np
-from numpy.typing import NDArray
 
 from vioframe.errors import RunError, VioframeError
 from vioframe.incidents import Incidents
@@ -92,29 +92,22 @@ class Failed:
 
 
 class Images:
-    """Images of a rig's cameras in ``memory`` (B,) bytes that two processes see, a few frames in turn."""
+    """Images of a rig's cameras, a few frames in turn, in the open file ``descriptor`` that two processes see."""
 
-    def __init__(self, memory: NDArray[np.uint8], calibration: Calibration) -> None:
-        self._memory = memory
+    def __init__(self, descriptor: int, calibration: Calibration) -> None:
         self._shapes = [camera.model.resolution[::-1] for camera in calibration.cameras]
-        sizes = [height * width for height, width in self._shapes]
-        self._begins, self._frame_bytes = np.cumsum([0, *sizes[:-1]]), sum(sizes)
-        self._slot = 0
-
-    @classmethod
-    def in_file(cls, descriptor: int, calibration: Calibration) -> Images:
-        """In an open file, which is made as long as need be."""
-        widths_heights = [camera.model.resolution for camera in calibration.cameras]
-        size = _SLOTS * sum(width * height for width, height in widths_heights)
+        *self._begins, self._frame_bytes = accumulate((h * w for h, w in self._shapes), initial=0)
+        size = _SLOTS * self._frame_bytes
         os.truncate(descriptor, size)
-        return cls(np.frombuffer(mmap(descriptor, size), np.uint8), calibration)
+        self._memory = np.frombuffer(mmap(descriptor, size), np.uint8)
+        self._slot = 0
 
     def put(self, images: tuple[Image | None, ...]) -> tuple[Image | int | None, ...]:
         """Where each image now is; itself, if it is none or not as calibrated, which the front-end will refuse."""
         self._slot = (self._slot + 1) % _SLOTS
         places: list[Image | int | None] = []
         for image, shape, begin in zip(images, self._shapes, self._begins, strict=True):
-            place = self._slot * self._frame_bytes + int(begin)
+            place = self._slot * self._frame_bytes + begin
             if image is None or image.shape != shape or image.dtype != np.uint8:
                 places.append(image)
             else:
@@ -173,12 +166,11 @@ class FrontendProcess:
         """
         self._incidents, self._lenses = incidents, calibration
         try:
-            self._images = Images.in_file(self._memory.fileno(), calibration)
+            self._images = Images(self._memory.fileno(), calibration)
         except OSError as error:
             what = f"no memory for the images that two processes share: {error.strerror}"
             raise RunError(f"{what}; --cores 1 does with one process") from error
-        name = detector.name.partition("@")[0]
-        self._send(Setup(detector.origin, name, detector_options, calibration, options, warm))
+        self._send(Setup(detector.origin, detector.own_name, detector_options, calibration, options, warm))
 
     def prepare(self, frames: FrameSet) -> None:
         """Nothing that it would be worth to send a frame twice for."""
@@ -227,9 +219,9 @@ class FrontendProcess:
     def _receive(self) -> Done:
         try:
             while isinstance(answer := pickle.load(self._process.stdout), Compiling):  # type: ignore[arg-type]
-                from vioframe.jit import pass_on
+                from vioframe.jit import tell_of
 
-                pass_on(answer.kernel)
+                tell_of(answer.kernel)
         except (EOFError, ValueError, pickle.UnpicklingError) as error:
             raise self._gone() from error
         for incident in answer.incidents:

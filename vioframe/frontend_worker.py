@@ -46,7 +46,7 @@ def serve(memory: int) -> None:
             if have_been_compiled():  # else the first frame needs but some of them
                 warming.load_kernels()  # while the other process is busy with itself
             setup = pickle.load(source)
-            _follow(setup, Images.in_file(memory, setup.calibration), incidents, source, answers)
+            _follow(setup, Images(memory, setup.calibration), incidents, source, answers)
         except EOFError:
             raise
         except Exception as error:
@@ -69,17 +69,12 @@ class _Noted(Incidents):
 
 
 def _follow(setup: Setup, images: Images, incidents: _Noted, source: IO[bytes], answers: IO[bytes]) -> None:
-    # That one alone, under its own name: what others are called is no matter here.
-    installed = registry.load(entry for entry in registry.entries() if registry.origin(entry) == setup.origin)
+    installed = registry.load_alone(setup.origin)
     with installed.blaming():
-
-        def frontend(told: Incidents) -> Frontend:
-            detector = installed.create_detector(setup.detector, setup.detector_options)
-            return Frontend(detector, setup.calibration, setup.options, told)
-
+        detector = installed.create_detector(setup.detector, setup.detector_options)
         if setup.warm:
-            warming.warm_up(frontend(Incidents()), setup.calibration)
-        follower = frontend(incidents)
+            warming.warm_up(detector, setup.calibration, setup.options)
+        follower = Frontend(detector, setup.calibration, setup.options, incidents)
         put(Done(FrameTracks.none(0), {}, []), answers)
         for job in _ahead(source):
             follower.recalibrate(job.lenses)

@@ -72,14 +72,13 @@ def heard(tell: Callable[[str], None]) -> Iterator[None]:
     """Within it ``tell`` is called with the name of each kernel that has to be compiled: none, once all are cached."""
     _told.append(tell)
     try:
-        with event.install_listener("numba:compile", _Listener(tell)):
-            yield
+        yield
     finally:
         _told.remove(tell)
 
 
-def pass_on(kernel: str) -> None:
-    """Tell whoever hears of kernels here of one that another process compiles."""
+def tell_of(kernel: str) -> None:
+    """Have it ``heard`` here that ``kernel`` is compiled, be it by another process."""
     for tell in tuple(_told):
         tell(kernel)
 
@@ -136,17 +135,17 @@ def waited_s(clock: Callable[[], float] = perf_counter) -> float:
     return _waiting.seconds(clock)
 
 
-class _Listener(event.Listener):
-    def __init__(self, tell: Callable[[str], None]) -> None:
-        self._tell = tell
-
+class _Compiling(event.Listener):
     def on_start(self, begun: Any) -> None:
         function = begun.data["dispatcher"].py_func
         if not function.__module__.startswith("numba."):  # what a kernel calls of numba's own
-            self._tell(function.__name__)
+            tell_of(function.__name__)
 
     def on_end(self, begun: Any) -> None:
         """What is compiled is of use at once."""
+
+
+event.register("numba:compile", _Compiling())  # type: ignore[no-untyped-call]
 
 
 def _folder(chosen: str) -> Path:

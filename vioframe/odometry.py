@@ -100,7 +100,7 @@ class Odometry:
     ) -> None:
         self._registry = registry.load() if installed is None else installed
         self.incidents = Incidents() if incidents is None else incidents
-        options, warm_frontend = frontend or FrontendOptions(), None
+        options, warm_detector = frontend or FrontendOptions(), None
         self._frontend: Frontend | FrontendProcess
         if pipelined:
             if not isinstance(detector, str):
@@ -112,7 +112,7 @@ class Odometry:
         else:
             if isinstance(detector, str):
                 detector = self._registry.create_detector(detector, detector_options)
-                warm_frontend = Frontend(detector, calibration, options, Incidents()) if warm else None
+                warm_detector = detector if warm else None
             self._frontend = Frontend(detector, calibration, options, self.incidents)
         name, warm_backend = None, None
         if isinstance(backend, str):
@@ -128,8 +128,8 @@ class Odometry:
         with self._registry.blaming(), limited_threads():
             if warm_backend is not None:
                 warm_up(warm_backend, calibration)
-            if warm_frontend is not None:
-                frontend_warming.warm_up(warm_frontend, calibration)
+            if warm_detector is not None:
+                frontend_warming.warm_up(warm_detector, calibration, options)
         self._synchroniser = Synchroniser(
             self.incidents, time_offset_ns=calibration.cameras[0].time_offset_ns, wait_ms=wait_ms
         )

@@ -150,6 +150,8 @@ def prepare(
     if live:
         imu = dataset.calibration.imu.in_flight(config.estimation_options.imu_noise_factor)
         dataset = Live(cast(Source, dataset), Ahead(imu))
+        if isinstance(pipelined, FrontendProcess):
+            pipelined.close()
     elif tape is not None:
         raise DatasetError(f"{dataset.name} is a recording already; `vioframe convert` makes another of it")
     odometry = Odometry(

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import signal
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from math import inf
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -94,11 +94,27 @@ def run(
     """
     if view and save_view is not None:
         raise click.UsageError("--view opens a window and --save-view writes a file; choose one")
-    with ExitStack() as within:
-        pipelined: FrontendProcess | bool = False
-        if (cores or usable_cores()) > 1:
-            pipelined = within.enter_context(FrontendProcess())
-        summary, experiment, folder = _run(pipelined, out, overwrite, tape, view, save_view, quiet, choices)
+    with _begun(cores or usable_cores()) as pipelined:
+        from vioframe.parts import registry
+        from vioframe.pipeline import prepare, record
+        from vioframe.runs.recorder import check_run_folder, free_run_folder
+        from vioframe.warming import helped
+
+        if out is not None:
+            check_run_folder(out, overwrite=overwrite)
+        installed = registry.load()
+        config = _configure(installed, **choices)
+        with Bar(None, quiet=quiet, late=True) as bar, helped(config.backend.name):
+            experiment = prepare(config, installed, warm=overwrite, tape=tape, pipelined=pipelined)
+            folder = out or free_run_folder(Path("runs"), experiment.name)
+            told = _watched(bar, experiment)
+            with _ended_by_signals(experiment.live), _viewer(experiment, view, save_view) as shown:
+
+                def on_step(step: Step) -> None:
+                    shown(step)
+                    told(step)
+
+                summary = record(experiment, folder, overwrite=overwrite, on_step=on_step, explain=True)
     if not quiet:
         if others := experiment.left_aside:
             used = experiment.dataset.calibration.cameras[0].name
@@ -109,37 +125,9 @@ def run(
         click.get_current_context().exit(EXIT_FAILED)
 
 
-def _run(
-    pipelined: FrontendProcess | bool,
-    out: Path | None,
-    overwrite: bool,
-    tape: Path | None,
-    view: bool,
-    save_view: Path | None,
-    quiet: bool,
-    choices: dict[str, Any],
-) -> tuple[dict[str, Any], Experiment, Path]:
-    """The summary of a run, of what, and where it is."""
-    from vioframe.parts import registry
-    from vioframe.pipeline import prepare, record
-    from vioframe.runs.recorder import check_run_folder, free_run_folder
-    from vioframe.warming import helped
-
-    if out is not None:
-        check_run_folder(out, overwrite=overwrite)
-    installed = registry.load()
-    config = _configure(installed, **choices)
-    with Bar(None, quiet=quiet, late=True) as bar, helped(config.backend.name):
-        experiment = prepare(config, installed, warm=overwrite, tape=tape, pipelined=pipelined)
-        folder = out or free_run_folder(Path("runs"), experiment.name)
-        told = _watched(bar, experiment)
-        with _ended_by_signals(experiment.live), _viewer(experiment, view, save_view) as shown:
-
-            def on_step(step: Step) -> None:
-                shown(step)
-                told(step)
-
-            return record(experiment, folder, overwrite=overwrite, on_step=on_step, explain=True), experiment, folder
+def _begun(cores: int) -> AbstractContextManager[FrontendProcess | bool]:
+    """The front-end's process where there is a core for it: it loads while this one does."""
+    return FrontendProcess() if cores > 1 else nullcontext(False)
 
 
 def _configure(

@@ -6,7 +6,10 @@ import cv2
 import numpy as np
 
 from vioframe.frontend import anchors, equalisation, lucas_kanade
+from vioframe.frontend.options import FrontendOptions
 from vioframe.frontend.tracker import Frontend
+from vioframe.incidents import Incidents
+from vioframe.interfaces import Detector
 from vioframe.types import NS_PER_S, Calibration, FrameSet, ImuSegment, g_W
 
 _FRAMES, _PERIOD_NS = 3, NS_PER_S // 10
@@ -19,12 +22,13 @@ def load_kernels() -> None:
     anchors.warm_up()
 
 
-def warm_up(frontend: Frontend, calibration: Calibration) -> None:
-    """Come once through all that is compiled for following points, or load it; ``frontend`` is of no use afterwards.
+def warm_up(detector: Detector, calibration: Calibration, options: FrontendOptions) -> None:
+    """Come once through all that is compiled for following points, or load it.
 
     A few images at rest are looked at, for detectors compile and load what they need as they see the first of them.
     """
     load_kernels()
+    frontend = Frontend(detector, calibration, options, Incidents())
     rng = np.random.default_rng(0)
     sizes = [camera.model.resolution for camera in calibration.cameras]
     images = tuple(cv2.blur(rng.integers(0, 256, (h, w), np.uint8), (5, 5)).astype(np.uint8) for w, h in sizes)

@@ -79,12 +79,13 @@ class Origin:
 
 @dataclass(frozen=True, slots=True)
 class Part:
-    """A named part, and where it comes from."""
+    """A named part, and where it comes from; ``own_name`` is what its plug-in calls it, as others may as well."""
 
     kind: Kind
     name: str
     factory: Any
     origin: Origin
+    own_name: str
 
     def __str__(self) -> str:
         return f"{self.kind.name} {self.name!r} ({self.origin})"
@@ -261,14 +262,14 @@ def load(found: Iterable[EntryPoint] | None = None) -> Registry:
     manager.add_hookspecs(hookspecs)
     every: list[Part] = []
     failures = []
-    chosen = entries() if found is None else found
+    chosen = entry_points(group=hookspecs.PROJECT) if found is None else found
     # One at a time: pluggy's own loader gives up on all of them at the first ImportError.
-    for came_from, entry in sorted(((origin(entry), entry) for entry in chosen), key=lambda pair: astuple(pair[0])):
+    for origin, entry in sorted(((_origin(entry), entry) for entry in chosen), key=lambda pair: astuple(pair[0])):
         try:
-            every += _parts_of(manager, came_from, entry.load())
+            every += _parts_of(manager, origin, entry.load())
         except Exception as error:
-            failures.append(Failure(came_from, str(error) if isinstance(error, PluginError) else describe(error)))
-            _LOG.warning("plug-in %s (%s) is skipped: %s", came_from.entry_point, came_from, failures[-1].reason)
+            failures.append(Failure(origin, str(error) if isinstance(error, PluginError) else describe(error)))
+            _LOG.warning("plug-in %s (%s) is skipped: %s", origin.entry_point, origin, failures[-1].reason)
     parts: dict[str, dict[str, Part]] = {kind.name: {} for kind in KINDS}
     clashes = []
     for (kind, name), named in _by_name(every).items():
@@ -277,6 +278,11 @@ def load(found: Iterable[EntryPoint] | None = None) -> Registry:
         if len(named) > 1:
             clashes.append(Clash(kind, name, tuple(part.name for part in named)))
     return Registry(parts, tuple(failures), tuple(clashes))
+
+
+def load_alone(origin: Origin) -> Registry:
+    """One plug-in, without importing the others: its parts have the :attr:`Part.own_name` that it gives them."""
+    return load(entry for entry in entry_points(group=hookspecs.PROJECT) if _origin(entry) == origin)
 
 
 def _by_name(every: Iterable[Part]) -> dict[tuple[Kind, str], list[Part]]:
@@ -310,7 +316,7 @@ def _parts_of(manager: pluggy.PluginManager, origin: Origin, plugin: Any) -> lis
         if not hooks:
             raise PluginError("it implements no hook; decorate its functions with @vioframe.parts.hooks.hookimpl")
         return [
-            Part(kind, name, _checked(kind, name, factory), origin)
+            Part(kind, name, _checked(kind, name, factory), origin, name)
             for kind in KINDS
             if kind.hook in hooks
             for name, factory in _offered(kind, getattr(plugin, kind.hook)()).items()
@@ -355,13 +361,7 @@ def _is_interrupt(error: BaseException | None) -> bool:
     return False
 
 
-def entries() -> Iterable[EntryPoint]:
-    """Of all plug-ins that are installed; none is imported for it."""
-    return entry_points(group=hookspecs.PROJECT)
-
-
-def origin(entry: EntryPoint) -> Origin:
-    """Where the plug-in of ``entry`` comes from."""
+def _origin(entry: EntryPoint) -> Origin:
     name, version = (entry.dist.name, entry.dist.version) if entry.dist else ("unknown", "?")
     return Origin(entry.name, entry.module, name, version)
 
