@@ -24,13 +24,13 @@ export OPENBLAS_NUM_THREADS := 1
 .PHONY: demo test test-all test-fast lint install system-libraries browser clean
 
 test: lint browser
-	$(BIN)/pytest -n 2 -m "not very_slow"
+	$(BIN)/pytest -n 2 --dist worksteal -m "not very_slow"
 
 test-all: lint browser
-	$(BIN)/pytest -n 2
+	$(BIN)/pytest -n 2 --dist worksteal
 
 test-fast: lint
-	$(BIN)/pytest -n 2 -m "not slow and not very_slow"
+	$(BIN)/pytest -n 2 --dist worksteal -m "not slow and not very_slow"
 
 lint: install
 	$(BIN)/ruff check .

@@ -1,5 +1,6 @@
 """Fixtures shared by all tests."""
 
+import os
 import signal
 from functools import partial
 from pathlib import Path
@@ -23,12 +24,19 @@ BACKENDS = ("msckf", "sliding_window", "loose_ekf")
 
 
 def pytest_sessionstart(session: pytest.Session) -> None:
-    """In a checkout that is new every worker would compile every kernel: each compiles a part ahead, for all."""
+    """Workers have a core each, so that what they run begins no second process beside those of the others.
+
+    In a checkout that is new every worker would compile every kernel: each compiles a part ahead, for all.
+    """
     worker = getattr(session.config, "workerinput", None)
     if worker is not None:
+        number = int(worker["workerid"].removeprefix("gw"))  # xdist's are gw0, gw1, ...
+        if hasattr(os, "sched_setaffinity"):
+            cores = sorted(os.sched_getaffinity(0))
+            os.sched_setaffinity(0, {cores[number % len(cores)]})
         installed, calibration = registry.load(), packaged_calibration("euroc", cameras=["cam0"])
         parts = [partial(warm_up, installed.create_backend(name), calibration) for name in BACKENDS]
-        for compile_part in [*parts, load_kernels][int(worker["workerid"].removeprefix("gw")) :: worker["workercount"]]:
+        for compile_part in [*parts, load_kernels][number :: worker["workercount"]]:
             compile_part()
 
 

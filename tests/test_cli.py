@@ -16,7 +16,9 @@ from plugin_helpers import install
 from ruamel.yaml import YAML
 
 import vioframe.cli
+import vioframe.cli.run as cli_run
 from vioframe.cli import main
+from vioframe.frontend_process import FrontendProcess
 from vioframe.parts import config
 from vioframe.runs.folder import RunFolder
 
@@ -163,6 +165,18 @@ def test_a_run_from_recording_to_folder(toy):
     assert f"vioframe evaluate {folder}" in result.stdout
     assert "frames/s" in result.stderr
     assert "x real time" in result.stderr
+
+
+def test_a_run_on_two_cores_is_the_same_byte_for_byte(toy, monkeypatch):
+    begun = []
+    monkeypatch.setattr(cli_run, "FrontendProcess", lambda: begun.append(FrontendProcess()) or begun[-1])
+    for cores in (1, 2):
+        run_toy(toy, "--cores", cores, "--out", f"on{cores}")
+        assert len(begun) == cores - 1
+    for file in ("trajectory.tum", "states.csv", "tracks.csv"):
+        first, second = (Path(f"on{cores}", file).read_bytes() for cores in (1, 2))
+        assert len(first) > 1000
+        assert first == second, file
 
 
 def test_quiet_says_nothing(toy):

@@ -13,12 +13,13 @@ from vioframe_akaze import Akaze
 from vioframe_brisk import Brisk
 from vioframe_fast import Fast
 from vioframe_orb import Orb
+from vioframe_random import Random
 from vioframe_shi_tomasi import ShiTomasi
 from vioframe_sift import Sift
 from vioframe_surf import Surf
 
 DESCRIBING = {"orb": Orb, "sift": Sift, "akaze": Akaze, "brisk": Brisk, "surf": Surf}
-DETECTORS = {"shi_tomasi": ShiTomasi, "fast": Fast, **DESCRIBING}
+DETECTORS = {"shi_tomasi": ShiTomasi, "fast": Fast, "random": Random, **DESCRIBING}
 each_detector = pytest.mark.parametrize("make", DETECTORS.values(), ids=DETECTORS)
 
 
@@ -153,6 +154,17 @@ def test_fast_keeps_one_corner_a_cell():
     found = Fast(cell_px=20).detect(texture(), 1000).xy
     cells = np.floor(found / 20).astype(int)
     assert len(np.unique(cells, axis=0)) == len(cells) > 30
+
+
+def test_random_places_are_steep_and_of_no_order():
+    image = texture()
+    found = Random(min_distance_px=3.0).detect(image, 300)
+    steep = np.hypot(*(d.astype(float) for d in cv2.spatialGradient(image)))
+    columns, rows = found.xy.T.astype(int)
+    assert len(found.xy) == 300
+    assert (steep[rows, columns] >= np.quantile(steep, 0.8)).all()
+    assert abs(np.corrcoef(found.score, steep[rows, columns])[0, 1]) < 0.15
+    assert np.abs(np.quantile(found.xy, 0.5, axis=0) - [160, 120]).max() < 20
 
 
 def test_shi_tomasi_keeps_its_distance():

@@ -129,7 +129,13 @@ def test_surf_says_what_to_install(monkeypatch):
 
 @pytest.mark.parametrize(
     ("name", "key", "value"),
-    [("akaze", "threshold", "-1"), ("brisk", "octaves", "-1"), ("surf", "threshold", "-1"), ("surf", "octaves", "0")],
+    [
+        ("akaze", "threshold", "-1"),
+        ("brisk", "octaves", "-1"),
+        ("surf", "threshold", "-1"),
+        ("surf", "octaves", "0"),
+        ("random", "steepest", "0"),
+    ],
 )
 def test_an_option_out_of_range_is_refused(name, key, value):
     with pytest.raises(ConfigError, match=rf"detector '{name}': {key}='{value}': Input should be greater than"):

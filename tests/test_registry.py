@@ -56,7 +56,7 @@ def failure(loaded: registry.Registry, entry_point: str) -> str:
 def test_every_built_in_comes_in_through_the_entry_points():
     loaded = registry.load()
     assert not loaded.failures
-    classic = {"shi_tomasi", "fast", "orb", "sift", "akaze", "brisk", "surf"}
+    classic = {"shi_tomasi", "fast", "orb", "sift", "akaze", "brisk", "surf", "random"}
     assert classic | {"superpoint"} <= set(loaded.names(registry.DETECTOR))
     assert "msckf" in loaded.names(registry.BACKEND)
     assert {"euroc", "rosbag"} <= set(loaded.names(registry.DATASET))

@@ -15,12 +15,14 @@ from vioframe.evaluation import evaluate
 from vioframe.geometry.trajectory import Trajectory
 from vioframe.io.trajectories import write_tum
 from vioframe.report.suite.statistics import (
+    Duel,
     Study,
     averages,
     curves,
     data_caption,
     duels,
     groups,
+    holm,
     median_flight,
     records,
     seeds_text,
@@ -198,16 +200,34 @@ def test_duels_pair_flights_and_a_failure_loses(stressed):
 
     assert stressed.baseline == "shi_tomasi"
     rows = duels(stressed.flights, "shi_tomasi")
-    assert [(r.condition, r.level, r.won, r.lost, r.tied, r.both) for r in rows] == [
-        ("clear", 0.0, 2, 0, 0, 2),
-        ("motion_blur", 0.5, 2, 0, 0, 2),
-        ("motion_blur", 1.0, 2, 0, 0, 2),
-        ("fog", 0.5, 2, 0, 0, 2),
-        ("fog", 1.0, 2, 0, 0, 1),
-        (None, None, 8, 0, 0, 7),
+    assert [(r.condition, r.won, r.lost, r.tied, r.both) for r in rows] == [
+        ("clear", 2, 0, 0, 2),
+        ("motion_blur", 4, 0, 0, 4),
+        ("fog", 4, 0, 0, 3),
+        (None, 8, 0, 0, 7),
     ]
     assert rows[0].ratio == pytest.approx(0.5, rel=0.05)
     assert rows[-1].p_value == pytest.approx(stats.binomtest(8, 8).pvalue)
+    assert np.isnan(rows[-1].interval).all()  # of two worlds
+
+
+def test_the_interval_of_a_ratio_is_as_wide_as_worlds_differ_not_as_flights_do():
+    rng, worlds, levels = np.random.default_rng(1), 8, 30
+    of_world = np.repeat(rng.normal(0.0, 0.3, worlds), levels)
+    log_ratio = -0.2 + of_world + rng.normal(0.0, 0.05, worlds * levels)
+    pairs = pd.DataFrame({"sequence": "a", "seed": np.repeat(range(worlds), levels), "log_ratio": log_ratio})
+    low, high = Duel("simulated", None, "orb", "msckf", pairs).interval
+    means = pairs.groupby("seed")["log_ratio"].mean()
+    error, of_flights = means.std(ddof=0) / np.sqrt(worlds), log_ratio.std() / np.sqrt(worlds * levels)
+    assert 0.5 * np.log(high / low) == pytest.approx(1.96 * error, rel=0.1)
+    assert 1.96 * error > 4.0 * of_flights
+    assert means.min() < np.log(low) < log_ratio.mean() < np.log(high) < means.max()
+
+
+def test_holms_correction_is_that_of_the_textbook():
+    # Holm (1979): the smallest times their number, the next times one less, never below the one before, at most 1.
+    assert holm([0.01, 0.04, 0.03, 0.005, 0.9]) == pytest.approx([0.04, 0.09, 0.09, 0.025, 0.9])
+    assert holm([]) == []
 
 
 def test_two_failures_and_two_equal_flights_are_ties(tmp_path):

@@ -17,6 +17,7 @@ from vioframe import jit
 from vioframe.cores import usable_cores
 from vioframe.errors import DivergedError
 from vioframe.estimation import initialization
+from vioframe.frontend.warming import load_kernels
 from vioframe.interfaces import Backend
 from vioframe.io.calibration import packaged_calibration
 from vioframe.parts import registry
@@ -51,7 +52,7 @@ def warm_up(backend: Backend, calibration: Calibration) -> None:
 def helped(backend: str) -> Iterator[None]:
     """Within it, from the first kernel that has to be compiled on, another process compiles those of ``backend``.
 
-    What is needed first, to follow points and to start, is compiled here meanwhile; the rest then lies in the cache.
+    It begins with those that points are followed by, at the other end; what is needed next then lies in the cache.
     """
     helpers: list[subprocess.Popen[bytes]] = []
 
@@ -101,4 +102,5 @@ def _fly_along_a_wall(backend: Backend, calibration: Calibration) -> None:
 
 
 if __name__ == "__main__":
+    load_kernels()
     warm_up(registry.load().create_backend(sys.argv[1], {}), packaged_calibration("euroc", cameras=["cam0"]))

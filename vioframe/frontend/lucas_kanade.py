@@ -105,7 +105,7 @@ def _search(
     by_x, by_y = np.empty((side, wide), np.float32), np.empty((side, wide), np.float32)
     lost = np.zeros(len(xy), np.bool_)
     for n in range(len(xy)):
-        found[n] *= np.float32(2.0)
+        found[n, 0], found[n, 1] = np.float32(2.0) * found[n, 0], np.float32(2.0) * found[n, 1]
         x, y = xy[n, 0] - half, xy[n, 1] - half
         if not (-side <= x < width and -side <= y < height):
             lost[n] = True

@@ -237,10 +237,12 @@ def _robustness(study: Study) -> Iterator[str]:
         return
     for duel in duels(study.flights, baseline):
         if duel.condition is None and duel.both:
+            low, high = duel.interval
             yield (
                 f"{_named(study, duel.detector, duel.backend)} against {_titled(study, baseline)}, flight by flight"
                 f"{f' ({duel.data})' if kinds > 1 else ''}: {duel.won} won, {duel.lost} lost, {duel.tied} tied; where "
-                f"both have an error, {duel.ratio:.2f} times its ATE."
+                f"both have an error, {duel.ratio:.2f} times its ATE"
+                f"{f' (95 %: {low:.2f} to {high:.2f})' if low < high else ''}."
             )
 
 

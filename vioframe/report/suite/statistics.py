@@ -27,6 +27,8 @@ BEGUN_BY = 0.5
 SUCCESS_PERCENT = 5.0
 """A complete flight succeeded where its ATE is below this part of its path."""
 CONFIDENCE = 0.95
+ENOUGH_TO_DRAW_FROM = 5
+"""Fewer worlds than this, drawn again and again, would tell too narrow an interval."""
 
 COURSE = list(CELL[:4])
 """What contenders, a detector with a back-end, are compared on: data, sequence, condition, level."""
@@ -35,6 +37,7 @@ COMPLETE, INCOMPLETE = "complete", "not complete"
 """Incomplete is what was begun late, lost for more than a twentieth of the frames, or cut short."""
 NOT_EVALUATED, NEVER_INITIALISED, FAILED = "not evaluated", "never initialised", "failed"
 
+_DRAWS = 10_000
 _SAME_M = 1e-9
 """ATEs closer than this are of one and the same estimate."""
 _ALWAYS = (
@@ -275,13 +278,12 @@ class Duel(NamedTuple):
     """A detector against the baseline, flight by flight: same recording, condition, level, back-end and seed.
 
     A complete flight wins against one that is not, an ATE against none, and otherwise the smaller one: whoever is lost
-    early has little time to be wrong in. Equal ones are ``tied``. ``condition`` and ``level`` are None where it is over
-    all degraded flights. ``pairs`` has what is the baseline's in columns with the suffix ``_baseline``.
+    early has little time to be wrong in. Equal ones are ``tied``. It is over all levels of ``condition``, or over all
+    degraded flights where that is None. ``pairs`` has what is the baseline's in columns with the suffix ``_baseline``.
     """
 
     data: str
     condition: str | None
-    level: float | None
     detector: str
     backend: str
     pairs: pd.DataFrame
@@ -309,6 +311,21 @@ class Duel(NamedTuple):
         return float(np.exp(self.pairs["log_ratio"].mean()))
 
     @property
+    def interval(self) -> tuple[float, float]:
+        """Of the ratio, at 95 %: by the bootstrap over what was flown, all pairs of a sequence and seed together.
+
+        They have the world and the path in common. NaN where there are fewer than ``ENOUGH_TO_DRAW_FROM`` of those.
+        """
+        together = self.pairs.groupby(["sequence", "seed"])["log_ratio"].agg(["sum", "count"]).to_numpy()
+        if len(together) < ENOUGH_TO_DRAW_FROM:
+            return np.nan, np.nan
+        drawn = np.random.default_rng(0).integers(len(together), size=(_DRAWS, len(together)))
+        sums, counts = together[drawn].sum(axis=1).T
+        tails = [0.5 - 0.5 * CONFIDENCE, 0.5 + 0.5 * CONFIDENCE]
+        low, high = np.exp(np.quantile(sums[counts > 0] / counts[counts > 0], tails)) if counts.any() else [np.nan] * 2
+        return float(low), float(high)
+
+    @property
     def p_value(self) -> float:
         """Of the two-sided sign test."""
         from scipy.stats import binomtest
@@ -317,7 +334,7 @@ class Duel(NamedTuple):
 
 
 def duels(flights: pd.DataFrame, baseline: str) -> list[Duel]:
-    """By condition, level and contender, then over all degraded flights; recordings of one data kind together."""
+    """By condition and contender, then over all degraded flights; recordings of one data kind together."""
     theirs = flights["detector"] == baseline
     pairs = flights[~theirs].merge(flights[theirs], on=[*COURSE, "backend", "seed"], suffixes=("", "_baseline")).copy()
     standing, other = (2 * pairs[f"complete{s}"].astype(int) + pairs[f"evaluated{s}"] for s in ("", "_baseline"))
@@ -327,9 +344,18 @@ def duels(flights: pd.DataFrame, baseline: str) -> list[Duel]:
     pairs["log_ratio"] = np.log((pairs["ate_m"] / pairs["ate_m_baseline"]).astype(float))
     hard = groups(pairs[pairs["condition"] != CLEAR], ("data", *CONTENDER))
     return [
-        *(Duel._make((*key, own)) for key, own in groups(pairs, ("data", "condition", "level", *CONTENDER))),
-        *(Duel._make((data, None, None, *contender, own)) for (data, *contender), own in hard),
+        *(Duel._make((*key, own)) for key, own in groups(pairs, ("data", "condition", *CONTENDER))),
+        *(Duel._make((data, None, *contender, own)) for (data, *contender), own in hard),
     ]
+
+
+def holm(p_values: Iterable[float]) -> list[float]:
+    """Those of several tests at once, so that not one in twenty *suites* finds what is not there (Holm, 1979)."""
+    p = np.array([*p_values])
+    order = np.argsort(p)
+    adjusted = np.empty_like(p)
+    adjusted[order] = np.maximum.accumulate(np.minimum(p[order] * np.arange(len(p), 0, -1), 1.0))
+    return [float(each) for each in adjusted]
 
 
 def stage_means(flights: pd.DataFrame) -> pd.DataFrame:

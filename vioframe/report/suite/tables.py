@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from itertools import groupby
 from pathlib import Path
 from shlex import quote
 from typing import Any
@@ -16,6 +17,7 @@ from vioframe.evaluation.consistency import PARTS, over_trials
 from vioframe.report.suite.statistics import (
     COMPLETE,
     CONTENDER,
+    ENOUGH_TO_DRAW_FROM,
     SUCCESS_PERCENT,
     Study,
     averages,
@@ -25,6 +27,7 @@ from vioframe.report.suite.statistics import (
     data_caption,
     duels,
     groups,
+    holm,
     machines,
     records,
     seeds_text,
@@ -235,32 +238,35 @@ def _levels(study: Study) -> Table:
 
 
 def _duels(study: Study) -> Table | None:
-    """Against the baseline: a row for each condition, level and contender; last, over all of them."""
+    """Against the baseline: a row for each condition and contender; last, over all of them."""
     if not study.is_stress or (baseline := study.baseline) is None:
         return None
     rows = []
-    for duel in duels(study.flights, baseline):
-        entries = {
-            "data": text(duel.data),
-            "condition": text(duel.condition or "all degraded"),
-            "level": number(duel.level, "g"),
-            **_contender(duel.detector, duel.backend),
-            **{key: number(getattr(duel, key), "d") for key in ("won", "lost", "tied")},
-            f"ATE over that of {baseline}, geometric mean": number(duel.ratio, ".2f"),
-            "of pairs": number(duel.both, "d"),
-            "p, sign test": number(duel.p_value, ".3f"),
-        }
-        # A row that is over others, which have them, has no links.
-        pairs = duel.pairs if duel.condition else duel.pairs[:0]
-        theirs = links(pairs.assign(folder=pairs["folder_baseline"]), whose=", baseline")
-        rows.append(TableRow(entries, links(pairs) + theirs, duel.detector, duel.backend))
+    for _, family in groupby(duels(study.flights, baseline), key=lambda duel: duel.condition is None):
+        members = list(family)
+        for duel, p_of_all in zip(members, holm(duel.p_value for duel in members), strict=True):
+            low, high = duel.interval
+            entries = {
+                "data": text(duel.data),
+                "condition": text(duel.condition or "all degraded"),
+                **_contender(duel.detector, duel.backend),
+                **{key: number(getattr(duel, key), "d") for key in ("won", "lost", "tied")},
+                f"ATE over that of {baseline}, geometric mean": number(duel.ratio, ".2f"),
+                "95 % from": number(low, ".2f"),
+                "to": number(high, ".2f"),
+                "of pairs": number(duel.both, "d"),
+                "p, sign test": number(duel.p_value, ".3f"),
+                "p, Holm": number(p_of_all, ".3f"),
+            }
+            rows.append(TableRow(entries, (), duel.detector, duel.backend))
     caption = (
-        f"Flight by flight against {baseline}: same recording, condition, level, back-end and seed, "
-        f"{study.flights.groupby(['condition', 'level']).ngroups} conditions and levels. A complete flight wins "
-        "against one that is not, an ATE against none, else the smaller one; tied: equal, or neither has one. The "
-        f"ratio is of the pairs in which both have an ATE; below 1 is better than {baseline}. The two-sided sign test "
-        "takes the pairs for independent, which flights of one recording are not quite. All degraded: the rows above "
-        f"together, but for the clear ones. {data_caption(study.flights)}"
+        f"Flight by flight against {baseline}: same recording, condition, level, back-end and seed, the levels of a "
+        "condition together. A complete flight wins against one that is not, an ATE against none, else the smaller "
+        "one; tied: equal, or neither has one. The ratio is of the pairs in which both have an ATE; below 1 is better "
+        f"than {baseline}. Its interval is by the bootstrap over sequences and seeds, of which there must be "
+        f"{ENOUGH_TO_DRAW_FROM}. The two-sided sign test takes the pairs for independent, which flights in one world "
+        "are not quite; Holm's p counts that there are as many tests as rows, those over all degraded flights apart. "
+        f"All degraded: the rows above together, but for the clear ones. {data_caption(study.flights)}"
     )
     return Table("duels", f"Against {baseline}", caption, tuple(rows))
 
