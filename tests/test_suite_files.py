@@ -41,7 +41,15 @@ def read(folder: Path, text: str) -> Suite:
 
 class TestFiles:
     def test_shipped_suites_are_whole(self):
-        assert set(suites.shipped()) == {"consistency", "detector_fps", "euroc", "mh05_comparison", "speed", "stress"}
+        assert set(suites.shipped()) == {
+            "consistency",
+            "detector_fps",
+            "euroc",
+            "mh05_comparison",
+            "speed",
+            "stress",
+            "tuning",
+        }
         for name, path in suites.shipped().items():
             suite = suites.read(path)
             assert suite.name == name
@@ -49,8 +57,8 @@ class TestFiles:
 
     def test_the_stress_suite_is_as_large_as_promised(self):
         stress = suites.read(suites.find("stress"))
-        assert [len(levels) for levels in stress.conditions.values()] == [3, 3, 3, 3]
-        assert (len(stress.detectors), len(stress.backends), stress.seeds) == (3, 4, 2)
+        assert [len(levels) for levels in stress.conditions.values()] == [3, 3, 3, 3, 3]
+        assert (len(stress.detectors), len(stress.backends), stress.seeds) == (4, 4, 10)
 
     def test_a_suite_survives_being_written(self, tmp_path):
         for path in suites.shipped().values():
