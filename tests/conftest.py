@@ -6,6 +6,7 @@ from functools import partial
 from pathlib import Path
 
 import pytest
+from threadpoolctl import threadpool_limits
 
 from vioframe.frontend.warming import load_kernels
 from vioframe.io.calibration import packaged_calibration
@@ -34,6 +35,9 @@ def pytest_sessionstart(session: pytest.Session) -> None:
         if hasattr(os, "sched_setaffinity"):
             cores = sorted(os.sched_getaffinity(0))
             os.sched_setaffinity(0, {cores[number % len(cores)]})
+            # Threads of BLAS, as many as there are cores, would wait for one another on the one.
+            threadpool_limits(1)
+            os.environ |= {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
         installed, calibration = registry.load(), packaged_calibration("euroc", cameras=["cam0"])
         parts = [partial(warm_up, installed.create_backend(name), calibration) for name in BACKENDS]
         for compile_part in [*parts, load_kernels][number :: worker["workercount"]]:

@@ -12,7 +12,7 @@ from vioframe.geometry.cameras import Camera, intrinsics_of
 from vioframe_msckf.measurement import Window, landmark_blocks, mahalanobis, observations, reduce_landmark, track_rows
 from vioframe_msckf.options import MsckfOptions
 from vioframe_msckf.state import IMU, OFFSET, READOUT
-from vioframe_msckf.updates import promote_tracks
+from vioframe_msckf.updates import PointNoise, promote_tracks
 
 CAMERAS = {
     "radtan": Camera(458.654, 457.296, 367.215, 248.375, (-0.283, 0.0740, 0.00019, 1.76e-05), (752, 480), "radtan"),
@@ -158,21 +158,21 @@ def test_mahalanobis_distance():
 
 def test_delayed_initialisation_is_the_joint_update_with_nothing_known_of_the_landmark():
     state, table = seeing_state()
-    options = MsckfOptions(pixel_sigma=0.7)
+    options, noise = MsckfOptions(), PointNoise(0.5)
     row = np.flatnonzero(table.seen.all(axis=1))[0]
-    _, p_WF, H, H_f, residual = rows_of(table, row, Window.of(state, True), 0.7)
+    _, p_WF, H, H_f, residual = rows_of(table, row, Window.of(state, True), noise.px)
     # In information form the landmark's prior is exactly nothing.
     n = len(state.cov)
     joint = np.zeros((len(residual), n + 3))
     joint[:, IMU:n], joint[:, n:] = H, H_f
-    information = joint.T @ joint / 0.7**2
+    information = joint.T @ joint / noise.px**2
     information[:n, :n] += np.linalg.inv(state.cov)
     cov = np.linalg.inv(information)
-    dx = cov @ joint.T @ residual / 0.7**2
+    dx = cov @ joint.T @ residual / noise.px**2
 
     before = copy.deepcopy(state)
     gate = chi2.ppf(0.999999, np.arange(1, 40))
-    assert promote_tracks(state, table, np.array([row]), options, np.r_[0.0, gate]).tolist() == [row]
+    assert promote_tracks(state, table, np.array([row]), options, noise, np.r_[0.0, gate]).tolist() == [row]
     np.testing.assert_allclose(state.cov, cov, rtol=1e-6, atol=1e-9 * np.abs(cov).max())
     np.testing.assert_allclose(state.p_WF[0], p_WF + dx[n:], atol=1e-9)
     np.testing.assert_allclose(state.p_WF_first[0], p_WF, atol=0.0)
@@ -191,7 +191,7 @@ def test_delayed_initialisation_is_gated_by_two_rows_a_view_but_for_the_three_of
             gate = np.full(40, elsewhere)
             gate[2 * count - 3] = at_dof
             rows = np.flatnonzero(views == count)[:1]
-            assert promote_tracks(state, table, rows, MsckfOptions(), gate).tolist() == rows.tolist()
+            assert promote_tracks(state, table, rows, MsckfOptions(), PointNoise(0.7), gate).tolist() == rows.tolist()
             assert len(state.landmark_ids) == (at_dof > 0.0)
 
 
@@ -201,6 +201,6 @@ def test_an_implausible_track_is_used_up_and_changes_nothing():
     table.xy[row, 2] += 60.0
     cov = state.cov.copy()
     gate = np.r_[0.0, chi2.ppf(0.95, np.arange(1, 40))]
-    assert promote_tracks(state, table, np.array([row]), MsckfOptions(), gate).tolist() == [row]
+    assert promote_tracks(state, table, np.array([row]), MsckfOptions(), PointNoise(0.7), gate).tolist() == [row]
     assert not len(state.landmark_ids)
     np.testing.assert_array_equal(state.cov, cov)

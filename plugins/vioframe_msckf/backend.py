@@ -16,6 +16,7 @@ from vioframe.types import Estimate, FrameTracks, ImuSegment, Start, Status
 from vioframe_msckf.options import MsckfOptions
 from vioframe_msckf.state import FilterState
 from vioframe_msckf.updates import (
+    PointNoise,
     Turns,
     hold_still,
     promote_tracks,
@@ -32,6 +33,7 @@ class Msckf:
 
     def __init__(self, options: MsckfOptions | None = None) -> None:
         self._options = options or MsckfOptions()
+        self.noise = PointNoise(self._options.pixel_sigma)
 
     def begin(self, start: Start) -> None:
         """A filter with ``start``'s state and no clones."""
@@ -44,7 +46,7 @@ class Msckf:
             intrinsics=options.calibrate_intrinsics,
             readout=options.calibrate_readout,
         )
-        self._noise, self._noise_at_rest = start.calibration.calibration.imu, start.noise_at_rest
+        self._imu_noise, self._noise_at_rest = start.calibration.calibration.imu, start.noise_at_rest
         cameras = len(start.calibration.calibration.cameras)
         self._observations, self._turns = TrackTable(cameras), Turns(cameras)
         dof = np.arange(1, 2 * cameras * options.max_clones + 3)
@@ -53,6 +55,7 @@ class Msckf:
     def process(self, imu: ImuSegment, tracks: FrameTracks, still: bool) -> Estimate:
         """Filter one frame."""
         options, state, observations, watch = self._options, self.state, self._observations, Stopwatch()
+        noise, gate = self.noise, self._gate
         if still and hold_still(state, imu, self._noise_at_rest, options.first_estimate_jacobians):
             watch.lap("standstill")
             return Estimate(
@@ -63,7 +66,7 @@ class Msckf:
             )
         watch.lap("standstill")
 
-        state.propagate(imu, noise_over(imu, self._noise_at_rest, self._noise), options.first_estimate_jacobians)
+        state.propagate(imu, noise_over(imu, self._noise_at_rest, self._imu_noise), options.first_estimate_jacobians)
         state.augment_clone(imu.gyro_B[-1] - state.bias_gyro_B)
         observations.add_frame(tracks.only(~np.isin(tracks.ids, state.landmark_ids)))
         self._turns.add_frame(tracks)
@@ -71,11 +74,11 @@ class Msckf:
         watch.lap("propagate")
 
         selection = select_tracks(observations, state, options, full)
-        ids, p_WF = update_from_tracks(state, observations, selection.finished, options, self._gate)
+        ids, p_WF = update_from_tracks(state, observations, selection.finished, options, noise, gate)
         watch.lap("msckf_update")
-        used = update_from_landmarks(state, tracks, self._turns.in_sight, options, self._gate)
+        used = update_from_landmarks(state, tracks, self._turns.in_sight, options, noise, gate)
         watch.lap("landmark_update")
-        promoted = promote_tracks(state, observations, selection.promoted, options, self._gate)
+        promoted = promote_tracks(state, observations, selection.promoted, options, noise, gate)
         watch.lap("delayed_init")
 
         observations.drop(np.concatenate([selection.finished, promoted]))

@@ -23,6 +23,9 @@ from vioframe_msckf.measurement import (
 from vioframe_msckf.options import MsckfOptions
 from vioframe_msckf.state import IMU, FilterState, compress
 
+# How much larger noise is taken for than it is at least, and how many tracks it is found by.
+_AT_FIRST, _AT_MOST, _REMEMBERED = 1.4, 4.0, 100
+
 
 @dataclass(frozen=True, slots=True)
 class Selection:
@@ -68,23 +71,52 @@ def select_tracks(observations: TrackTable, state: FilterState, options: MsckfOp
     return Selection(rest[order][: options.max_features], promoted)
 
 
+class PointNoise:
+    """The standard deviation of a tracked point, px: at least what the options say, and more where tracks fit worse.
+
+    A gate that takes noise for smaller than it is turns good tracks away, the long ones first; what is too large for a
+    while does less harm, and so it begins.
+    """
+
+    def __init__(self, least_px: float) -> None:
+        self._least_px, self.px = least_px, _AT_FIRST * least_px
+
+    def add(self, excess: Float) -> None:
+        """Go by (N,) tracks' Mahalanobis distances over their medians: 1 in the middle, where the noise is right.
+
+        Not all that is accepted, which would agree with any noise; of several the middle one is no outlier. Each counts
+        for one of the last ``_REMEMBERED``.
+        """
+        found = excess[excess > 0.0]
+        if len(found):
+            share = len(found) / (len(found) + _REMEMBERED)
+            px = self.px * float(np.median(found)) ** (0.5 * share)
+            self.px = min(max(px, self._least_px), _AT_MOST * self._least_px)
+
+
 def update_from_tracks(
-    state: FilterState, observations: TrackTable, rows: NDArray[np.intp], options: MsckfOptions, gate: Float
+    state: FilterState,
+    observations: TrackTable,
+    rows: NDArray[np.intp],
+    options: MsckfOptions,
+    noise: PointNoise,
+    gate: Float,
 ) -> tuple[Int, Float]:
     """The multi-state constraint update; returns ids and positions of the landmarks it accepted."""
     columns = slice(IMU, state.landmarks_begin)
-    H, residual, p_WF, verdict = msckf_rows(
+    H, residual, p_WF, excess, verdict = msckf_rows(
         Window.of(state, options.first_estimate_jacobians),
         observations.xy[rows],
         observations.xy_normalised[rows],
         observations.seen[rows],
         np.ascontiguousarray(state.cov[columns, columns]),
-        options.pixel_sigma,
+        noise.px,
         gate,
     )
     if len(residual):
         H, residual = compress(H, residual)
-        state.update(H, residual, columns, options.pixel_sigma**2)
+        state.update(H, residual, columns, noise.px**2)
+    noise.add(excess)
     accepted = verdict == ACCEPTED
     return observations.ids[rows[accepted]], p_WF[accepted]
 
@@ -124,7 +156,7 @@ class Turns:
 
 
 def update_from_landmarks(
-    state: FilterState, tracks: FrameTracks, in_sight: Int, options: MsckfOptions, gate: Float
+    state: FilterState, tracks: FrameTracks, in_sight: Int, options: MsckfOptions, noise: PointNoise, gate: Float
 ) -> int:
     """Update with the landmarks of the state seen in the newest frame; implausible ones leave, and all not in sight.
 
@@ -141,7 +173,7 @@ def update_from_landmarks(
     blocks, residual = landmark_blocks(
         state, newest, landmarks, cameras, tracks.xy[rows], options.first_estimate_jacobians
     )
-    HP, S = state.innovation(newest, landmarks, cameras, blocks, options.pixel_sigma**2)
+    HP, S = state.innovation(newest, landmarks, cameras, blocks, noise.px**2)
     accepted = distances(S, residual) < gate[2]
     if accepted.any():
         use = np.repeat(accepted, 2)
@@ -152,7 +184,12 @@ def update_from_landmarks(
 
 
 def promote_tracks(
-    state: FilterState, observations: TrackTable, rows: NDArray[np.intp], options: MsckfOptions, gate: Float
+    state: FilterState,
+    observations: TrackTable,
+    rows: NDArray[np.intp],
+    options: MsckfOptions,
+    noise: PointNoise,
+    gate: Float,
 ) -> NDArray[np.intp]:
     """Take the tracks ``rows`` into the state as landmarks; returns the rows used up, promoted or implausible.
 
@@ -160,12 +197,12 @@ def promote_tracks(
     an orthogonal transformation leaves to the landmark initialise it, the others update the state.
     """
     used = []
-    variance = options.pixel_sigma**2
+    variance = noise.px**2
     for row in rows:
         # Every promotion updates the state, so each is linearised at the estimate the last one left.
         window = Window.of(state, options.first_estimate_jacobians)
         ok, p_WF, H, H_f, residual = track_rows(
-            window, observations.xy[row], observations.xy_normalised[row], observations.seen[row], options.pixel_sigma
+            window, observations.xy[row], observations.xy_normalised[row], observations.seen[row], noise.px
         )
         if not ok:
             continue
