@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from typing import Annotated
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field
 
 from vioframe.frontend.distinct import distinct
@@ -46,7 +47,7 @@ class Random:
         return Keypoints(xy[taken], drawn[order[taken]])
 
 
-def _scrambled(image: Image) -> np.ndarray:
+def _scrambled(image: Image) -> NDArray[np.float32]:
     """(H, W) numbers from 0 to 1 in which nothing is left to be seen of the image (multiplicative hashing)."""
     around = np.pad(image, 1, mode="edge").astype(np.uint32)
     bits = around[1:-1, 1:-1] + (around[1:-1, 2:] << 8) + (around[2:, 1:-1] << 16) + (around[:-2, :-2] << 24)
