@@ -33,7 +33,6 @@ class Msckf:
 
     def __init__(self, options: MsckfOptions | None = None) -> None:
         self._options = options or MsckfOptions()
-        self.noise = PointNoise(self._options.pixel_sigma)
 
     def begin(self, start: Start) -> None:
         """A filter with ``start``'s state and no clones."""
@@ -47,6 +46,7 @@ class Msckf:
             readout=options.calibrate_readout,
         )
         self._imu_noise, self._noise_at_rest = start.calibration.calibration.imu, start.noise_at_rest
+        self.noise = PointNoise(options.pixel_sigma)
         cameras = len(start.calibration.calibration.cameras)
         self._observations, self._turns = TrackTable(cameras), Turns(cameras)
         dof = np.arange(1, 2 * cameras * options.max_clones + 3)

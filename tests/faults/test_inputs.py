@@ -164,7 +164,7 @@ SURVIVED = {
     "imu gap of 1 s": Survived(missing(IMU, 0.0, 1.0), {"imu_gap": 1}, resets=1),
     "imu falls silent": Survived(missing(IMU, 2.0, 99.0), {"frame_after_imu": 0}),
     # Too little of the rest is left: it begins in flight.
-    "imu begins late": Survived(missing(IMU, -9.0, -4.7), {"frame_before_imu": 3}, times=5.0),
+    "imu begins late": Survived(missing(IMU, -9.0, -4.7), {"frame_before_imu": 3}, times=6.0),
     "imu stamp from the future": Survived(stamped(IMU, 0.005, lambda t: t + HOUR), {"imu_out_of_order": 1}),
     # The camera.
     "images black": Survived(painted(1.0, np.zeros_like), {"featureless_image": 10}, A_SECOND),
