@@ -113,7 +113,7 @@ def test_noise_of_points_is_found_where_it_is_larger_than_was_taken_for_granted(
     counts, filters, begin = GateCounts(monkeypatch), [], Msckf.begin
     monkeypatch.setattr(Msckf, "begin", lambda self, start: filters.append(self) or begin(self, start))
     fly(simulated_sequence("figure_eight", pixel_sigma=flown_px, seed=1, duration_s=15.0), MsckfOptions(), 1)
-    assert filters[-1].noise.px == pytest.approx(found_px, rel=0.07)
+    assert filters[-1].point_noise.px == pytest.approx(found_px, rel=0.07)
     if flown_px >= found_px:
         # With 0.7 px the gate would accept 6 % of them.
         assert counts.rates[0] > 0.85

@@ -46,7 +46,7 @@ class Msckf:
             readout=options.calibrate_readout,
         )
         self._imu_noise, self._noise_at_rest = start.calibration.calibration.imu, start.noise_at_rest
-        self.noise = PointNoise(options.pixel_sigma)
+        self.point_noise = PointNoise(options.pixel_sigma)
         cameras = len(start.calibration.calibration.cameras)
         self._observations, self._turns = TrackTable(cameras), Turns(cameras)
         dof = np.arange(1, 2 * cameras * options.max_clones + 3)
@@ -55,7 +55,7 @@ class Msckf:
     def process(self, imu: ImuSegment, tracks: FrameTracks, still: bool) -> Estimate:
         """Filter one frame."""
         options, state, observations, watch = self._options, self.state, self._observations, Stopwatch()
-        noise, gate = self.noise, self._gate
+        point_noise, gate = self.point_noise, self._gate
         if still and hold_still(state, imu, self._noise_at_rest, options.first_estimate_jacobians):
             watch.lap("standstill")
             return Estimate(
@@ -74,11 +74,11 @@ class Msckf:
         watch.lap("propagate")
 
         selection = select_tracks(observations, state, options, full)
-        ids, p_WF = update_from_tracks(state, observations, selection.finished, options, noise, gate)
+        ids, p_WF = update_from_tracks(state, observations, selection.finished, options, point_noise, gate)
         watch.lap("msckf_update")
-        used = update_from_landmarks(state, tracks, self._turns.in_sight, options, noise, gate)
+        used = update_from_landmarks(state, tracks, self._turns.in_sight, options, point_noise, gate)
         watch.lap("landmark_update")
-        promoted = promote_tracks(state, observations, selection.promoted, options, noise, gate)
+        promoted = promote_tracks(state, observations, selection.promoted, options, point_noise, gate)
         watch.lap("delayed_init")
 
         observations.drop(np.concatenate([selection.finished, promoted]))

@@ -99,7 +99,7 @@ def update_from_tracks(
     observations: TrackTable,
     rows: NDArray[np.intp],
     options: MsckfOptions,
-    noise: PointNoise,
+    point_noise: PointNoise,
     gate: Float,
 ) -> tuple[Int, Float]:
     """The multi-state constraint update; returns ids and positions of the landmarks it accepted."""
@@ -110,13 +110,13 @@ def update_from_tracks(
         observations.xy_normalised[rows],
         observations.seen[rows],
         np.ascontiguousarray(state.cov[columns, columns]),
-        noise.px,
+        point_noise.px,
         gate,
     )
     if len(residual):
         H, residual = compress(H, residual)
-        state.update(H, residual, columns, noise.px**2)
-    noise.add(excess)
+        state.update(H, residual, columns, point_noise.px**2)
+    point_noise.add(excess)
     accepted = verdict == ACCEPTED
     return observations.ids[rows[accepted]], p_WF[accepted]
 
@@ -156,7 +156,7 @@ class Turns:
 
 
 def update_from_landmarks(
-    state: FilterState, tracks: FrameTracks, in_sight: Int, options: MsckfOptions, noise: PointNoise, gate: Float
+    state: FilterState, tracks: FrameTracks, in_sight: Int, options: MsckfOptions, point_noise: PointNoise, gate: Float
 ) -> int:
     """Update with the landmarks of the state seen in the newest frame; implausible ones leave, and all not in sight.
 
@@ -173,7 +173,7 @@ def update_from_landmarks(
     blocks, residual = landmark_blocks(
         state, newest, landmarks, cameras, tracks.xy[rows], options.first_estimate_jacobians
     )
-    HP, S = state.innovation(newest, landmarks, cameras, blocks, noise.px**2)
+    HP, S = state.innovation(newest, landmarks, cameras, blocks, point_noise.px**2)
     accepted = distances(S, residual) < gate[2]
     if accepted.any():
         use = np.repeat(accepted, 2)
@@ -188,7 +188,7 @@ def promote_tracks(
     observations: TrackTable,
     rows: NDArray[np.intp],
     options: MsckfOptions,
-    noise: PointNoise,
+    point_noise: PointNoise,
     gate: Float,
 ) -> NDArray[np.intp]:
     """Take the tracks ``rows`` into the state as landmarks; returns the rows used up, promoted or implausible.
@@ -197,12 +197,12 @@ def promote_tracks(
     an orthogonal transformation leaves to the landmark initialise it, the others update the state.
     """
     used = []
-    variance = noise.px**2
+    variance = point_noise.px**2
     for row in rows:
         # Every promotion updates the state, so each is linearised at the estimate the last one left.
         window = Window.of(state, options.first_estimate_jacobians)
         ok, p_WF, H, H_f, residual = track_rows(
-            window, observations.xy[row], observations.xy_normalised[row], observations.seen[row], noise.px
+            window, observations.xy[row], observations.xy_normalised[row], observations.seen[row], point_noise.px
         )
         if not ok:
             continue

@@ -316,13 +316,13 @@ class Duel(NamedTuple):
 
         They have the world and the path in common. NaN where there are fewer than ``ENOUGH_TO_DRAW_FROM`` of those.
         """
-        together = self.pairs.groupby(["sequence", "seed"])["log_ratio"].agg(["sum", "count"]).to_numpy()
+        both = self.pairs.dropna(subset="log_ratio")
+        together = both.groupby(["sequence", "seed"])["log_ratio"].agg(["sum", "count"]).to_numpy()
         if len(together) < ENOUGH_TO_DRAW_FROM:
             return np.nan, np.nan
         drawn = np.random.default_rng(0).integers(len(together), size=(_DRAWS, len(together)))
         sums, counts = together[drawn].sum(axis=1).T
-        tails = [0.5 - 0.5 * CONFIDENCE, 0.5 + 0.5 * CONFIDENCE]
-        low, high = np.exp(np.quantile(sums[counts > 0] / counts[counts > 0], tails)) if counts.any() else [np.nan] * 2
+        low, high = np.exp(np.quantile(sums / counts, [0.5 - 0.5 * CONFIDENCE, 0.5 + 0.5 * CONFIDENCE]))
         return float(low), float(high)
 
     @property

@@ -502,7 +502,7 @@ def _circumstances(own: pd.DataFrame) -> Entries:
     }
 
 
-def links(own: pd.DataFrame, *, named: bool = False, whose: str = "") -> tuple[tuple[str, str], ...]:
+def links(own: pd.DataFrame, *, named: bool = False) -> tuple[tuple[str, str], ...]:
     """(seed, folder relative to the results) of flights or trials that left one, ``named`` by their sequence."""
     rows = records(own[own["folder"].notna()])
-    return tuple((f"{row['sequence'] + ', ' if named else ''}seed {row['seed']}{whose}", row["folder"]) for row in rows)
+    return tuple((f"{row['sequence'] + ', ' if named else ''}seed {row['seed']}", row["folder"]) for row in rows)
