@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import replace
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from threadpoolctl import threadpool_limits
 
 from vioframe.bench import BackendRun, run_backend
 from vioframe.errors import ConfigError
+from vioframe.estimation.factors.solver import Solution, solve
 from vioframe.estimation.factors.tracks import TrackTable
 from vioframe.estimation.inertial.preintegration import Preintegrated, join_segments, preintegrate
 from vioframe.estimation.lifecycle import LifeCycle
@@ -27,7 +29,7 @@ from vioframe.simulation.tracks import TrackOptions, TrackSimulator
 from vioframe.types import DTHETA, CameraOnBody, Estimate, Float, FrameTracks, NavState, Status
 from vioframe_sliding_window.backend import SlidingWindow
 from vioframe_sliding_window.options import SlidingWindowOptions as Options
-from vioframe_sliding_window.window import Window, parallax
+from vioframe_sliding_window.window import parallax
 
 UP = np.array([0.0, 0.0, 1.0])
 CALIBRATED = Options(calibrate_extrinsics=False, calibrate_time_offset=False)
@@ -305,13 +307,13 @@ def test_cameras_that_take_turns_have_parallax_each_to_its_own_last_frame():
 def test_iterations_are_bounded_in_number_and_time(monkeypatch):
     sequence = simulated_sequence("aggressive", seed=1, duration_s=3.0)
     taken: list[int] = []
-    optimise = Window.optimise
 
-    def counted(window: Window) -> int:
-        taken.append(optimise(window))
-        return taken[-1]
+    def counted(*problem: Any, **limits: Any) -> Solution:
+        solution = solve(*problem, **limits)
+        taken.append(solution.iterations)
+        return solution
 
-    monkeypatch.setattr(Window, "optimise", counted)
+    monkeypatch.setattr("vioframe_sliding_window.window.solve", counted)
     most = {}
     for name, options in {
         "eight": Options(),

@@ -72,8 +72,7 @@ class SlidingWindow:
         window.repropagate()
         window.triangulate()
         watch.lap("triangulate")
-        window.optimise()
-        _check_agreement(*window.reject_outliers())
+        _check_agreement(*window.optimise())
         watch.lap("optimise")
         ids, p_WF = window.landmarks()
         newest = window.newest

@@ -56,6 +56,9 @@ from vioframe.types import (
 )
 from vioframe_sliding_window.options import SlidingWindowOptions
 
+# What a step must lower the cost by for another to follow: 1 is sqrt(2) standard deviations of all unknowns together,
+# and the next frame begins where this one ended.
+_DECREASE = 1.0
 # Biases that moved farther from those the readings were integrated with have them integrated anew, rad/s and m/s^2.
 _REPROPAGATE_GYRO, _REPROPAGATE_ACCEL = 0.01, 0.1
 
@@ -213,30 +216,26 @@ class Window:
             ):
                 self._readings[k] = reading.repropagated(gyro, accel)
 
-    def optimise(self) -> int:
-        """Move states, calibration and landmarks to where all factors agree best; returns the number of steps."""
+    def optimise(self) -> tuple[int, int]:
+        """Move states, calibration and landmarks to where all factors agree best, and drop tracks that do not fit.
+
+        Returns how many of these the newest frame saw, and of how many.
+        """
         options, rows = self._options, np.flatnonzero(self.tracks.known)
         solution = solve(
             self._problem(self._readings, self._still, self._sightings(rows)),
             self._variables(rows),
             self._active(),
             options.max_iterations,
+            decrease=_DECREASE,
             max_seconds=1e-3 * options.max_solve_ms,
         )
         x = solution.variables
         self._states, self._cameras, self.tracks.landmarks[rows] = x.states, x.cameras, x.landmarks
         self._cov, self._camera_sigma = self._covariance(solution.normal)
-        return solution.iterations
-
-    def reject_outliers(self) -> tuple[int, int]:
-        """Drop tracks that do not fit; how many the newest frame saw, and of how many."""
-        tracks = self.tracks
-        rows = np.flatnonzero(tracks.known)
-        x = self._variables(rows)
-        errors = self._sightings(rows).errors(x.poses, x.cameras, x.landmarks)
-        bad = (errors * self._options.pixel_sigma > self._options.outlier_px) | (x.landmarks[:, 2] <= 0.0)
-        newest = tracks.in_sight()[rows]
-        tracks.drop(rows[bad])
+        bad = (solution.normal.errors * options.pixel_sigma > options.outlier_px) | (x.landmarks[:, 2] <= 0.0)
+        newest = self.tracks.in_sight()[rows]
+        self.tracks.drop(rows[bad])
         return int((bad & newest).sum()), int(newest.sum())
 
     @property

@@ -40,12 +40,13 @@ def solve(
     active: Int,
     max_iterations: int,
     relative_decrease: float = 1e-3,
+    decrease: float = 0.0,
     max_seconds: float = 0.0,
 ) -> Solution:
     """Minimise from ``x`` over the entries ``active`` of the error vector; the others stay.
 
-    It has converged where a step lowers the cost by less than ``relative_decrease``. ``max_seconds`` ends it early,
-    where it is not zero. Raises ``LinAlgError`` where nothing finite comes out.
+    It has converged where a step lowers the cost by less than ``decrease`` or, as a part of it, ``relative_decrease``.
+    ``max_seconds`` ends it early, where it is not zero. Raises ``LinAlgError`` where nothing finite comes out.
     """
     begin_s = working_s()
     damping, normal = _FIRST_DAMPING, problem.linearise(x)
@@ -60,7 +61,8 @@ def solve(
             if damping > _LARGEST_DAMPING or not np.isfinite(trial_normal.cost):
                 # No step leads down: a minimum to rounding.
                 return _finite(Solution(x, normal, iteration, bool(np.isfinite(trial_normal.cost))))
-        small = normal.cost - trial_normal.cost < relative_decrease * max(abs(trial_normal.cost), 1.0)
+        least = max(decrease, relative_decrease * max(abs(trial_normal.cost), 1.0))
+        small = normal.cost - trial_normal.cost < least
         x, normal, damping = trial, trial_normal, 0.1 * damping
         if small or 0.0 < max_seconds < working_s() - begin_s:
             return _finite(Solution(x, normal, iteration + 1, small))
