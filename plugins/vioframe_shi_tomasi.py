@@ -27,7 +27,7 @@ class ShiTomasi:
     def __init__(
         self,
         *,
-        quality_level: Annotated[float, "score of the weakest corner kept, relative to the strongest"] = 0.01,
+        quality_level: Annotated[float, "score of the weakest corner kept, relative to the strongest"] = 0.001,
         min_distance_px: Annotated[float, "smallest distance between corners"] = 10.0,
     ) -> None:
         self._quality_level = quality_level
