@@ -514,22 +514,21 @@ def comparison() -> str:
 
 def stress() -> str:
     """The suite ``stress``: the ATE over Shi-Tomasi's by condition, with its interval over the worlds."""
-    table = pd.read_csv(HERE / "results" / "stress" / "duels.csv")
     shown: dict[str, dict[str, str]] = {}
-    for _, row in table.iterrows():
+    for _, row in _duels("stress").iterrows():
         at = shown.setdefault(row["condition"], {"": row["condition"]})
-        at[f"`{row['detector']}`, `{row['back-end']}`"] = _with_interval(row, _ratio(table))
+        at[f"`{row['detector']}`, `{row['back-end']}`"] = _with_interval(row)
     return markdown(shown.values()) + suite_source("stress")
 
 
 def contest() -> str:
     """The same over all degraded flights together, with who won."""
-    table = pd.read_csv(HERE / "results" / "stress" / "duels.csv")
+    table = _duels("stress")
     shown = [
         {
             "detector": f"`{row['detector']}`",
             "back-end": f"`{row['back-end']}`",
-            "ATE over that of `shi_tomasi`": _with_interval(row, _ratio(table)),
+            "ATE over that of `shi_tomasi`": _with_interval(row),
             "n, pairs": f"{row['of pairs']}",
             "won - lost": f"{row['won']} - {row['lost']}",
             "p, Holm": f"{row['p, Holm']:.3f}",
@@ -539,14 +538,10 @@ def contest() -> str:
     return markdown(shown) + suite_source("stress")
 
 
-def _with_interval(row: pd.Series, ratio: str) -> str:
-    return f"{row[ratio]:.2f} ({row['95 % from']:.2f} to {row['to']:.2f})"
-
-
 def tuning() -> str:
     """The suite ``tuning``: what each variant reaches by Shi-Tomasi's ATE, in the clear and in all that is degraded."""
-    table = pd.read_csv(HERE / "results" / "tuning" / "duels.csv")
-    ratios = table.pivot_table(index="detector", columns=["back-end", "condition"], values=_ratio(table), sort=False)
+    table = _duels("tuning")
+    ratios = table.pivot_table(index="detector", columns=["back-end", "condition"], values="ratio", sort=False)
     conditions = "clear", "all degraded"
     shown = [
         {"": f"`{detector}`"}
@@ -559,8 +554,14 @@ def tuning() -> str:
     return markdown(shown) + suite_source("tuning")
 
 
-def _ratio(table: pd.DataFrame) -> str:
-    return next(name for name in table.columns if name.startswith("ATE over that of"))
+def _duels(suite: str) -> pd.DataFrame:
+    """What its table of duels says, the column of the ATE over the baseline's as ``ratio``."""
+    table = pd.read_csv(HERE / "results" / suite / "duels.csv")
+    return table.rename(columns=lambda name: "ratio" if name.startswith("ATE over that of") else name)
+
+
+def _with_interval(row: pd.Series) -> str:
+    return f"{row['ratio']:.2f} ({row['95 % from']:.2f} to {row['to']:.2f})"
 
 
 def throughput() -> str:
