@@ -104,11 +104,12 @@ def adjust(scene: VisionMap, sigma: float, held: int, iterations: int) -> None:
     to_plane = np.tile(np.eye(2), (*seen.shape, 1, 1))
     sightings = Sightings(seen, xy, np.zeros(xy.shape), to_plane, sigma, _WIDTH)
     problem = Problem(weak, ImuFactors.stack([]), {}, sightings, first_estimates=False)
-    x = solve(problem, Variables(states, camera, landmarks), columns[6 * held :], iterations).variables
+    solution = solve(problem, Variables(states, camera, landmarks), columns[6 * held :], iterations)
+    x = solution.variables
 
     scene.poses = [VisionPose(R, p) for R, p in zip(x.states.R_WB, x.states.p_WB, strict=True)]
     scene.p_VF[rows] = positions(x.states, camera, hosts, x.landmarks)
-    errors = np.sqrt(2.0) * sightings.errors(x.poses, camera, x.landmarks)
+    errors = np.sqrt(2.0) * solution.normal.errors
     scene.known[rows] = in_front & (errors < _LARGEST_ERROR) & (x.landmarks[:, 2] > 0.0)
 
 

@@ -288,7 +288,7 @@ def _check_fit(problem: Problem, solution: Solution) -> None:
     """Observations, readings and biases must be as the noise and the priors have them."""
     refuse_unless(solution.converged, "the bundle adjustment did not converge")
     x, sightings = solution.variables, problem.sightings
-    errors = sightings.errors(x.poses, x.cameras, x.landmarks)
+    errors = solution.normal.errors
     used = ~np.isinf(errors)  # what is behind a camera is let go of, and says nothing of the others
     views = sightings.seen.sum(axis=1)[used]
     rms = sightings.sigma * float(np.sqrt((views * errors[used] ** 2).sum() / views.sum()))
