@@ -345,7 +345,27 @@ def test_new_points_keep_their_distance_and_spread():
     assert max(cells.values()) - min(cells.values()) <= 1
 
 
-def test_spread_fills_the_emptiest_cell_with_its_strongest():
+def test_points_that_are_lost_at_once_do_not_keep_others_out():
+    """In every cell of the refill's grid a strip looks anew each time, and what lies on it is the strongest."""
+    still, wide = view(np.eye(3)), 320 // GRID[1]
+    flickering = np.arange(320) % wide >= wide - 12
+
+    def seen(k: int) -> np.ndarray:
+        image = still.copy()
+        image[:, flickering] = np.random.default_rng(k).integers(0, 256, (240, flickering.sum()))
+        return image
+
+    rng, cells = np.random.default_rng(0), wide * np.arange(GRID[1])
+    lost, lasting = (
+        np.column_stack([np.repeat(cells, 20) + rng.uniform(*reach, 160), rng.uniform(10.0, 230.0, 160)])
+        for reach in ((wide - 8, wide - 4), (8, 14))
+    )
+    detector = Scripted(lambda image, n: keypoints(*np.vstack([lost, lasting])[:n]))
+    tracks = play(frontend(detector, max_points=60, min_distance_px=3.0, klt_levels=0), map(seen, range(15)))[-1]
+    assert np.mean(tracks.xy[:, 0] % wide < wide // 2) > 0.8
+
+
+def test_spread_fills_the_emptiest_cell_with_the_first_in_it():
     candidates = np.array([[10, 10], [30, 10], [80, 10], [70, 30], [20, 80]], float)
     live = np.array([[90, 90], [40, 90]], float)
     taken = spread(candidates, live, 3, size=(100, 100), grid=(2, 2), min_distance_px=5.0)

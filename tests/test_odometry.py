@@ -279,7 +279,7 @@ def test_what_a_detector_prints_does_no_harm(tmp_path, monkeypatch, capfd):
     odometry = apart("talkative", tmp_path, monkeypatch)
     assert len(next(odometry.follow(short_flight())).tracks.ids) == 2
     out, err = capfd.readouterr()
-    assert (out, err.splitlines()[0]) == ("", "looking 450")
+    assert (out, err.splitlines()[0]) == ("", "looking 900")
 
 
 def test_a_process_that_dies_is_an_error_with_a_remedy(tmp_path, monkeypatch):

@@ -63,7 +63,7 @@ def flown(count: int, calibration=RIG):
     return [tuple(shown(camera, 0.02 * k) for camera in calibration.cameras) for k in range(count)]
 
 
-@pytest.mark.parametrize(("model", "median_px"), [(CAMERA, 0.1), (SMALLER, 0.5)], ids=["alike", "smaller"])
+@pytest.mark.parametrize(("model", "median_px"), [(CAMERA, 0.12), (SMALLER, 0.5)], ids=["alike", "smaller"])
 def test_what_both_cameras_see_has_one_id_and_lies_on_the_wall(model, median_px):
     calibration = rig(beside(model=model))
     steps = play(calibration, flown(6, calibration))
@@ -75,7 +75,7 @@ def test_what_both_cameras_see_has_one_id_and_lies_on_the_wall(model, median_px)
     for tracks in steps:
         ids, left, right = pairs(tracks)
         _, in_view = projected(model, on_wall(tracks.of_camera(0).xy_normalised))
-        assert len(ids) > 0.7 * in_view.sum() > 20
+        assert len(ids) > 0.6 * in_view.sum() > 20
         expected, _ = projected(model, on_wall(left))
         off_px = np.linalg.norm(model.distort(right) - expected, axis=1)
         assert np.median(off_px) < median_px

@@ -39,10 +39,10 @@ def spread(
     min_distance_px: float,
     grid: tuple[int, int] = GRID,
 ) -> Int:
-    """(<= count,) indices of the candidates to take: strongest first from whichever grid cell holds the fewest points.
+    """(<= count,) indices of the candidates to take: each is the first in whichever grid cell holds the fewest points.
 
-    ``candidates`` (N, 2) px, strongest first, inside the image of ``size`` (width, height); ``live`` (M, 2) px.
-    Everything taken is at least ``min_distance_px`` from ``live`` and from each other.
+    ``candidates`` (N, 2) px inside the image of ``size`` (width, height); ``live`` (M, 2) px. Everything taken is at
+    least ``min_distance_px`` from ``live`` and from each other.
     """
     rows, columns = grid
 

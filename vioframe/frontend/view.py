@@ -28,8 +28,8 @@ _FROZEN_PX = 1.0
 _BORDER_PX = 5.0
 # A point followed there and back must return to within this of where it was.
 FORWARD_BACKWARD_PX = 1.0
-# Candidates asked of the detector, as a multiple of the points wanted; most fall near live tracks.
-_CANDIDATES_PER_POINT = 3
+# Candidates asked of the detector, as a multiple of the points wanted: all over the image, not where contrast is best.
+_CANDIDATES_PER_POINT = 6
 # The 5-, 7- and 8-point solvers need more points than that before an odd one out can be told.
 _FEWEST_TO_JUDGE = 10
 
@@ -59,6 +59,7 @@ class View:
         self._candidates = CandidateSource(detector, camera, _BORDER_PX, incidents)
         self._options = options
         self._incidents = incidents
+        self._dice = np.random.default_rng(0)
         self._image: Image | None = None
         self._pyramid: Pyramid | None = None
         self._anchors: Anchors | None = None
@@ -97,13 +98,18 @@ class View:
             self.xy_normalised = camera.undistort(self.xy)
 
     def refill(self, next_id: int, t_ns: int) -> int:
-        """Take new points where there are fewest, once enough tracks are lost; returns the id of the next one."""
+        """Draw new points where there are fewest, once enough tracks are lost; returns the id of the next one.
+
+        They are drawn, not the strongest taken: these lie on outlines more often than others, slide along them and are
+        lost, only to be taken again. Of what is drawn, whatever can be followed stays.
+        """
         options, camera, image = self._options, self.camera, self._image
         assert image is not None
         self.keep(thin(self.xy, self.ids, 0.5 * options.min_distance_px))
         if len(self.ids) >= options.refill_below * options.max_points:
             return next_id
         candidates = self._candidates.ask(image, _CANDIDATES_PER_POINT * options.max_points, t_ns)
+        candidates = self._dice.permutation(candidates)
         taken = spread(
             candidates,
             self.xy,
