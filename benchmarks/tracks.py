@@ -1,0 +1,111 @@
+"""How long each detector's points are followed, and how far they stray from their landmarks, in worlds for reporting.
+
+    python benchmarks/tracks.py [--record]
+
+Simulated flights with EuRoC's true motion, in the clear and under conditions, the same ones for every detector, by the
+front-end alone. A track that is not lost to the end of the recording counts as long as that.
+"""
+
+from collections.abc import Iterator
+from itertools import product
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import click
+import numpy as np
+from common import SHARED_DATA, present, render
+from rendered_flights import seeds
+from threadpoolctl import threadpool_limits
+
+from vioframe.bench import Row
+from vioframe.evaluation.tracks import TrackLives, track_lives
+from vioframe.frontend import Frontend, FrontendOptions
+from vioframe.geometry.meshes import read_mesh
+from vioframe.incidents import Incidents
+from vioframe.io.synchronise import synchronise
+from vioframe.parts import registry
+from vioframe.parts.config import PartConfig
+from vioframe.parts.registry import Registry
+from vioframe.simulation.config import MESH, SimulationConfig, simulation_folder
+
+FLIGHT, START_S, DURATION_S = "V1_02_medium", 5.0, 15.0
+LEVEL = 0.67
+CONDITIONS = ("", "motion_blur", "low_light", "low_texture")
+WORLDS = 3
+# As the suite stress flies them.
+DETECTORS = {
+    "shi_tomasi": {"min_distance_px": 20.0},
+    "orb": {"levels": 1},
+    "keypointnet": {"threads": 1, "nms_px": 8.0},
+    "random": {},
+}
+COLUMNS = {
+    "condition": "",
+    "world": "d",
+    "detector": "",
+    "tracks": "d",
+    "life.median": ".0f",
+    "life.mean": ".1f",
+    "drift_px.median": ".2f",
+    "drift_px.p95": ".2f",
+}
+
+
+@click.command()
+@click.option("--record", "keep", is_flag=True, help="Write the results to benchmarks/results.")
+@click.option(
+    "--data",
+    type=click.Path(exists=True, file_okay=False, path_type=Path),
+    default=SHARED_DATA,
+    help="Folder of the recordings.  [default: ../shared/data]",
+)
+def main(keep: bool, data: Path) -> None:
+    """Tracks of each detector against the truth."""
+    installed = registry.load()
+
+    def rows() -> Iterator[Row]:
+        with TemporaryDirectory() as temporary, threadpool_limits(1):
+            for condition, world in product(CONDITIONS, seeds(WORLDS)):
+                bag = Path(temporary) / "flight.bag"
+                flown = SimulationConfig(
+                    recorded=data / "euroc_imu_gt" / FLIGHT,
+                    start_s=START_S,
+                    duration_s=DURATION_S,
+                    seed=world,
+                    conditions={condition: LEVEL} if condition else {},
+                )
+                render(flown, installed, bag)
+                for name, options in DETECTORS.items():
+                    row = {"condition": condition or "clear", "world": world, "detector": name}
+                    yield row | summary(lives(bag, PartConfig(name=name, options=options), installed))
+
+    settings = {"flight": FLIGHT, "duration_s": DURATION_S, "level": LEVEL, "detectors": DETECTORS}
+    present("tracks", "Images a track lives, and its distance from the truth, px", rows(), COLUMNS, settings, keep)
+
+
+def lives(bag: Path, detector: PartConfig, installed: Registry) -> TrackLives:
+    """Of the tracks through the simulated recording ``bag`` by the front-end with ``detector``."""
+    dataset = installed.open_dataset(bag)
+    calibration, truth = dataset.calibration, dataset.ground_truth
+    assert truth is not None  # it is simulated
+    made = installed.create_detector(detector.name, detector.options)
+    frontend = Frontend(made, calibration, FrontendOptions(), Incidents())
+    steps = [
+        frontend.track(imu, frames, calibration)
+        for imu, frames in synchronise(dataset.measurements(), incidents=Incidents())
+        if truth.covers([frames.t_ns])[0]
+    ]
+    return track_lives(steps, truth, calibration.cameras[0], read_mesh(simulation_folder(bag) / MESH))
+
+
+def summary(lives: TrackLives) -> Row:
+    drift_px = lives.drift_px[np.isfinite(lives.drift_px)]
+    return {
+        "tracks": len(lives.images),
+        "life": {"median": float(np.median(lives.images)), "mean": float(np.mean(lives.images))},
+        "drift_px": {"median": float(np.median(drift_px)), "p95": float(np.quantile(drift_px, 0.95))},
+    }
+
+
+if __name__ == "__main__":
+    main()
