@@ -353,6 +353,26 @@ def frontend() -> str:
     return markdown(shown) + source(rows)
 
 
+def tracks() -> str:
+    """How long each detector's tracks live and how far they stray: means over worlds, and over Shi-Tomasi's."""
+    rows = recorded("tracks.json")
+    measures = (
+        ("images lived", "life.median", ".1f"),
+        ("px off", "drift_px.median", ".2f"),
+        ("px off, 95 %", "drift_px.p95", ".2f"),
+    )
+    beside = rows[rows["detector"] == "shi_tomasi"].set_index(["condition", "world"])
+    shown = []
+    for (condition, detector), own in rows.groupby(["condition", "detector"], sort=False):
+        paired = own.set_index(["condition", "world"])
+        row = {"condition": str(condition).replace("_", " "), "detector": f"`{detector}`", "n, worlds": f"{len(own)}"}
+        for name, column, spec in measures:
+            ratios = paired[column] / beside.loc[paired.index, column]
+            row[name] = f"{own[column].mean():{spec}} ({geometric_mean(ratios):.2f})"
+        shown.append(row)
+    return markdown(shown) + source(rows)
+
+
 def whole_runs() -> str:
     """Whole runs on one core and on two, beside the yardstick; medians over the rounds."""
     rows = recorded("speed.json")
@@ -596,6 +616,7 @@ FIGURES: dict[str, Callable[[], str]] = {
             loops,
             april,
             frontend,
+            tracks,
             whole_runs,
             consistency,
             memory,
