@@ -38,10 +38,9 @@ from vioframe.arrays import Float, Int
 from vioframe.bench import Row, backend_row, run_backend
 from vioframe.bench.suites.sources import EUROC
 from vioframe.cores import usable_cores
+from vioframe.evaluation.tracks import landmarks_of
 from vioframe.frontend import Frontend
-from vioframe.geometry.meshes import ray_scene
 from vioframe.geometry.trajectory import Trajectory
-from vioframe.geometry.two_view import rays
 from vioframe.incidents import Incidents
 from vioframe.interfaces import Flight
 from vioframe.io.synchronise import synchronise
@@ -179,19 +178,13 @@ def follow(recording: SimulatedRecording, config: Config, installed: Registry, t
     frontend = Frontend(detector, calibration, config.frontend_options, incidents)
     packets = synchronise(recording.measurements(), incidents=incidents, time_offset_ns=offset_ns)
     tracks = [frontend.track(imu, frames, calibration) for imu, frames in packets]
-    (camera,), scene = calibration.cameras, ray_scene(recording.world.mesh.corners)
-    poses = zip(*true.motion(np.array([frame.t_ns for frame in tracks]))[:2], strict=True)
-    known: dict[int, Float] = {}
+    (camera,) = calibration.cameras
+    R_WB, p_WB = true.motion(np.array([frame.t_ns for frame in tracks]))[:2]
+    known = landmarks_of(tracks, R_WB @ camera.R_BC, p_WB + R_WB @ camera.p_BC, recording.world.mesh.corners)
     kept, landmarks, errors = [], [], []
-    for frame, (R_WB, p_WB) in zip(tracks, poses, strict=True):
-        new = np.array([i not in known for i in frame.ids.tolist()], bool)
-        R_WC, p_WC = R_WB @ camera.R_BC, p_WB + R_WB @ camera.p_BC
-        towards = rays(camera.model.undistort(frame.xy[new])) @ R_WC.T
-        cast = np.hstack([np.broadcast_to(p_WC, towards.shape), towards]).astype(np.float32)
-        distance = scene.cast_rays(cast)["t_hit"].numpy().astype(np.float64)
-        known.update(zip(frame.ids[new].tolist(), p_WC + distance[:, None] * towards, strict=True))
-        p_WF = np.array([known[i] for i in frame.ids.tolist()]).reshape(-1, 3)
-        xy, ahead = pixels(camera, R_WB, p_WB, p_WF)
+    for frame, *pose in zip(tracks, R_WB, p_WB, strict=True):
+        p_WF = known[frame.ids]
+        xy, ahead = pixels(camera, *pose, p_WF)
         kept.append(frame.only(ahead))
         landmarks.append(p_WF[ahead])
         errors.append(frame.xy[ahead] - xy[ahead])

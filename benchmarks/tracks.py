@@ -3,7 +3,8 @@
     python benchmarks/tracks.py [--record]
 
 Simulated flights with EuRoC's true motion, in the clear and under conditions, the same ones for every detector, by the
-front-end alone. A track that is not lost to the end of the recording counts as long as that.
+front-end alone, with the options that the suite stress has for each. A track that is not lost to the end of the
+recording counts as long as that.
 """
 
 from collections.abc import Iterator
@@ -13,11 +14,12 @@ from tempfile import TemporaryDirectory
 
 import click
 import numpy as np
-from common import SHARED_DATA, present, render
+from common import HERE, SHARED_DATA, present, render
 from rendered_flights import seeds
 from threadpoolctl import threadpool_limits
 
 from vioframe.bench import Row
+from vioframe.bench.suites import suite
 from vioframe.evaluation.tracks import TrackLives, track_lives
 from vioframe.frontend import Frontend, FrontendOptions
 from vioframe.geometry.meshes import read_mesh
@@ -32,13 +34,6 @@ FLIGHT, START_S, DURATION_S = "V1_02_medium", 5.0, 15.0
 LEVEL = 0.67
 CONDITIONS = ("", "motion_blur", "low_light", "low_texture")
 WORLDS = 3
-# As the suite stress flies them.
-DETECTORS = {
-    "shi_tomasi": {"min_distance_px": 20.0},
-    "orb": {"levels": 1},
-    "keypointnet": {"threads": 1, "nms_px": 8.0},
-    "random": {},
-}
 COLUMNS = {
     "condition": "",
     "world": "d",
@@ -62,6 +57,7 @@ COLUMNS = {
 def main(keep: bool, data: Path) -> None:
     """Tracks of each detector against the truth."""
     installed = registry.load()
+    detectors = suite.read(HERE / "suites" / "stress.yaml").detectors
 
     def rows() -> Iterator[Row]:
         with TemporaryDirectory() as temporary, threadpool_limits(1):
@@ -75,11 +71,12 @@ def main(keep: bool, data: Path) -> None:
                     conditions={condition: LEVEL} if condition else {},
                 )
                 render(flown, installed, bag)
-                for name, options in DETECTORS.items():
-                    row = {"condition": condition or "clear", "world": world, "detector": name}
-                    yield row | summary(lives(bag, PartConfig(name=name, options=options), installed))
+                for detector in detectors:
+                    row = {"condition": condition or "clear", "world": world, "detector": detector.called}
+                    yield row | summary(lives(bag, detector, installed))
 
-    settings = {"flight": FLIGHT, "duration_s": DURATION_S, "level": LEVEL, "detectors": DETECTORS}
+    options = {detector.called: detector.options for detector in detectors}
+    settings = {"flight": FLIGHT, "duration_s": DURATION_S, "level": LEVEL, "detectors": options}
     present("tracks", "Images a track lives, and its distance from the truth, px", rows(), COLUMNS, settings, keep)
 
 

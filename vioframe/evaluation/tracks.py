@@ -9,6 +9,7 @@ import numpy as np
 
 from vioframe.geometry.meshes import ray_scene
 from vioframe.geometry.trajectory import Trajectory
+from vioframe.geometry.two_view import rays
 from vioframe.types import CameraOnBody, Float, FrameTracks, Int
 
 
@@ -23,32 +24,42 @@ class TrackLives:
 
 
 def track_lives(
-    steps: Sequence[FrameTracks], ground_truth: Trajectory, camera: CameraOnBody, corners: Float, index: int = 0
+    steps: Sequence[FrameTracks], ground_truth: Trajectory, camera: CameraOnBody, corners: Float
 ) -> TrackLives:
-    """The lives of the tracks of ``camera``, at place ``index`` in the rig.
+    """The lives of the tracks of one ``camera``, in a world of triangles ``corners`` (T, 3, 3) m.
 
-    ``corners`` (T, 3, 3) m are the triangles of the world, ``ground_truth`` covers all ``steps``. The shutter is taken
-    for a global one. Left out: tracks that were found where the camera sees no surface.
+    ``ground_truth`` covers all ``steps``. The shutter is taken for a global one. Left out: tracks that were found where
+    the camera sees no surface.
     """
     truth = ground_truth.at([step.t_ns for step in steps])
     R_WC, p_WC = truth.R_WB @ camera.R_BC, truth.p_WB + truth.R_WB @ camera.p_BC
-    middle = 0.5 * (corners.min(axis=(0, 1)) + corners.max(axis=(0, 1)))  # rays are cast in single precision
-    scene = ray_scene(corners - middle)
-    seen = [step.of_camera(index) for step in steps]
-    count = 1 + max((int(tracks.ids.max()) for tracks in seen if len(tracks.ids)), default=-1)
-    p_WF, images, squared_px = np.full((count, 3), np.nan), np.full(count, -1), np.zeros(count)
-    for tracks, R, p in zip(seen, R_WC, p_WC, strict=True):
-        ids = tracks.ids
-        new = images[ids] < 0
-        ways_W = np.hstack([tracks.xy_normalised[new], np.ones((len(ids[new]), 1))]) @ R.T
-        rays = np.hstack([np.broadcast_to(p - middle, ways_W.shape), ways_W]).astype(np.float32)
-        depth_m = scene.cast_rays(rays)["t_hit"].numpy().astype(np.float64)
-        p_WF[ids[new]] = p + np.where(np.isfinite(depth_m), depth_m, np.nan)[:, None] * ways_W
-        images[ids] += 1
-        off_px = camera.model.project((p_WF[ids] - p) @ R) - tracks.xy
-        squared_px[ids] += np.where(new, 0.0, np.sum(off_px**2, axis=1))
-    known = np.isfinite(p_WF).all(axis=1)
+    p_WF = landmarks_of(steps, R_WC, p_WC, corners)
+    images, squared_px = np.full(len(p_WF), -1), np.zeros(len(p_WF))
+    for tracks, R, p in zip(steps, R_WC, p_WC, strict=True):
+        off_px = camera.model.project((p_WF[tracks.ids] - p) @ R) - tracks.xy
+        images[tracks.ids] += 1
+        squared_px[tracks.ids] += np.sum(off_px**2, axis=1)  # where it was found none
+    known = np.isfinite(squared_px)
     images, squared_px = images[known], squared_px[known]
-    drift_px = np.full(len(images), np.nan)
-    np.divide(squared_px, images, out=drift_px, where=images > 0)
-    return TrackLives(images, np.sqrt(drift_px))
+    mean_px = np.full(len(images), np.nan)
+    np.divide(squared_px, images, out=mean_px, where=images > 0)
+    return TrackLives(images, np.sqrt(mean_px))
+
+
+def landmarks_of(steps: Sequence[FrameTracks], R_WC: Float, p_WC: Float, corners: Float) -> Float:
+    """(K, 3) m where tracks of a camera lie on the surface of triangles ``corners`` (T, 3, 3), by their ids below K.
+
+    That is where they were found, the camera's poses in the ``steps`` being (S, 3, 3) and (S, 3). NaN where it saw no
+    surface, and for ids that are no track.
+    """
+    scene = ray_scene(corners)
+    p_WF = np.full((1 + max((int(step.ids.max(initial=-1)) for step in steps), default=-1), 3), np.nan)
+    found = np.zeros(len(p_WF), bool)
+    for tracks, R, p in zip(steps, R_WC, p_WC, strict=True):
+        new = tracks.only(~found[tracks.ids])
+        towards = rays(new.xy_normalised) @ R.T
+        cast = np.hstack([np.broadcast_to(p, towards.shape), towards]).astype(np.float32)
+        depth_m = scene.cast_rays(cast)["t_hit"].numpy().astype(np.float64)
+        p_WF[new.ids] = p + np.where(np.isfinite(depth_m), depth_m, np.nan)[:, None] * towards
+        found[new.ids] = True
+    return p_WF
