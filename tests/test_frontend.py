@@ -504,3 +504,28 @@ def test_contrast_is_spread_as_opencv_does(shape: tuple[int, int], contrast: flo
 
 def test_an_image_without_contrast_stays_so():
     assert len(np.unique(clahe(np.full((64, 64), 7, np.uint8)))) == 1
+
+
+class Ranking:
+    """Whole pixels 8 px apart in an order that says nothing of where they lie."""
+
+    def __init__(self):
+        x, y = np.meshgrid(np.arange(10, 312, 8), np.arange(10, 232, 8))
+        self.xy = np.random.default_rng(0).permutation(np.column_stack([x.ravel(), y.ravel()])).astype(np.float32)
+
+    def detect(self, image, max_points):
+        return Keypoints(self.xy[:max_points], np.linspace(1.0, 0.0, len(self.xy[:max_points]), dtype=np.float32))
+
+
+@pytest.mark.parametrize("knows", [True, False])
+def test_of_a_detector_that_knows_what_will_be_followed_the_first_are_taken(knows):
+    detector = Ranking()
+    if knows:
+        detector.best_first = True
+    (tracks,) = play(frontend(detector, max_points=100, min_distance_px=8.0), [view(np.eye(3))])
+    rank = {tuple(xy): n for n, xy in enumerate(detector.xy[:600].tolist())}
+    taken = np.array([rank[tuple(xy)] for xy in tracks.xy.tolist()])
+    assert len(taken) == 100
+    # A hundred of six hundred, two or three of each cell.
+    assert (np.median(taken) < 120) == knows
+    assert (taken.max() < 400) == knows

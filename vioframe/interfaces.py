@@ -32,7 +32,11 @@ if TYPE_CHECKING:
 
 @runtime_checkable
 class Detector(Protocol):
-    """Finds keypoints in one image. It gets no mask: the front-end keeps the candidates away from live tracks."""
+    """Finds keypoints in one image. It gets no mask: the front-end keeps the candidates away from live tracks.
+
+    Of what it finds the front-end draws, as strong points are not those that are followed well. One that has
+    ``best_first = True`` knows better: its score says how well, and the front-end takes the first.
+    """
 
     def detect(self, image: Image, max_points: int) -> Keypoints:
         """At most ``max_points`` keypoints of ``image`` (H, W) uint8, strongest first."""

@@ -33,6 +33,7 @@ class KeypointNet:
         )
         self._choose = peaks if weights.architecture.peaks else select
         self._options = options
+        self.best_first = weights.target != "repeatability"
 
     @property
     def device(self) -> str:

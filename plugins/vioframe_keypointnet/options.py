@@ -12,6 +12,8 @@ from vioframe_keypointnet.architecture import ARCHITECTURES, Architecture
 
 Runtime = Literal["auto", "cuda", "openvino", "torch"]
 Precision = Literal["auto", "float32", "float16", "int8"]
+Target = Literal["repeatability", "life", "drift", "faithful", "information", "clean"]
+"""Of a training; what each but the first says of a point is in :mod:`vioframe_keypointnet.training.followed`."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -45,6 +47,11 @@ class TrainingOptions:
     """full (as published), compact or quick."""
     width: PositiveFloat = 1.0
     """Factor on the channels of every layer."""
+    target: Target = "repeatability"
+    """repeatability (as published: points are found again in another view), or what becomes of a point that is followed
+    in simulated flights, which --images then name: the share of 60 images in which it is followed (life), how near it
+    stays to its landmark (drift), the share before it strays by more than 1 px (faithful), both as information
+    (information), whether it never strays (clean); networks of peaks only."""
     dropout: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.2
     """Of whole channels, as published; the weights that ship were trained with 0: small networks have none to spare."""
     seed: NonNegativeInt = 0
@@ -79,6 +86,15 @@ class TrainingOptions:
     def __post_init__(self) -> None:
         if any(n < 32 or n % 8 for n in self.size):
             raise ConfigError(f"size must be two multiples of 8, each at least 32, not {self.size}")
+        if self.target != "repeatability":
+            if not self.architecture.peaks:
+                raise ConfigError(
+                    f"the network {self.network} says nothing of a pixel; target={self.target} needs compact or quick"
+                )
+            if self.lesson_epochs or self.descriptors_only:
+                raise ConfigError(
+                    "lessons and descriptors are of target=repeatability; train them apart, with --finetune"
+                )
         if self.epoch_samples is not None and self.epoch_samples < self.batch:
             raise ConfigError(f"epoch_samples must be at least the batch, {self.batch}, not {self.epoch_samples}")
 

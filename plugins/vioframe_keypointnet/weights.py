@@ -49,6 +49,11 @@ class Weights:
     card: Mapping[str, Any] = field(default_factory=dict)
     activation_ranges: Mapping[str, float] | None = None
 
+    @property
+    def target(self) -> str:
+        """What the detector was trained for: repeatability, or what becomes of points that are followed."""
+        return str(self.card.get("target", "repeatability"))
+
 
 def save(path: Path, weights: Weights) -> None:
     """Write ``weights`` as a file that :func:`load` reads, but for counters of batches.

@@ -27,6 +27,8 @@ class CandidateSource:
         self._incidents = incidents
         self._failures = 0
         self._has_worked = False
+        self.best_first = bool(getattr(detector, "best_first", False))
+        """Whether the first candidates are those that will be followed best."""
 
     def ask(self, image: Image, max_points: int, t_ns: int) -> Float:
         """(N, 2) px, N <= ``max_points``, strongest first: finite and at least ``border_px`` inside the image."""

@@ -101,7 +101,8 @@ class View:
         """Draw new points where there are fewest, once enough tracks are lost; returns the id of the next one.
 
         They are drawn, not the strongest taken: these lie on outlines more often than others, slide along them and are
-        lost, only to be taken again. Of what is drawn, whatever can be followed stays.
+        lost, only to be taken again. Of what is drawn, whatever can be followed stays. Of a detector whose score says
+        how well a point will be followed, the first are taken.
         """
         options, camera, image = self._options, self.camera, self._image
         assert image is not None
@@ -109,7 +110,8 @@ class View:
         if len(self.ids) >= options.refill_below * options.max_points:
             return next_id
         candidates = self._candidates.ask(image, _CANDIDATES_PER_POINT * options.max_points, t_ns)
-        candidates = self._dice.permutation(candidates)
+        if not self._candidates.best_first:
+            candidates = self._dice.permutation(candidates)
         taken = spread(
             candidates,
             self.xy,

@@ -9,7 +9,7 @@ import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pandas as pd
@@ -24,9 +24,10 @@ from vioframe.errors import ConfigError
 from vioframe.types import TrainingJob, TrainingStep
 from vioframe_keypointnet import weights
 from vioframe_keypointnet.detector import KeypointNet as Detector
-from vioframe_keypointnet.network import KeypointNet, fill
+from vioframe_keypointnet.network import KeypointNet, fill, of_weights
 from vioframe_keypointnet.options import KeypointNetOptions, TrainingOptions
 from vioframe_keypointnet.quantisation import measure_ranges
+from vioframe_keypointnet.training.followed import Followed, follow, followed_losses, rank_correlation
 from vioframe_keypointnet.training.losses import InlierOutlierNet, losses, matching_loss, teach
 from vioframe_keypointnet.training.samples import Pair, Picture, batch, gather, grey_of, simulated_worlds, split
 
@@ -56,7 +57,11 @@ class KeypointNetTrainer:
         if job.resume and not checkpoint.exists():
             raise ConfigError(f"{checkpoint} does not exist, so there is nothing to resume; leave out --resume")
         worlds = simulated_worlds(job.images)
-        pictures = gather(job.images, options.architecture.image_channels, options.frames_per_recording)
+        pictures: list[Picture]
+        if options.target == "repeatability":
+            pictures = gather(job.images, options.architecture.image_channels, options.frames_per_recording)
+        else:
+            pictures = [followed for recording in job.images for followed in follow(recording)]
         train, held_out = split(pictures, job.hold_out)
         self._held_out = held_out[:_VALIDATION_IMAGES]
         self._training = Training(options, train)
@@ -91,7 +96,7 @@ class KeypointNetTrainer:
         row = {"epoch": training.step // training.epoch_steps}
         row |= {name: float(np.mean([values[name] for values in of_epoch])) for name in of_epoch[0]}
         if self._held_out:
-            row |= validate(training.weights(), self._held_out, self._options.seed)
+            row |= training.validate(self._held_out)
         self._history.append(row)
         training.save(self._job.out / CHECKPOINT, self._history)
         # Epochs of lessons have other losses than those that follow.
@@ -110,6 +115,7 @@ class KeypointNetTrainer:
         }
         made = self._training.weights()
         ranges = measure_ranges(made, self._sample)
+        card |= made.card
         weights.save(self._job.out / WEIGHTS, replace(made, card=card, activation_ranges=ranges))
 
 
@@ -135,6 +141,8 @@ class Training:
         trained = [p for p in (*self.network.parameters(), *self.judge.parameters()) if p.requires_grad]
         self._optimiser = Adam(trained, lr=options.learning_rate)
         self.step = 0
+        self.target = options.target
+        """That of the detector: where only descriptors are trained, it is that of the weights begun with."""
         self.worlds: list[dict[str, Any]] = []
 
     @property
@@ -154,6 +162,8 @@ class Training:
                 f"{self.options.architecture.name}; choose it with -o network= and -o width="
             )
         fill(self.network, other)
+        if self.options.descriptors_only:
+            self.target = other.target
         self.saw(other.card.get("simulated_worlds", ()))
 
     def saw(self, worlds: Iterable[dict[str, Any]]) -> None:
@@ -171,18 +181,30 @@ class Training:
             rate = self.options.learning_rate * 0.5 ** sum(epoch >= e for e in self.options.halve_at)
             for group in self._optimiser.param_groups:
                 group["lr"] = rate
-            taught = epoch < self.options.lesson_epochs
-            corners_taught = taught and not self.options.descriptors_only
-            pairs = batch(self._pictures, self.options, self.step, corners_taught=corners_taught)
-            pairs = Pair(*(tensor.to(self._device) for tensor in pairs))
             # Dropout, too, depends on the number of the step alone.
             torch.manual_seed(int(np.random.default_rng([self.options.seed, 3, self.step]).integers(2**62)))
-            values = step_losses(self.network, self.judge, self.options, pairs, taught=taught)
+            values = self._losses(taught=epoch < self.options.lesson_epochs)
             self._optimiser.zero_grad(set_to_none=True)
             values["total"].backward()  # type: ignore[no-untyped-call]
             self._optimiser.step()
             self.step += 1
             yield {name: float(value.detach()) for name, value in values.items()}
+
+    def _losses(self, *, taught: bool) -> Mapping[str, Tensor]:
+        """Those of the next step, ``total`` to be minimised."""
+        if self.options.target != "repeatability":
+            return followed_losses(self.network, cast(Sequence[Followed], self._pictures), self.options, self.step)
+        corners_taught = taught and not self.options.descriptors_only
+        pairs = batch(self._pictures, self.options, self.step, corners_taught=corners_taught)
+        pairs = Pair(*(tensor.to(self._device) for tensor in pairs))
+        return step_losses(self.network, self.judge, self.options, pairs, taught=taught)
+
+    def validate(self, held_out: Sequence[Picture]) -> dict[str, float]:
+        """How good the network is by now on pictures not trained on."""
+        made, target = self.weights(), self.options.target
+        if target == "repeatability":
+            return validate(made, held_out, self.options.seed)
+        return {"rank_correlation": rank_correlation(of_weights(made), cast(Sequence[Followed], held_out), target)}
 
     def save(self, path: Path, history: Sequence[Mapping[str, float]]) -> None:
         """Write all that the training depends on, whole or not at all; ``history`` goes along."""
@@ -196,6 +218,7 @@ class Training:
                 "optimiser": self._optimiser.state_dict(),
                 "history": [dict(row) for row in history],
                 "simulated_worlds": self.worlds,
+                "target": self.target,
             },
             part,
         )
@@ -220,13 +243,14 @@ class Training:
         self._optimiser.load_state_dict(kept["optimiser"])
         self.step = kept["step"]
         self.saw(kept.get("simulated_worlds", ()))
+        self.target = kept.get("target", "repeatability")
         return list(kept["history"])
 
     def weights(self) -> weights.Weights:
         """The network's weights as they are now."""
         state = self.network.state_dict()
         tensors = {n: x.cpu().numpy().copy() for n, x in state.items() if not n.endswith("num_batches_tracked")}
-        return weights.Weights(self.options.architecture, tensors)
+        return weights.Weights(self.options.architecture, tensors, {"target": self.target})
 
 
 def step_losses(

@@ -1,0 +1,220 @@
+"""What the tracker teaches: points of simulated flights, each followed as in flight, and what became of it.
+
+Repeatability, which the published losses train for, is not what tracking asks for: no point is ever found again, its
+patch is followed. In a simulated world it is known how far from its landmark that led, and so which points to choose.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import get_args
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.nn.functional import binary_cross_entropy_with_logits, pixel_shuffle
+
+from vioframe.errors import ConfigError
+from vioframe.evaluation.tracks import landmarks_of
+from vioframe.frontend import FrontendOptions
+from vioframe.frontend.flow import body_rotation
+from vioframe.frontend.view import Shown, View
+from vioframe.geometry.meshes import read_mesh
+from vioframe.incidents import Incidents
+from vioframe.io.synchronise import synchronise
+from vioframe.parts import registry
+from vioframe.simulation.config import MESH, simulation_folder
+from vioframe.stopwatch import Stopwatch
+from vioframe.types import Bool, Float, FrameTracks, Int
+from vioframe_keypointnet.network import KeypointNet
+from vioframe_keypointnet.options import Target, TrainingOptions
+from vioframe_keypointnet.training.samples import Picture
+
+IMAGES = 60
+"""In how many images a point is followed, at most: three seconds at 20 Hz."""
+_KNOWN = 20
+"""In fewer nothing is learned of it."""
+_EVERY = 6
+"""Of the images of a flight, points are drawn in one of so many."""
+_POINTS, _APART_PX, _STEEPEST = 600, 6.0, 0.5
+"""How many, how far apart, and from which share of the pixels: among them bad ones, or there is nothing to be told."""
+_EDGE_PX, _BORDER_PX = 10.0, 5.0
+"""Points so near the edge of a crop are seen in part; so near the border of an image the front-end drops them."""
+
+_STRAYED_PX = 1.0
+"""So far from its landmark a point does more harm than good."""
+_DRIFT_PX, _SIGMA_PX = 0.5, 0.3
+
+
+@dataclass(frozen=True, slots=True)
+class Followed(Picture):
+    """An image of a flight, as a detector is given it, and N of its points as they were followed from there."""
+
+    xy: NDArray[np.float32]
+    """(N, 2) px."""
+    off_px: NDArray[np.float16]
+    """(N, IMAGES) how far from its landmark each was in the images after; infinite where it was lost."""
+    known: Bool
+    """(N, IMAGES) False once the landmark has left the image or the recording has ended: that is no fault of a point.
+    """
+
+
+def follow(recording: Path) -> list[Followed]:
+    """Follow points of every sixth image of a simulated ``recording`` by the first of its cameras.
+
+    Raises :class:`ConfigError` where it was not simulated: nobody knows its landmarks.
+    """
+    installed = registry.load()
+    dataset = installed.open_dataset(recording)
+    mesh = simulation_folder(recording) / MESH
+    truth, calibration = dataset.ground_truth, dataset.calibration
+    if truth is None or not mesh.is_file():
+        raise ConfigError(f"{recording} was not simulated: nobody knows where its points are; use `vioframe simulate`")
+    camera, options = calibration.cameras[0], FrontendOptions(max_points=_POINTS, min_distance_px=_APART_PX)
+    detector = installed.create_detector("random", {"steepest": _STEEPEST, "min_distance_px": _APART_PX})
+    incidents, watch = Incidents(), Stopwatch()
+    t_ns: list[int] = []
+    begun: list[_Set] = []
+    for imu, frames in synchronise(dataset.measurements(), incidents=incidents):
+        image = frames.images[0]
+        if image is None or not truth.covers([frames.t_ns])[0]:
+            continue
+        R_C2C1 = camera.R_BC.T @ body_rotation(imu).T @ camera.R_BC
+        shown = Shown.of(image, options, watch)
+        for points in begun:
+            points.advance(shown, R_C2C1, frames.t_ns, watch)
+        if len(t_ns) % _EVERY == 0 and shown.pyramid is not None:
+            begun.append(_Set(len(t_ns), shown, View(detector, camera.model, options, incidents), frames.t_ns, watch))
+        t_ns.append(frames.t_ns)
+    motion = truth.at(t_ns)
+    R_WC, p_WC = motion.R_WB @ camera.R_BC, motion.p_WB + motion.R_WB @ camera.p_BC
+    out = []
+    for number, points in enumerate(begun):
+        first, xy = points.first, points.xy
+        ids = np.arange(len(xy))
+        start = FrameTracks(t_ns[first], ids, 0 * ids, xy[:, 0], camera.model.undistort(xy[:, 0]))
+        p_WF = landmarks_of([start], R_WC[first : first + 1], p_WC[first : first + 1], read_mesh(mesh))
+        off_px = np.full((len(xy), IMAGES), np.inf)
+        known = np.zeros(off_px.shape, bool)
+        for k, (R, p) in enumerate(zip(R_WC[first + 1 :][:IMAGES], p_WC[first + 1 :][:IMAGES], strict=True)):
+            p_CF = (p_WF - p) @ R
+            true_xy = camera.model.project(p_CF)
+            distance = np.linalg.norm(xy[:, k + 1] - true_xy, axis=1)
+            off_px[:, k] = np.where(np.isfinite(distance), distance, np.inf)
+            known[:, k] = camera.model.contains(true_xy, _BORDER_PX) & (p_CF[:, 2] > 0.0)
+        known = np.logical_and.accumulate(known, axis=1)
+        name = f"{recording}#{number}"
+        out.append(Followed(name, points.image, xy[:, 0].astype(np.float32), off_px.astype(np.float16), known))
+    return out
+
+
+class _Set:
+    """Points drawn in image ``first``, which ``shown`` is; ``xy`` (N, IMAGES + 1, 2) px, NaN where they are lost."""
+
+    def __init__(self, first: int, shown: Shown, view: View, t_ns: int, watch: Stopwatch) -> None:
+        view.advance(shown, None, t_ns, watch)
+        count = view.refill(0, t_ns)
+        self.first, self.image = first, np.asarray(shown.image, np.uint8)
+        self.xy: Float = np.full((count, IMAGES + 1, 2), np.nan)
+        self.xy[view.ids, 0] = view.xy
+        self._view, self._images = view, 0
+
+    def advance(self, shown: Shown, R_C2C1: Float, t_ns: int, watch: Stopwatch) -> None:
+        if self._images < IMAGES and len(self._view.ids):
+            self._view.advance(shown, R_C2C1, t_ns, watch)
+            self._images += 1
+            self.xy[self._view.ids, self._images] = self._view.xy
+
+
+def wanted(target: Target, followed: Followed) -> tuple[NDArray[np.float32], Bool]:
+    """(N,) what a network is to say of each point, in [0, 1], and of which there is enough known to teach it (N,)."""
+    known, off_px = followed.known, followed.off_px.astype(np.float32)
+    images = known.sum(axis=1)
+    there = known & np.isfinite(off_px)
+    score = _TARGETS[target](np.where(there, off_px, 0.0), there, known) / np.maximum(images, 1)
+    return score.astype(np.float32), images >= _KNOWN
+
+
+def _life(_: Float, there: Bool, known: Bool) -> Float:
+    return np.asarray(there.sum(axis=1), float)
+
+
+def _drift(off_px: Float, there: Bool, known: Bool) -> Float:
+    mean_square = np.square(off_px).sum(axis=1) / np.maximum(there.sum(axis=1), 1)
+    score = there.any(axis=1) / (1.0 + mean_square / _DRIFT_PX**2)
+    return np.asarray(score * known.sum(axis=1))
+
+
+def _faithful(off_px: Float, there: Bool, known: Bool) -> Float:
+    kept = there & (off_px <= _STRAYED_PX)
+    return np.asarray((np.logical_and.accumulate(kept | ~known, axis=1) & known).sum(axis=1), float)
+
+
+def _information(off_px: Float, there: Bool, known: Bool) -> Float:
+    return np.asarray(np.where(there, _SIGMA_PX**2 / (_SIGMA_PX**2 + np.square(off_px)), 0.0).sum(axis=1))
+
+
+def _clean(off_px: Float, there: Bool, known: Bool) -> Float:
+    return np.asarray((there.any(axis=1) & (off_px <= _STRAYED_PX).all(axis=1)) * known.sum(axis=1), float)
+
+
+# Each of distances (N, IMAGES), 0 where a point is not followed, where it is, and where that is known: the score times
+# the images in which it is known.
+_TARGETS: dict[Target, Callable[[Float, Bool, Bool], Float]] = {
+    "life": _life,
+    "drift": _drift,
+    "faithful": _faithful,
+    "information": _information,
+    "clean": _clean,
+}
+assert {*_TARGETS, "repeatability"} == {*get_args(Target)}
+
+
+def responses(network: KeypointNet, images: Tensor) -> Tensor:
+    """(B, H, W) the response of a network of peaks to each pixel of ``images`` (B, 1, H, W) in [0, 1]."""
+    return pixel_shuffle(network.found(images, descriptors=False)[0].permute(0, 3, 1, 2), 2)[:, 0]
+
+
+def followed_losses(
+    network: KeypointNet, pictures: Sequence[Followed], options: TrainingOptions, step: int
+) -> dict[str, Tensor]:
+    """Cross entropy of what the network says of points from what became of them; of crops of a batch of pictures."""
+    rng = np.random.default_rng([options.seed, 4, step])
+    width, height = options.size
+    device = next(network.parameters()).device
+    crops, told = [], []
+    for picture in (pictures[k] for k in rng.integers(len(pictures), size=options.batch)):
+        rows, columns = picture.pixels.shape
+        top, left = rng.integers(0, rows - height + 1), rng.integers(0, columns - width + 1)
+        crops.append(picture.pixels[top : top + height, left : left + width])
+        score, enough = wanted(options.target, picture)
+        xy = picture.xy - np.array([left, top], np.float32)
+        seen = enough & (xy >= _EDGE_PX).all(axis=1) & (xy < np.array(options.size) - _EDGE_PX).all(axis=1)
+        told.append((np.rint(xy[seen]).astype(np.int64), score[seen]))
+    said = responses(network, torch.from_numpy(np.stack(crops)).to(device)[:, None].float() / 255.0)
+    of_crop: Int = np.repeat(np.arange(len(told)), [len(score) for _, score in told])
+    x, y = np.concatenate([xy for xy, _ in told]).T
+    score = torch.from_numpy(np.concatenate([score for _, score in told])).to(device)
+    loss = binary_cross_entropy_with_logits(said[of_crop, y, x], score) if len(score) else said.sum() * 0.0
+    return {"followed": loss, "total": loss}
+
+
+def rank_correlation(network: KeypointNet, pictures: Sequence[Followed], target: Target) -> float:
+    """How well the network, ready to run, orders the points of an image as the ``target`` does: mean of Spearman's."""
+    from scipy.stats import spearmanr
+
+    found = []
+    for picture in pictures:
+        score, enough = wanted(target, picture)
+        rows, columns = picture.pixels.shape
+        image = torch.from_numpy(picture.pixels[: rows // 8 * 8, : columns // 8 * 8].copy())
+        with torch.inference_mode():
+            said = responses(network, image[None, None].float() / 255.0)[0].numpy()
+        x, y = np.rint(picture.xy).astype(np.int64).T
+        use = enough & (x < said.shape[1]) & (y < said.shape[0])
+        if len(np.unique(score[use])) > 1:
+            found.append(spearmanr(said[y[use], x[use]], score[use]).statistic)
+    return float(np.mean(found)) if found else float("nan")
