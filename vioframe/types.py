@@ -454,7 +454,7 @@ class TrainingJob:
     hold_out: tuple[str, ...] = ()
     """Images whose name contains one of these, or matches it as a pattern, serve validation only."""
     start_from: Path | None = None
-    """Weights to fine-tune."""
+    """Weights to fine-tune: a file, or a name that the trainer knows."""
     resume: bool = False
     """Go on with the training in ``out``."""
 

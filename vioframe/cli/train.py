@@ -19,7 +19,13 @@ from vioframe.types import TrainingJob, TrainingStep
 @click.option("--images", type=FILE, multiple=True, required=True, help="Folder of photographs, or recording; repeat.")
 @click.option("--out", type=FILE, help="Folder for checkpoint, log and weights.  [default: training/NAME]")
 @click.option("--hold-out", metavar="PATTERN", multiple=True, help="Images to validate on, by name; repeat.")
-@click.option("--finetune", "start_from", metavar="CKPT", type=FILE, help="Weights to begin with.")
+@click.option(
+    "--finetune",
+    "start_from",
+    metavar="NAME|FILE",
+    type=FILE,
+    help="Weights to begin with: those that ship by their name, or a file.",
+)
 @click.option("--config", "config_file", type=FILE, help="YAML file of options; -o overrides it.")
 @click.option("-o", "--option", "options", metavar="KEY=VALUE", multiple=True, help="Set an option of the trainer.")
 @click.option("--resume", is_flag=True, help="Go on with the training in --out.")
