@@ -1,0 +1,120 @@
+"""What a KeypointNet is trained for: the same network, on the same flights, once for each target.
+
+    python benchmarks/targets.py [--out targets] [--record]
+    vioframe bench benchmarks/suites/targets.yaml
+
+The first simulates flights in worlds for training, follows their points, and trains `compact` for each target by which
+a point that was followed can be judged; the weights lie in the folder. Flights and followed points that are there are
+not made again. The second flies with these weights, in worlds for tuning.
+"""
+
+from __future__ import annotations
+
+import pickle
+from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import asdict, replace
+from multiprocessing import get_context
+from pathlib import Path
+from typing import get_args
+
+import click
+from common import present, render
+from threadpoolctl import threadpool_limits
+
+from vioframe.bench import Row
+from vioframe.bench.suites.sources import EUROC
+from vioframe.cores import usable_cores
+from vioframe.parts import registry
+from vioframe.simulation.config import SimulationConfig
+from vioframe.simulation.seeds import seed_for
+from vioframe_keypointnet import weights
+from vioframe_keypointnet.network import of_weights
+from vioframe_keypointnet.options import Target, TrainingOptions
+from vioframe_keypointnet.quantisation import measure_ranges
+from vioframe_keypointnet.training.followed import follow, rank_correlation
+from vioframe_keypointnet.training.trainer import Training
+
+TOURS = ("V2_02_medium", "V1_01_easy", "MH_03_medium", "V2_01_easy")
+CONDITIONS = (
+    {},
+    {"motion_blur": 0.6},
+    {"low_texture": 0.9},
+    {"low_light": 0.8},
+    {"fog": 0.8},
+    {"low_texture": 0.6},
+    {"exposure": 0.8},
+    {"motion_blur": 0.9},
+)
+DURATION_S = 20.0
+HELD_OUT = 4
+"""The last of the flights, on which it is told how well a network orders points."""
+START = "compact"
+CALIBRATED = 64
+"""Images on which the reach of each layer is measured for int8."""
+TARGETS: tuple[Target, ...] = get_args(Target)[1:]
+OPTIONS = TrainingOptions(
+    dropout=0.0, size=(376, 240), batch=4, epochs=12, halve_at=(5, 8, 10, 11), learning_rate=2e-3, threads=1
+)
+COLUMNS = {"trained for": "", "steps": "d"} | {f"order.{target}": ".2f" for target in TARGETS}
+
+
+@click.command()
+@click.option("--out", type=click.Path(file_okay=False, path_type=Path), default=Path("targets"), show_default=True)
+@click.option("--flights", default=24, show_default=True, help="Flights that are followed.")
+@click.option("--record", "keep", is_flag=True, help="Write the results to benchmarks/results.")
+def main(out: Path, flights: int, keep: bool) -> None:
+    """How well networks order points as each target does (rank correlation on flights held out), by what they saw."""
+    out.mkdir(parents=True, exist_ok=True)
+    targets: list[Target] = ["repeatability", *TARGETS]
+    settings = {"flights": flights, "held_out": HELD_OUT, "duration_s": DURATION_S, "options": asdict(OPTIONS)}
+    with ProcessPoolExecutor(usable_cores(), mp_context=get_context("spawn")) as workers:
+        kept = list(workers.map(followed, [out] * flights, range(flights)))
+        rows = workers.map(trained, targets, [out] * len(targets), [kept] * len(targets))
+        present("targets", "Rank correlation with what became of points", rows, COLUMNS, settings, keep)
+
+
+def followed(out: Path, number: int) -> Path:
+    """Where it is kept what became of the points of the ``number``-th flight for training."""
+    kept = out / f"flight_{number:02}.followed"
+    if not kept.exists():
+        tour = TOURS[number // 2 % len(TOURS)]
+        simulated = SimulationConfig(
+            flight=EUROC[tour].tour(1 + list(EUROC).index(tour)),
+            duration_s=DURATION_S,
+            seed=seed_for("training", number),
+            conditions=CONDITIONS[number % len(CONDITIONS)],
+        )
+        bag = kept.with_suffix(".bag")
+        render(simulated, registry.load(), bag)
+        with threadpool_limits(1):
+            kept.write_bytes(pickle.dumps(follow(bag)))
+    return kept
+
+
+def trained(target: Target, out: Path, kept: Sequence[Path]) -> Row:
+    """The network for ``target``, or, for repeatability, that which all begin with: how it orders what is held out."""
+    shown, held_out = (
+        [picture for path in some for picture in pickle.loads(path.read_bytes())]
+        for some in (kept[:-HELD_OUT], kept[-HELD_OUT:])
+    )
+    options = replace(OPTIONS, target=target)
+    training = Training(options, shown)
+    training.start_from(weights.load(START))
+    if target != "repeatability":
+        training.saw(
+            {"seed": seed_for("training", k), "flight": "tour", "world": "hall"} for k in range(len(kept) - HELD_OUT)
+        )
+        for _ in training.steps():
+            pass
+        made = training.weights()
+        card = {"options": asdict(options), "simulated_worlds": training.worlds, "started_from": START, **made.card}
+        ranges = measure_ranges(made, [picture.pixels for picture in shown[:: len(shown) // CALIBRATED]])
+        weights.save(out / f"{target}.safetensors", replace(made, card=card, activation_ranges=ranges))
+    network = of_weights(training.weights())
+    order = {name: rank_correlation(network, held_out, name) for name in TARGETS}
+    return {"trained for": target, "steps": training.step, "order": order}
+
+
+if __name__ == "__main__":
+    main()
