@@ -152,14 +152,17 @@ def test_command_trains_weights_whose_points_are_taken_first_to_last(flight, tmp
     installed = registry.load()
     assert installed.create_detector("keypointnet", {"weights": str(made), "threads": 1}).best_first
     assert not installed.create_detector("keypointnet", {"threads": 1}).best_first
+    with pytest.raises(ConfigError, match="descriptors_only=true"):
+        installed.create_detector("keypointnet", {"weights": str(made), "threads": 1, "descriptors": True})
 
 
 def test_descriptors_trained_afterwards_leave_the_target_as_it_was(tmp_path):
     trained = Training(SMALL, scenes())
+    assert not trained.weights().describe
     weights.save(tmp_path / "a.safetensors", trained.weights())
     later = Training(replace(SMALL, target="repeatability", descriptors_only=True), scenes())
     later.start_from(weights.load(tmp_path / "a.safetensors"))
-    assert later.weights().target == "drift"
+    assert (later.weights().target, later.weights().describe) == ("drift", True)
     later.save(tmp_path / "checkpoint.pt", [])
     again = Training(replace(SMALL, target="repeatability", descriptors_only=True), scenes())
     again.resume(tmp_path / "checkpoint.pt")

@@ -25,6 +25,11 @@ class KeypointNet:
     """
 
     def __init__(self, weights: Weights, options: KeypointNetOptions) -> None:
+        if options.descriptors and not weights.describe:
+            raise ConfigError(
+                f"the descriptors of weights={options.weights} are older than their detector; train them with "
+                "`vioframe train keypointnet --finetune WEIGHTS -o descriptors_only=true`, or use weights=compact"
+            )
         calibrated = weights.activation_ranges is not None
         self._runtime, self.precision = runtimes.choose(options.runtime, options.precision, calibrated)
         _LOG.info("KeypointNet %s runs by %s in %s", weights.architecture.name, self._runtime, self.precision)

@@ -54,6 +54,11 @@ class Weights:
         """What the detector was trained for: repeatability, or what becomes of points that are followed."""
         return str(self.card.get("target", "repeatability"))
 
+    @property
+    def describe(self) -> bool:
+        """Whether the layers of descriptors were trained with those before them, as these are."""
+        return bool(self.card.get("descriptors", True))
+
 
 def save(path: Path, weights: Weights) -> None:
     """Write ``weights`` as a file that :func:`load` reads, but for counters of batches.

@@ -250,7 +250,8 @@ class Training:
         """The network's weights as they are now."""
         state = self.network.state_dict()
         tensors = {n: x.cpu().numpy().copy() for n, x in state.items() if not n.endswith("num_batches_tracked")}
-        return weights.Weights(self.options.architecture, tensors, {"target": self.target})
+        describes = self.options.target == "repeatability"
+        return weights.Weights(self.options.architecture, tensors, {"target": self.target, "descriptors": describes})
 
 
 def step_losses(
