@@ -1,7 +1,7 @@
 """What a KeypointNet is trained for: the same network, on the same flights, once for each target.
 
     python benchmarks/targets.py [--out targets] [--record]
-    vioframe bench benchmarks/suites/targets.yaml
+    vioframe bench benchmarks/targets.yaml
 
 The first simulates flights in worlds for training, follows their points, and trains `compact` for each target by which
 a point that was followed can be judged; the weights lie in the folder. Flights and followed points that are there are
