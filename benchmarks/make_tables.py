@@ -574,6 +574,18 @@ def tuning() -> str:
     return markdown(shown) + suite_source("tuning")
 
 
+def targets() -> str:
+    """How networks that were trained for each target order points that are followed, by what became of these."""
+    rows = recorded("targets.json")
+    names = rows["trained for"][1:]
+    shown = [
+        {"trained for": f"{row['trained for']}" if row["steps"] else "as it ships (`compact`)"}
+        | {f"order by {name}": f"{row[f'order.{name}']:.2f}" for name in names}
+        for _, row in rows.iterrows()
+    ]
+    return markdown(shown) + source(rows)
+
+
 def _duels(suite: str) -> pd.DataFrame:
     """What its table of duels says, the column of the ATE over the baseline's as ``ratio``."""
     table = pd.read_csv(HERE / "results" / suite / "duels.csv")
@@ -629,6 +641,7 @@ FIGURES: dict[str, Callable[[], str]] = {
             clean,
             comparison,
             tuning,
+            targets,
             stress,
             contest,
             throughput,
