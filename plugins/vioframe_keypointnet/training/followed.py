@@ -22,6 +22,7 @@ from vioframe.evaluation.tracks import landmarks_of
 from vioframe.frontend import FrontendOptions
 from vioframe.frontend.flow import body_rotation
 from vioframe.frontend.view import Shown, View
+from vioframe.geometry.cameras import Camera
 from vioframe.geometry.meshes import read_mesh
 from vioframe.incidents import Incidents
 from vioframe.io.synchronise import synchronise
@@ -89,26 +90,33 @@ def follow(recording: Path) -> list[Followed]:
         if len(t_ns) % _EVERY == 0 and shown.pyramid is not None:
             begun.append(_Set(len(t_ns), shown, View(detector, camera.model, options, incidents), frames.t_ns, watch))
         t_ns.append(frames.t_ns)
-    motion = truth.at(t_ns)
+    motion, corners = truth.at(t_ns), read_mesh(mesh)
     R_WC, p_WC = motion.R_WB @ camera.R_BC, motion.p_WB + motion.R_WB @ camera.p_BC
     out = []
     for number, points in enumerate(begun):
-        first, xy = points.first, points.xy
-        ids = np.arange(len(xy))
-        start = FrameTracks(t_ns[first], ids, 0 * ids, xy[:, 0], camera.model.undistort(xy[:, 0]))
-        p_WF = landmarks_of([start], R_WC[first : first + 1], p_WC[first : first + 1], read_mesh(mesh))
-        off_px = np.full((len(xy), IMAGES), np.inf)
-        known = np.zeros(off_px.shape, bool)
-        for k, (R, p) in enumerate(zip(R_WC[first + 1 :][:IMAGES], p_WC[first + 1 :][:IMAGES], strict=True)):
-            p_CF = (p_WF - p) @ R
-            true_xy = camera.model.project(p_CF)
-            distance = np.linalg.norm(xy[:, k + 1] - true_xy, axis=1)
-            off_px[:, k] = np.where(np.isfinite(distance), distance, np.inf)
-            known[:, k] = camera.model.contains(true_xy, _BORDER_PX) & (p_CF[:, 2] > 0.0)
-        known = np.logical_and.accumulate(known, axis=1)
-        name = f"{recording}#{number}"
-        out.append(Followed(name, points.image, xy[:, 0].astype(np.float32), off_px.astype(np.float16), known))
+        seen = slice(points.first, points.first + IMAGES + 1)
+        off_px, known = _fates(points.xy, R_WC[seen], p_WC[seen], camera.model, corners)
+        xy = points.xy[:, 0].astype(np.float32)
+        out.append(Followed(f"{recording}#{number}", points.image, xy, off_px.astype(np.float16), known))
     return out
+
+
+def _fates(xy: Float, R_WC: Float, p_WC: Float, camera: Camera, corners: Float) -> tuple[Float, Bool]:
+    """``off_px`` and ``known`` of :class:`Followed`: of points ``xy`` (N, IMAGES + 1, 2) px seen from poses (S, ...).
+
+    ``corners`` (T, 3, 3) m are those of the world's triangles; there are fewer poses where the recording ends.
+    """
+    ids = np.arange(len(xy))
+    found = FrameTracks(0, ids, np.zeros_like(ids), xy[:, 0], camera.undistort(xy[:, 0]))
+    p_WF = landmarks_of([found], R_WC[:1], p_WC[:1], corners)
+    off_px, known = np.full((len(xy), IMAGES), np.inf), np.zeros((len(xy), IMAGES), bool)
+    for k, (R, p) in enumerate(zip(R_WC[1:], p_WC[1:], strict=True)):
+        p_CF = (p_WF - p) @ R
+        true_xy = camera.project(p_CF)
+        distance = np.linalg.norm(xy[:, k + 1] - true_xy, axis=1)
+        off_px[:, k] = np.where(np.isfinite(distance), distance, np.inf)
+        known[:, k] = camera.contains(true_xy, _BORDER_PX) & (p_CF[:, 2] > 0.0)
+    return off_px, np.logical_and.accumulate(known, axis=1)
 
 
 class _Set:
@@ -129,40 +137,41 @@ class _Set:
             self.xy[self._view.ids, self._images] = self._view.xy
 
 
-def wanted(target: Target, followed: Followed) -> tuple[NDArray[np.float32], Bool]:
+def wanted(target: Target, followed: Followed) -> tuple[Float, Bool]:
     """(N,) what a network is to say of each point, in [0, 1], and of which there is enough known to teach it (N,)."""
     known, off_px = followed.known, followed.off_px.astype(np.float32)
-    images = known.sum(axis=1)
     there = known & np.isfinite(off_px)
-    score = _TARGETS[target](np.where(there, off_px, 0.0), there, known) / np.maximum(images, 1)
-    return score.astype(np.float32), images >= _KNOWN
+    return _TARGETS[target](np.where(there, off_px, 0.0), there, known), known.sum(axis=1) >= _KNOWN
 
 
 def _life(_: Float, there: Bool, known: Bool) -> Float:
-    return np.asarray(there.sum(axis=1), float)
+    return _share(there, known)
 
 
-def _drift(off_px: Float, there: Bool, known: Bool) -> Float:
+def _drift(off_px: Float, there: Bool, _: Bool) -> Float:
     mean_square = np.square(off_px).sum(axis=1) / np.maximum(there.sum(axis=1), 1)
-    score = there.any(axis=1) / (1.0 + mean_square / _DRIFT_PX**2)
-    return np.asarray(score * known.sum(axis=1))
+    return np.asarray(there.any(axis=1) / (1.0 + mean_square / _DRIFT_PX**2))
 
 
 def _faithful(off_px: Float, there: Bool, known: Bool) -> Float:
-    kept = there & (off_px <= _STRAYED_PX)
-    return np.asarray((np.logical_and.accumulate(kept | ~known, axis=1) & known).sum(axis=1), float)
+    stays = there & (off_px <= _STRAYED_PX)
+    return _share(np.logical_and.accumulate(stays, axis=1), known)
 
 
 def _information(off_px: Float, there: Bool, known: Bool) -> Float:
-    return np.asarray(np.where(there, _SIGMA_PX**2 / (_SIGMA_PX**2 + np.square(off_px)), 0.0).sum(axis=1))
+    return _share(there * _SIGMA_PX**2 / (_SIGMA_PX**2 + np.square(off_px)), known)
 
 
-def _clean(off_px: Float, there: Bool, known: Bool) -> Float:
-    return np.asarray((there.any(axis=1) & (off_px <= _STRAYED_PX).all(axis=1)) * known.sum(axis=1), float)
+def _clean(off_px: Float, there: Bool, _: Bool) -> Float:
+    return np.asarray(there.any(axis=1) & (off_px <= _STRAYED_PX).all(axis=1), float)
 
 
-# Each of distances (N, IMAGES), 0 where a point is not followed, where it is, and where that is known: the score times
-# the images in which it is known.
+def _share(of: NDArray[np.generic], known: Bool) -> Float:
+    """(N,) what ``of`` (N, IMAGES) is on average while a point is known."""
+    return np.asarray(of.sum(axis=1) / np.maximum(known.sum(axis=1), 1))
+
+
+# Each of how far points are off (N, IMAGES), 0 where they are not followed; where they are; and where that is known.
 _TARGETS: dict[Target, Callable[[Float, Bool, Bool], Float]] = {
     "life": _life,
     "drift": _drift,
@@ -197,7 +206,7 @@ def followed_losses(
     said = responses(network, torch.from_numpy(np.stack(crops)).to(device)[:, None].float() / 255.0)
     of_crop: Int = np.repeat(np.arange(len(told)), [len(score) for _, score in told])
     x, y = np.concatenate([xy for xy, _ in told]).T
-    score = torch.from_numpy(np.concatenate([score for _, score in told])).to(device)
+    score = torch.from_numpy(np.concatenate([score for _, score in told])).float().to(device)
     loss = binary_cross_entropy_with_logits(said[of_crop, y, x], score) if len(score) else said.sum() * 0.0
     return {"followed": loss, "total": loss}
 
