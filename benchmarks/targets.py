@@ -31,8 +31,8 @@ from vioframe.simulation.seeds import seed_for
 from vioframe_keypointnet import weights
 from vioframe_keypointnet.network import of_weights
 from vioframe_keypointnet.options import Target, TrainingOptions
-from vioframe_keypointnet.quantisation import measure_ranges
 from vioframe_keypointnet.training.followed import follow, rank_correlation
+from vioframe_keypointnet.training.samples import simulated_worlds
 from vioframe_keypointnet.training.trainer import Training
 
 TOURS = ("V2_02_medium", "V1_01_easy", "MH_03_medium", "V2_01_easy")
@@ -51,7 +51,7 @@ HELD_OUT = 4
 """The last of the flights, on which it is told how well a network orders points."""
 START = "compact"
 CALIBRATED = 64
-"""Images on which the reach of each layer is measured for int8."""
+"""Images, about, on which the reach of each layer is measured for int8."""
 TARGETS: tuple[Target, ...] = get_args(Target)[1:]
 OPTIONS = TrainingOptions(
     dropout=0.0, size=(376, 240), batch=4, epochs=12, halve_at=(5, 8, 10, 11), learning_rate=2e-3, threads=1
@@ -102,15 +102,11 @@ def trained(target: Target, out: Path, kept: Sequence[Path]) -> Row:
     training = Training(options, shown)
     training.start_from(weights.load(START))
     if target != "repeatability":
-        training.saw(
-            {"seed": seed_for("training", k), "flight": "tour", "world": "hall"} for k in range(len(kept) - HELD_OUT)
-        )
+        training.saw(simulated_worlds(path.with_suffix(".bag") for path in kept[:-HELD_OUT]))
         for _ in training.steps():
             pass
-        made = training.weights()
-        card = {"options": asdict(options), "simulated_worlds": training.worlds, "started_from": START, **made.card}
-        ranges = measure_ranges(made, [picture.pixels for picture in shown[:: len(shown) // CALIBRATED]])
-        weights.save(out / f"{target}.safetensors", replace(made, card=card, activation_ranges=ranges))
+        sample = shown[:: len(shown) // CALIBRATED]
+        training.write(out / f"{target}.safetensors", sample, {"started_from": START})
     network = of_weights(training.weights())
     order = {name: rank_correlation(network, held_out, name) for name in TARGETS}
     return {"trained for": target, "steps": training.step, "order": order}

@@ -158,11 +158,11 @@ def test_command_trains_weights_whose_points_are_taken_first_to_last(flight, tmp
 
 def test_descriptors_trained_afterwards_leave_the_target_as_it_was(tmp_path):
     trained = Training(SMALL, scenes())
-    assert not trained.weights().describe
+    assert not trained.weights().has_descriptors
     weights.save(tmp_path / "a.safetensors", trained.weights())
     later = Training(replace(SMALL, target="repeatability", descriptors_only=True), scenes())
     later.start_from(weights.load(tmp_path / "a.safetensors"))
-    assert (later.weights().target, later.weights().describe) == ("drift", True)
+    assert (later.weights().target, later.weights().has_descriptors) == ("drift", True)
     later.save(tmp_path / "checkpoint.pt", [])
     again = Training(replace(SMALL, target="repeatability", descriptors_only=True), scenes())
     again.resume(tmp_path / "checkpoint.pt")

@@ -25,7 +25,7 @@ class KeypointNet:
     """
 
     def __init__(self, weights: Weights, options: KeypointNetOptions) -> None:
-        if options.descriptors and not weights.describe:
+        if options.descriptors and not weights.has_descriptors:
             raise ConfigError(
                 f"the descriptors of weights={options.weights} are older than their detector; train them with "
                 "`vioframe train keypointnet --finetune WEIGHTS -o descriptors_only=true`, or use weights=compact"

@@ -55,7 +55,7 @@ class Weights:
         return str(self.card.get("target", "repeatability"))
 
     @property
-    def describe(self) -> bool:
+    def has_descriptors(self) -> bool:
         """Whether the layers of descriptors were trained with those before them, as these are."""
         return bool(self.card.get("descriptors", True))
 

@@ -25,7 +25,7 @@ _FEATURELESS = 3.0
 # Turned by so much, a camera shows another image.
 _FROZEN_PX = 1.0
 # Points closer than this to the edge of the image are dropped: their patches reach beyond it.
-_BORDER_PX = 5.0
+BORDER_PX = 5.0
 # A point followed there and back must return to within this of where it was.
 FORWARD_BACKWARD_PX = 1.0
 # Candidates asked of the detector, as a multiple of the points wanted: all over the image, not where contrast is best.
@@ -56,7 +56,7 @@ class View:
     """``ids`` (N,), ``xy`` (N, 2) px and ``xy_normalised`` (N, 2) of the points in the newest image of ``camera``."""
 
     def __init__(self, detector: Detector, camera: Camera, options: FrontendOptions, incidents: Incidents) -> None:
-        self._candidates = CandidateSource(detector, camera, _BORDER_PX, incidents)
+        self._candidates = CandidateSource(detector, camera, BORDER_PX, incidents)
         self._options = options
         self._incidents = incidents
         self._dice = np.random.default_rng(0)
@@ -128,7 +128,7 @@ class View:
     def undistorted(self, xy: Float) -> tuple[Float, Bool]:
         """(N, 2) on the z = 1 plane of points (N, 2) px, and which can be followed (N,): they lie well in the image."""
         xy_normalised = self.camera.undistort(xy)
-        return xy_normalised, np.isfinite(xy_normalised).all(axis=1) & self.camera.contains(xy, _BORDER_PX)
+        return xy_normalised, np.isfinite(xy_normalised).all(axis=1) & self.camera.contains(xy, BORDER_PX)
 
     def add(self, ids: Int, xy: Float, xy_normalised: Float) -> None:
         """Points (N,) that were found in the newest image."""

@@ -21,7 +21,7 @@ from vioframe.errors import ConfigError
 from vioframe.evaluation.tracks import landmarks_of
 from vioframe.frontend import FrontendOptions
 from vioframe.frontend.flow import body_rotation
-from vioframe.frontend.view import Shown, View
+from vioframe.frontend.view import BORDER_PX, Shown, View
 from vioframe.geometry.cameras import Camera
 from vioframe.geometry.meshes import read_mesh
 from vioframe.incidents import Incidents
@@ -32,6 +32,7 @@ from vioframe.stopwatch import Stopwatch
 from vioframe.types import Bool, Float, FrameTracks, Int
 from vioframe_keypointnet.network import KeypointNet
 from vioframe_keypointnet.options import Target, TrainingOptions
+from vioframe_keypointnet.selection import padded_to_cells
 from vioframe_keypointnet.training.samples import Picture
 
 IMAGES = 60
@@ -42,8 +43,8 @@ _EVERY = 6
 """Of the images of a flight, points are drawn in one of so many."""
 _POINTS, _APART_PX, _STEEPEST = 600, 6.0, 0.5
 """How many, how far apart, and from which share of the pixels: among them bad ones, or there is nothing to be told."""
-_EDGE_PX, _BORDER_PX = 10.0, 5.0
-"""Points so near the edge of a crop are seen in part; so near the border of an image the front-end drops them."""
+_EDGE_PX = 10.0
+"""Points so near the edge of a crop are seen in part."""
 
 _STRAYED_PX = 1.0
 """So far from its landmark a point does more harm than good."""
@@ -115,7 +116,7 @@ def _fates(xy: Float, R_WC: Float, p_WC: Float, camera: Camera, corners: Float) 
         true_xy = camera.project(p_CF)
         distance = np.linalg.norm(xy[:, k + 1] - true_xy, axis=1)
         off_px[:, k] = np.where(np.isfinite(distance), distance, np.inf)
-        known[:, k] = camera.contains(true_xy, _BORDER_PX) & (p_CF[:, 2] > 0.0)
+        known[:, k] = camera.contains(true_xy, BORDER_PX) & (p_CF[:, 2] > 0.0)
     return off_px, np.logical_and.accumulate(known, axis=1)
 
 
@@ -218,12 +219,10 @@ def rank_correlation(network: KeypointNet, pictures: Sequence[Followed], target:
     found = []
     for picture in pictures:
         score, enough = wanted(target, picture)
-        rows, columns = picture.pixels.shape
-        image = torch.from_numpy(picture.pixels[: rows // 8 * 8, : columns // 8 * 8].copy())
+        image = torch.from_numpy(padded_to_cells(picture.pixels).copy())
         with torch.inference_mode():
             said = responses(network, image[None, None].float() / 255.0)[0].numpy()
-        x, y = np.rint(picture.xy).astype(np.int64).T
-        use = enough & (x < said.shape[1]) & (y < said.shape[0])
-        if len(np.unique(score[use])) > 1:
-            found.append(spearmanr(said[y[use], x[use]], score[use]).statistic)
+        x, y = np.rint(picture.xy[enough]).astype(np.int64).T
+        if len(np.unique(score[enough])) > 1:
+            found.append(spearmanr(said[y, x], score[enough]).statistic)
     return float(np.mean(found)) if found else float("nan")

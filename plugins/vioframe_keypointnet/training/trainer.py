@@ -67,7 +67,7 @@ class KeypointNetTrainer:
         self._training = Training(options, train)
         self._counts = len(train), len(held_out)
         every = max(1, len(train) // _CALIBRATION_IMAGES)
-        self._sample = [grey_of(picture.pixels) for picture in train[::every][:_CALIBRATION_IMAGES]]
+        self._sample = train[::every][:_CALIBRATION_IMAGES]
         self._history: list[Mapping[str, float]] = []
         if job.resume:
             self._history = self._training.resume(checkpoint)
@@ -104,19 +104,14 @@ class KeypointNetTrainer:
         return row
 
     def _write_weights(self) -> None:
-        card = {
+        about = {
             "images": [path.name for path in self._job.images],
             "trained_on": self._counts[0],
             "held_out": self._counts[1],
-            "simulated_worlds": self._training.worlds,
             "started_from": None if self._job.start_from is None else Path(self._job.start_from).name,
-            "options": asdict(self._options),
             "result": dict(self._history[-1]) if self._history else {},
         }
-        made = self._training.weights()
-        ranges = measure_ranges(made, self._sample)
-        card |= made.card
-        weights.save(self._job.out / WEIGHTS, replace(made, card=card, activation_ranges=ranges))
+        self._training.write(self._job.out / WEIGHTS, self._sample, about)
 
 
 class Training:
@@ -252,6 +247,16 @@ class Training:
         tensors = {n: x.cpu().numpy().copy() for n, x in state.items() if not n.endswith("num_batches_tracked")}
         describes = self.options.target == "repeatability"
         return weights.Weights(self.options.architecture, tensors, {"target": self.target, "descriptors": describes})
+
+    def write(self, path: Path, sample: Sequence[Picture], about: Mapping[str, Any]) -> None:
+        """Write the weights as they are now, with ranges for int8 measured on a ``sample`` of pictures.
+
+        Their card has the training, and what else is known ``about`` it.
+        """
+        made = self.weights()
+        ranges = measure_ranges(made, (grey_of(picture.pixels) for picture in sample))
+        card = {**about, "simulated_worlds": self.worlds, "options": asdict(self.options), **made.card}
+        weights.save(path, replace(made, card=card, activation_ranges=ranges))
 
 
 def step_losses(
