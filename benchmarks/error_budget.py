@@ -180,7 +180,7 @@ def follow(recording: SimulatedRecording, config: Config, installed: Registry, t
     tracks = [frontend.track(imu, frames, calibration) for imu, frames in packets]
     (camera,) = calibration.cameras
     R_WB, p_WB = true.motion(np.array([frame.t_ns for frame in tracks]))[:2]
-    known = landmarks_of(tracks, R_WB @ camera.R_BC, p_WB + R_WB @ camera.p_BC, recording.world.mesh.corners)
+    known = landmarks_of(tracks, *camera.pose(R_WB, p_WB), recording.world.mesh.corners)
     kept, landmarks, errors = [], [], []
     for frame, *pose in zip(tracks, R_WB, p_WB, strict=True):
         p_WF = known[frame.ids]

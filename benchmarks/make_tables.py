@@ -188,11 +188,10 @@ def one_or_two() -> str:
     for (clip, backend), own in rows.groupby(["clip", "backend"]):
         found = dict(iter(own.groupby("cameras")))
         one, both = (found[cameras].set_index("world") for cameras in ("one", "both"))
-        first = float(both["ate_m"][0])
 
-        def beside(cameras: str, found: dict[str, pd.DataFrame] = found, first: float = first) -> str:
-            ate_m = float(found[cameras]["ate_m"].iloc[0])
-            return f"{length(ate_m)}, {ate_m / first:.2f}"
+        def beside(cameras: str, found: dict[str, pd.DataFrame] = found, both: pd.Series = both["ate_m"]) -> str:
+            ate = found[cameras].set_index("world")["ate_m"]
+            return f"{_spread(ate)}, {ate.mean() / both[ate.index].mean():.2f}"
 
         shown.append(
             {

@@ -110,13 +110,14 @@ def test_a_start_of_another_instant_than_the_first_frame_is_refused():
 
 @pytest.mark.parametrize("name", BACKENDS)
 def test_cameras_may_take_turns(name):
-    """Every other frame is of the right one alone; the left one finds the start, and both hold the scale."""
+    """Every other frame is of the right one alone; both find the start, and hold the scale."""
     sequence = simulated_sequence("figure_eight", duration_s=8.0, seed=1, calibration=STEREO)
     packets = [(imu, tracks.of_camera(k % 2)) for k, (imu, tracks) in enumerate(sequence.packets)]
     life = LifeCycle(created(name), STEREO)
     estimates = [life.process(imu, tracks) for imu, tracks in packets]
     states = {e.state.t_ns: e.state for e in estimates if e.state is not None}
-    assert len(states) > 60
+    assert len(states) > 145
+    assert next(e.events for e in estimates if e.state is not None) == ("initialised (stereo)",)
     assert not any(e.status is Status.LOST for e in estimates)
     truth = {state.t_ns: state for state in sequence.true_states}
     begin, end = (states[t_ns] for t_ns in (min(states), max(states)))

@@ -138,6 +138,11 @@ class FrameTracks:
         """What the one at this place in the rig sees."""
         return self if not self.camera.any() and camera == 0 else self.only(self.camera == camera)
 
+    @property
+    def by_others_alone(self) -> bool:
+        """Whether cameras take turns, and this was not the first one's."""
+        return bool(len(self.ids)) and bool(self.camera.all())
+
     def undistorted(self, *lenses: Camera) -> FrameTracks:
         """The same pixels as the ``lenses`` of the rig have them on the z = 1 plane."""
         xy_normalised = np.empty_like(self.xy)
@@ -195,6 +200,10 @@ class CameraOnBody:
         They are exposed that part of ``readout_s`` after the stamp.
         """
         return (y + 0.5) / self.model.resolution[1] - 0.5
+
+    def pose(self, R_WB: Float, p_WB: Float) -> tuple[Float, Float]:
+        """R_WC (..., 3, 3) and p_WC (..., 3) m on a body at ``R_WB`` (..., 3, 3), ``p_WB`` (..., 3)."""
+        return R_WB @ self.R_BC, p_WB + R_WB @ self.p_BC
 
     def seen_from(self, other: CameraOnBody) -> tuple[Float, Float]:
         """R_C2C1 (3, 3) and p_C2C1 (3,) m, from the axes of this camera, C1, to those of the ``other``, C2."""

@@ -112,7 +112,7 @@ class KeyframeSelector:
         if before is not None and 0.0 < dt < _STEADY_S:
             rate_B = so3.log(before.R_WB.T @ R_WB) / dt
             R_WB, p_WB = R_WB @ so3.exp(rate_B * late_s), p_WB + state.v_WB * late_s
-        return R_WB @ self._camera.R_BC, p_WB + R_WB @ self._camera.p_BC
+        return self._camera.pose(R_WB, p_WB)
 
     def _see(self, tracks: FrameTracks, state: NavState) -> None:
         """Remember from where features were seen, by every camera: two see what is far though the body stands still."""

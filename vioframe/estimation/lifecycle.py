@@ -80,15 +80,13 @@ class LifeCycle:
     def process(self, imu: ImuSegment, tracks: FrameTracks) -> Estimate:
         """Begin, or follow one frame; where that fails it says so, and begins anew from where it was."""
         tracks = tracks.finite()
-        first = tracks.of_camera(0)
-        # Cameras may take turns; it begins by the first one alone.
-        apart = len(first.ids) == 0 < len(tracks.ids) and self._initial_state is None
-        still = not apart and self._standstill.sees_standstill(first) and self._options.zero_velocity_update
-        if apart and (self._initializer.in_doubt or not self._following):
-            self._initializer.pass_by(imu)
+        apart = tracks.by_others_alone and self._initial_state is None
+        still = (
+            not apart and self._standstill.sees_standstill(tracks.of_camera(0)) and self._options.zero_velocity_update
+        )
         if not self._following:
-            return Estimate(Status.INITIALISING) if apart else self._begin(imu, tracks)
-        if not apart and self._initializer.in_doubt and self._initializer.follow(imu, first, still):
+            return self._begin(imu, tracks)
+        if self._initializer.in_doubt and self._initializer.follow(imu, tracks, still):
             self._following = False
             return Estimate(
                 Status.LOST, events=(f"lost: the camera is mounted differently; {self._initializer.found}",)

@@ -21,8 +21,7 @@ def epipolar_errors_px(
     """
     covered = [s for s in steps if ground_truth.covers([s.t_ns])[0]]
     truth = ground_truth.at([s.t_ns for s in covered])
-    R_WC = truth.R_WB @ calibration.cameras[0].R_BC
-    p_WC = truth.p_WB + truth.R_WB @ calibration.cameras[0].p_BC
+    R_WC, p_WC = calibration.cameras[0].pose(truth.R_WB, truth.p_WB)
     errors = [np.empty(0)]
     for k in range(len(covered) - baseline):
         before, after = covered[k], covered[k + baseline]

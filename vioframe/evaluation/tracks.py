@@ -32,7 +32,7 @@ def track_lives(
     the camera sees no surface.
     """
     truth = ground_truth.at([step.t_ns for step in steps])
-    R_WC, p_WC = truth.R_WB @ camera.R_BC, truth.p_WB + truth.R_WB @ camera.p_BC
+    R_WC, p_WC = camera.pose(truth.R_WB, truth.p_WB)
     p_WF = landmarks_of(steps, R_WC, p_WC, corners)
     images, squared_px = np.full(len(p_WF), -1), np.zeros(len(p_WF))
     for tracks, R, p in zip(steps, R_WC, p_WC, strict=True):

@@ -217,9 +217,9 @@ class SimulatedRecording:
         return np.clip(t_ns, self.ground_truth.t_ns[0], self.ground_truth.t_ns[-1])
 
     def _camera_poses(self, camera: int, t_ns: Int) -> tuple[Float, Float]:
-        on_body = self.true_calibration.cameras[camera]
-        R_WB, p_WB = self._scenario.body_poses(self.true_calibration, camera, t_ns)
-        return R_WB @ on_body.R_BC, R_WB @ on_body.p_BC + p_WB
+        return self.true_calibration.cameras[camera].pose(
+            *self._scenario.body_poses(self.true_calibration, camera, t_ns)
+        )
 
 
 def _with_readout(calibration: Calibration, readout_s: list[float]) -> Calibration:

@@ -233,7 +233,7 @@ class TrackSimulator:
         """
         count = len(self._cameras)
         R_WB, p_WB = np.broadcast_to(R_WB, (count, 3, 3)), np.broadcast_to(p_WB, (count, 3))
-        poses = [self._camera_pose(c, R, p) for c, (R, p) in enumerate(zip(R_WB, p_WB, strict=True))]
+        poses = [camera.pose(R, p) for camera, R, p in zip(self._cameras, R_WB, p_WB, strict=True)]
         views = [self._project(c, *pose, later, self._p_WF) for c, pose in enumerate(poses)]
         living = np.any([seen for _, seen in views], axis=0)
         self._ids, self._p_WF = self._ids[living], self._p_WF[living]
@@ -270,17 +270,12 @@ class TrackSimulator:
                 break
         return xy, seen
 
-    def _camera_pose(self, camera: int, R_WB: Float, p_WB: Float) -> tuple[Float, Float]:
-        """R_WC and p_WC, (..., 3, 3) and (..., 3), of one body pose or many."""
-        on_body = self._cameras[camera]
-        return R_WB @ on_body.R_BC, R_WB @ on_body.p_BC + p_WB
-
     def _row_poses(self, camera: int, y: Float, later: PoseLater | None) -> tuple[Float, Float]:
         """Of a camera when it exposes its rows ``y`` (N,): R_WC (N, 3, 3) and p_WC (N, 3)."""
         on_body = self._cameras[camera]
         if later is None:
             raise ConfigError(f"{on_body.name} has a rolling shutter: say where the body is at the time of a row")
-        return self._camera_pose(camera, *later(camera, on_body.readout_s * on_body.row(y)))
+        return on_body.pose(*later(camera, on_body.readout_s * on_body.row(y)))
 
     def _project_from(self, camera: int, R_WC: Float, p_WC: Float, p_WF: Float) -> tuple[Float, Bool]:
         """The same from one pose, or from one for each landmark."""

@@ -92,7 +92,7 @@ def follow(recording: Path) -> list[Followed]:
             begun.append(_Set(len(t_ns), shown, View(detector, camera.model, options, incidents), frames.t_ns, watch))
         t_ns.append(frames.t_ns)
     motion, corners = truth.at(t_ns), read_mesh(mesh)
-    R_WC, p_WC = motion.R_WB @ camera.R_BC, motion.p_WB + motion.R_WB @ camera.p_BC
+    R_WC, p_WC = camera.pose(motion.R_WB, motion.p_WB)
     out = []
     for number, points in enumerate(begun):
         seen = slice(points.first, points.first + IMAGES + 1)

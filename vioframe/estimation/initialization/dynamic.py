@@ -315,14 +315,16 @@ def _check_lookahead(
     """
     found = given.with_intrinsics(cameras.intrinsics[0])
     for state, (imu, tracks) in zip(predicted, packets, strict=True):
-        tracks = tracks.of_camera(0)
-        _, a, b = np.intersect1d(ids, tracks.ids, return_indices=True)
+        if tracks.by_others_alone:
+            continue
+        seen = tracks.of_camera(0)
+        _, a, b = np.intersect1d(ids, seen.ids, return_indices=True)
         refuse_unless(len(a) >= _FEWEST_COMMON, f"only {len(a)} landmarks were still tracked in the frames held back")
         turned = so3.exp((imu.gyro_B[-1] - state.bias_gyro_B) * cameras.offset_s[0])
         p_WB = state.p_WB + state.v_WB * cameras.offset_s[0]
         p_C = ((p_WF[a] - p_WB) @ (state.R_WB @ turned) - cameras.p_BC[0]) @ cameras.R_BC[0]
         z = np.where(p_C[:, 2] > 0.0, p_C[:, 2], np.nan)
-        error = found.distort(p_C[:, :2] / z[:, None]) - given.distort(tracks.xy_normalised[b])
+        error = found.distort(p_C[:, :2] / z[:, None]) - given.distort(seen.xy_normalised[b])
         px = float(np.median(np.nan_to_num(np.linalg.norm(error, axis=1), nan=np.inf)))
         refuse_unless(px <= _LARGEST_LOOKAHEAD_PX, f"the prediction misses a later frame by {px:.1f} px")
 

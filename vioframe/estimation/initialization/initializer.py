@@ -126,11 +126,14 @@ class Initializer:
         """Take one frame; an estimate whose newest state is at this frame, or None as long as none can be trusted.
 
         Where :attr:`calibration` has another time offset after it, ``imu`` of the next call must count with it, and
-        begin where that of this call ended on the IMU's own clock, or earlier.
+        begin where that of this call ended on the IMU's own clock, or earlier. At a frame that the first camera has no
+        part in nothing begins.
         """
-        if not self._take(imu, tracks.of_camera(0)):
+        taken = self._take(imu, tracks)
+        if taken or tracks.by_others_alone:
+            self._take_of_rig(imu, tracks)
+        if not taken:
             return None
-        self._take_of_rig(imu, tracks)
         known = self._calibration.cameras[0].rotation_known
         placed = {"static": self._static, "stereo": self._stereo} if known else {}
         methods = {**placed, "dynamic": self._dynamic}
@@ -147,11 +150,6 @@ class Initializer:
                 self.in_doubt = estimate.method != "dynamic"
                 return estimate
         return None
-
-    def pass_by(self, imu: ImuSegment) -> None:
-        """Take the readings up to a frame that another camera took alone."""
-        self._begin_after_gap(imu)
-        self._readings.add(imu)
 
     def follow(self, imu: ImuSegment, tracks: FrameTracks, still: bool) -> bool:
         """Take one frame of a flight that began at rest; whether the camera turns out to be mounted quite differently.
@@ -177,10 +175,12 @@ class Initializer:
         return True
 
     def _take(self, imu: ImuSegment, tracks: FrameTracks) -> bool:
-        """Take one frame; whether its readings are there, or still to come."""
+        """Take what the first camera sees in a frame; False if it has no part in it, or readings are still to come."""
         self._begin_after_gap(imu)
-        tracks = unrolled(tracks.finite(), self._calibration.cameras[0], imu.gyro_B[-1])
         self._readings.add(imu)
+        if tracks.by_others_alone:
+            return False
+        tracks = unrolled(tracks.of_camera(0).finite(), self._calibration.cameras[0], imu.gyro_B[-1])
         self._waiting.append(tracks)
         self._sensors.add(tracks, self._calibration.cameras[0].model)
         self._cut()

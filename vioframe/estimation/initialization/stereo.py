@@ -2,14 +2,14 @@
 
     choose keyframes -> gyro bias -> places in metres -> alignment -> bundle adjustment -> look ahead -> add the newest
 
-It serves at rest and in motion alike. Being over before much of the calibration could show, it takes it as given, and
-leaves it to the slower methods where anything speaks against it.
+It serves at rest and in motion alike, and whether cameras are exposed at once or take turns. Being over before much of
+the calibration could show, it takes it as given, and leaves it to the slower methods where anything speaks against it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import combinations
+from itertools import combinations, permutations
 
 import numpy as np
 
@@ -45,7 +45,7 @@ from vioframe.estimation.initialization.window import (
 )
 from vioframe.geometry.so3 import level_rotation
 from vioframe.geometry.two_view import inverse_depths, rays
-from vioframe.types import Calibration, CameraOnBody
+from vioframe.types import NS_PER_S, Calibration, CameraOnBody
 
 # Frames of the window that are estimated, tracks that are used, the longest first, views each of them needs.
 _KEYFRAMES, _MOST_LANDMARKS, _MIN_VIEWS = 8, 80, 4
@@ -56,6 +56,8 @@ _FARTHEST_M = 50.0
 _LESS_SURE = 2.0
 # Steps of the search for a frame's place, and where a landmark begins to be discounted, times the noise.
 _STEPS, _WIDTH = 6, 5.0
+# Rounds in which cameras that take turns find how far they have moved between their images, and to what.
+_ROUNDS, _AGREED_M = 8, 1e-3
 
 
 def initialise(packets: Sequence[Packet], calibration: Calibration, known: Float, doubted: Float) -> InitialEstimate:
@@ -65,10 +67,8 @@ def initialise(packets: Sequence[Packet], calibration: Calibration, known: Float
     not be.
     """
     refuse_unless(len(packets) >= _FEWEST_FRAMES, f"{len(packets)} frames, {_FEWEST_FRAMES} are needed")
-    t_ns = np.array([tracks.t_ns for _, tracks in packets])
     cameras, noise = calibration.cameras, PIXEL_SIGMA / calibration.cameras[0].model.focal_px
-    chosen = [*spread_indices(t_ns[:-_HELD_OUT], _KEYFRAMES), len(packets) - 1]
-    window = build_window(packets, chosen, _MIN_VIEWS, _MOST_LANDMARKS, len(cameras))
+    window = build_window(packets, _keyframes(packets), _MIN_VIEWS, _MOST_LANDMARKS, len(cameras))
     require_tracks(window, "tracks are long enough")
     first, bias_gyro = with_gyro_bias(window.of_camera(0), np.zeros(3), calibration.only(0), noise)
     window = window.only(np.isin(window.ids, first.ids))
@@ -102,27 +102,56 @@ def initialise(packets: Sequence[Packet], calibration: Calibration, known: Float
     return InitialEstimate("stereo", states, window.ids[keep], p_WF)
 
 
+def _keyframes(packets: Sequence[Packet]) -> list[int]:
+    """Which of the ``packets``: some, spread over time, the newest, and after one camera's turn the next one's."""
+    earlier = packets[:-_HELD_OUT]
+    spread = spread_indices(np.array([tracks.t_ns for _, tracks in earlier]), _KEYFRAMES)
+    turns = [k for k in spread if len(np.unique(earlier[k][1].camera)) == 1]
+    return [*sorted({*spread, *(k + 1 for k in turns if k + 1 < len(earlier))}), len(packets) - 1]
+
+
 def _placed(window: Window, R_B0B: Float, cameras: Sequence[CameraOnBody], sigma: float) -> tuple[Float, Float, Bool]:
-    """p_B0B (K, 3), landmarks p_B0F (L, 3), and which of these two cameras saw at once (L,), given R_B0B (K, 3, 3).
+    """p_B0B (K, 3), landmarks p_B0F (L, 3), and which of these two cameras saw (L,), given R_B0B (K, 3, 3).
+
+    Cameras that take turns see what they share from two places. How far apart these are the path tells that follows
+    from it: once more, then, until both agree.
+    """
+    v_B0, t_s = np.zeros(3), (window.t_ns - window.t_ns[0]) / NS_PER_S
+    for _ in range(_ROUNDS):
+        p_B0B, p_F, known, first = _walked(window, R_B0B, cameras, sigma, v_B0 * t_s[:, None])
+        moved, v_B0 = p_B0B[first] / t_s[first] - v_B0, p_B0B[first] / t_s[first]
+        if not np.linalg.norm(moved) * t_s[first - 1] > _AGREED_M:
+            break
+    return p_B0B, p_F, known
+
+
+def _walked(
+    window: Window, R_B0B: Float, cameras: Sequence[CameraOnBody], sigma: float, p_B0B: Float
+) -> tuple[Float, Float, Bool, int]:
+    """The same if the body is at ``p_B0B`` (K, 3) until two cameras have seen something; and the first frame after.
 
     One frame after another: its place is where the landmarks known by then are seen, and those new in it get their
-    depth from two of its cameras.
+    depth from two cameras, both in it, or one in that before.
     """
     N, L = len(cameras), len(window.ids)
-    p_B0B, p_F, known = np.zeros((len(R_B0B), 3)), np.zeros((L, 3)), np.zeros(L, bool)
+    p_B0B, p_F, known, first = p_B0B.copy(), np.zeros((L, 3)), np.zeros(L, bool), 0
     for k, R in enumerate(R_B0B):
-        views = slice(N * k, N * (k + 1))
-        seen, xy = window.seen[views], window.xy[views]
-        if k:
+        seen, xy = window.seen[N * k : N * (k + 1)], window.xy[N * k : N * (k + 1)]
+        if known.any():
+            first = first or k
             p_B0B[k] = _place(R, p_B0B[k - 1], seen & known, xy, p_F, cameras, sigma)
-        for a, b in combinations(range(N), 2):
-            one, rows = cameras[a], np.flatnonzero(seen[a] & seen[b] & ~known)
-            rho = inverse_depths(xy[a, rows], xy[b, rows], *one.seen_from(cameras[b]))
+        pairs = [(k, a, b) for a, b in combinations(range(N), 2)]
+        pairs += [(k - 1, a, b) for a, b in permutations(range(N), 2) if k]
+        for i, a, b in pairs:
+            rows = np.flatnonzero(window.seen[N * i + a] & seen[b] & ~known)
+            (R_1, p_1), (R_2, p_2) = (cameras[c].pose(R_B0B[j], p_B0B[j]) for c, j in ((a, i), (b, k)))
+            xy_1 = window.xy[N * i + a, rows]
+            rho = inverse_depths(xy_1, xy[b, rows], R_2.T @ R_1, R_2.T @ (p_1 - p_2))
             near = rho > 1.0 / _FARTHEST_M
-            p_C = rays(xy[a, rows[near]]) / rho[near, None]
-            p_F[rows[near]] = (p_C @ one.R_BC.T + one.p_BC) @ R.T + p_B0B[k]
+            p_F[rows[near]] = rays(xy_1[near]) / rho[near, None] @ R_1.T + p_1
             known[rows[near]] = True
-    return p_B0B, p_F, known
+    refuse_unless(first, "nothing is seen by two cameras")
+    return p_B0B, p_F, known, first
 
 
 def _place(
