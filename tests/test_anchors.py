@@ -122,7 +122,3 @@ def test_anchors_go_with_their_points(image, xy):
     both = one.joined(other)
     np.testing.assert_array_equal(both.patch, Anchors.of(pyramid(image), xy[:8]).patch)
     np.testing.assert_array_equal(both.keep(np.arange(8) >= 5).inverse, other.inverse)
-    elsewhere = xy[:8] + 3.0
-    fresh = both.renewed(np.array([2, 4]), pyramid(image), elsewhere)
-    np.testing.assert_array_equal(fresh.patch[[2, 4]], Anchors.of(pyramid(image), elsewhere[[2, 4]]).patch)
-    np.testing.assert_array_equal(fresh.patch[[0, 1, 3]], both.patch[[0, 1, 3]])

@@ -1,7 +1,7 @@
 """The front-end on a rendered plane with known motion, on real images, and against detectors that misbehave."""
 
 from collections import Counter
-from itertools import pairwise
+from itertools import combinations, pairwise
 
 import cv2
 import numpy as np
@@ -100,6 +100,25 @@ def test_points_stay_on_their_landmarks_through_an_approach():
         assert len(i) > 50
     assert np.median(slid[True]) < 0.06
     assert np.median(slid[True]) < 0.3 * np.median(slid[False])
+
+
+def test_a_point_on_an_outline_is_let_go_of_before_it_slides():
+    """Something else moves in front of what stands still: a patch on its outline shows both, and follows neither."""
+    images = [view(np.eye(3)) for _ in range(20)]
+    for k, image in enumerate(images):
+        image[60:180, 40 + 4 * k : 140 + 4 * k] = texture((120, 100), seed=7)
+    strayed = {}
+    for anchored in (True, False):
+        steps = play(frontend(anchored=anchored, equalisation="none", rejection="none", min_distance_px=6.0), images)
+        off_px = []
+        for (k, first), (m, later) in combinations(enumerate(steps), 2):
+            _, i, j = np.intersect1d(first.ids, later.ids, return_indices=True)
+            moved = later.xy[j] - first.xy[i]
+            still, along = (np.linalg.norm(moved - [4.0 * images, 0.0], axis=1) for images in (0, m - k))
+            off_px.append(np.minimum(still, along))
+        strayed[anchored] = np.mean(np.concatenate(off_px) > 1.0)
+    assert strayed[True] < 0.01
+    assert strayed[True] < 0.2 * strayed[False]
 
 
 def test_points_are_undistorted():
@@ -455,7 +474,7 @@ def test_at_rest_tracks_live_on(shared_data):
     _, steps = euroc(shared_data, "V1_01_easy_rest", 95)
     assert len(steps) >= 90
     survivors, i, j = np.intersect1d(steps[0].ids, steps[-1].ids, return_indices=True)
-    assert len(survivors) >= 0.9 * len(steps[0].ids)
+    assert len(survivors) >= 0.8 * len(steps[0].ids)
     moved = steps[-1].xy[j] - steps[0].xy[i]
     assert np.median(np.linalg.norm(moved - np.median(moved, axis=0), axis=1)) < 0.4
 

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from vioframe.frontend.lucas_kanade import Pixels, Pyramid
 from vioframe.jit import kernel
-from vioframe.types import Bool, Float, Image, Int
+from vioframe.types import Bool, Float, Image
 
 _ITERATIONS, _EPSILON_PX = 6, 0.02
 # Pixels weigh by a Gaussian of this width, of half the side of a patch: turned or grown the middle is what it was.
@@ -65,14 +65,6 @@ class Anchors:
 
     def joined(self, more: Anchors) -> Anchors:
         return Anchors(*map(np.concatenate, zip(self._values, more._values, strict=True)))
-
-    def renewed(self, which: Int, pyramid: Pyramid, xy: Float) -> Anchors:
-        """With new ones for the points ``which`` (M,) of N, which are at ``xy`` (N, 2) px of ``pyramid`` now."""
-        fresh = Anchors.of(pyramid, xy[which])
-        values = [values.copy() for values in self._values]
-        for mine, new in zip(values, fresh._values, strict=True):
-            mine[which] = new
-        return Anchors(*values)
 
     def refine(self, pyramid: Pyramid, xy: Float, tried: Bool) -> tuple[Anchors, Float, Bool]:
         """Find the patches ``tried`` (N,) in ``pyramid``, beginning at ``xy`` (N, 2) px.

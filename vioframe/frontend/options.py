@@ -27,7 +27,7 @@ class FrontendOptions:
     klt_levels: int = 4
     """Pyramid levels above the full image."""
     anchored: bool = True
-    """Find each patch again as it looked at first, so that points do not slide off their landmarks."""
+    """Find each patch again as it looked at first, or let go of it, so that points do not slide off their landmarks."""
     rejection: Rejection = "magsac"
     """Epipolar outlier rejection: magsac (essential matrix by MAGSAC++), fundamental (fundamental matrix by RANSAC, it
     asks less of the calibration), two_point (rotation from the gyroscope; magsac where nobody knows how the camera

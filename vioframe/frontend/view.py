@@ -162,15 +162,11 @@ class View:
             return before
         guess = self.xy if R_C2C1 is None else predict(self.camera, self.xy, before, R_C2C1)
         xy, found = follow(self._pyramid, pyramid, self.xy, guess)
-        held = np.zeros(len(found), bool)
-        if self._anchors is not None:
-            self._anchors, xy, held = self._anchors.refine(pyramid, xy, found)
-        # What is like its anchor is the same point; others must find their way back, and begin anew where they are.
-        loose = np.flatnonzero(found & ~held)
-        back = returns(self._pyramid, pyramid, self.xy[loose], xy[loose], FORWARD_BACKWARD_PX)
-        found[loose] = back
-        if self._anchors is not None:
-            self._anchors = self._anchors.renewed(loose[back], pyramid, xy)
+        if self._anchors is None:
+            found[found] = returns(self._pyramid, pyramid, self.xy[found], xy[found], FORWARD_BACKWARD_PX)
+        else:
+            # What is not like its anchor any more may be followed on, but most of it has left its landmark.
+            self._anchors, xy, found = self._anchors.refine(pyramid, xy, found)
         self.xy = xy
         self.xy_normalised, usable = self.undistorted(self.xy)
         found &= usable
