@@ -14,9 +14,7 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from statistics import geometric_mean
 
-import numpy as np
 import pandas as pd
-from scipy.stats import wilcoxon
 
 from vioframe.bench.detectors.degradations import Degradation
 from vioframe.bench.detectors.tables import BASELINE, by_degradation
@@ -153,31 +151,6 @@ def rendered() -> str:
         }
         for (clip, backend, detector), own in rows[rows["options"] == ""].groupby(["clip", "backend", "detector"])
     ]
-    return markdown(shown) + source(rows)
-
-
-def against() -> str:
-    """The same recordings with other options: the ATE as it is over theirs, in pairs; each flight's, and all."""
-    rows = _in_m(recorded("rendered_flights_*.json"))
-    shown = []
-    for (backend, detector), own in rows.groupby(["backend", "detector"]):
-        found = {options: of.set_index(["clip", "world"])["ate_m"] for options, of in own.groupby("options")}
-        for options in filter(None, found):
-            ratios = found[""] / found[options]
-            for clip, of in (*ratios.groupby("clip"), ("all", ratios)):
-                shown.append(
-                    {
-                        "flight": clip,
-                        "back-end": f"`{backend}`",
-                        "detector": f"`{detector}`",
-                        "beside": f"`{options}`",
-                        "ATE": "-" if clip == "all" else _spread(found[""][of.index]),
-                        "ATE beside": "-" if clip == "all" else _spread(found[options][of.index]),
-                        "ratio, geometric mean": f"{geometric_mean(of):.2f}",
-                        "better": f"{(of < 1.0).sum()} of {len(of)}",
-                        "p, Wilcoxon": f"{wilcoxon(np.log(of)).pvalue:.3f}",
-                    }
-                )
     return markdown(shown) + source(rows)
 
 
@@ -620,7 +593,6 @@ FIGURES: dict[str, Callable[[], str]] = {
             at_rest,
             landmarks,
             rendered,
-            against,
             one_or_two,
             error_budget,
             take_off,
