@@ -119,8 +119,8 @@ def _placed(window: Window, R_B0B: Float, cameras: Sequence[CameraOnBody], sigma
     v_B0, t_s = np.zeros(3), (window.t_ns - window.t_ns[0]) / NS_PER_S
     for _ in range(_ROUNDS):
         p_B0B, p_F, known, first = _walked(window, R_B0B, cameras, sigma, v_B0 * t_s[:, None])
-        moved, v_B0 = p_B0B[first] / t_s[first] - v_B0, p_B0B[first] / t_s[first]
-        if not np.linalg.norm(moved) * t_s[first - 1] > _AGREED_M:
+        before, v_B0 = v_B0, p_B0B[first] / t_s[first]
+        if not np.linalg.norm(v_B0 - before) * t_s[first - 1] > _AGREED_M:
             break
     return p_B0B, p_F, known
 
