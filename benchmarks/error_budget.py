@@ -9,12 +9,11 @@ Then the back-end has the same points again:
     as flown          as they were followed, with the IMU that was recorded
     white noise       where they truly are, with white noise as large as the tracker's error
     exact points      where they truly are
-    steps closed      along the true path without the steps it has been published with, which no IMU felt
-    smooth path       along a smooth path, which has none of the noise that the true poses were measured with
-    specified IMU     there, with readings as noisy as the calibration says, and biases that wander so
+    published path    seen from the path as it has been published, not from the one that the IMU felt
+    specified IMU     along a smooth path, with readings as noisy as the calibration says, and biases that wander so
     exact IMU         there, with readings that are exact
     known rig         with the calibration, which is exact here, not estimated
-    true start        from the true state at the first frame, where the recording has it
+    true start        from the true state at the first frame
     as assumed        white noise, specified IMU, known rig and true start at once: what the estimator takes for granted
 
 Everything but what a row names is as flown. Nothing is tuned on the flights of other benchmarks' targets: by default
@@ -25,7 +24,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
-from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -42,8 +40,8 @@ from vioframe.evaluation.tracks import landmarks_of
 from vioframe.frontend import Frontend
 from vioframe.geometry.trajectory import Trajectory
 from vioframe.incidents import Incidents
-from vioframe.interfaces import Flight
 from vioframe.io.synchronise import synchronise
+from vioframe.io.trajectories import TrueTrajectory
 from vioframe.parts import config as configuration
 from vioframe.parts import registry
 from vioframe.parts.config import Config, PartConfig
@@ -54,7 +52,7 @@ from vioframe.simulation.flights import fit_flight
 from vioframe.simulation.recording import SimulatedRecording
 from vioframe.simulation.scenario import Scenario, fly, load_euroc
 from vioframe.simulation.tracks import cut_segments
-from vioframe.types import NS_PER_S, Calibration, CameraOnBody, FrameTracks, ImuNoise
+from vioframe.types import NS_PER_S, CameraOnBody, FrameTracks, ImuNoise
 
 FLIGHTS = ("MH_02_easy", "MH_03_medium", "V1_01_easy")
 WORLDS = (0, 1)
@@ -82,13 +80,13 @@ COLUMNS = {
 class Case:
     """What is otherwise than as flown.
 
-    The points are ``flown``, ``white`` or ``exact``; the path is as ``recorded``, ``closed`` or ``smooth``, and along
-    the smooth one the IMU may be as ``specified`` or ``exact`` instead of ``recorded``.
+    The points are ``flown``, ``white`` or ``exact``; the path is ``felt``, ``published`` or ``smooth``, and along the
+    smooth one the IMU is as ``specified`` or ``exact`` instead of ``recorded``.
     """
 
     name: str
     points: str = "flown"
-    path: str = "recorded"
+    path: str = "felt"
     imu: str = "recorded"
     options: Mapping[str, Any] | None = None
     true_start: bool = False
@@ -98,8 +96,7 @@ CASES = (
     Case("as flown"),
     Case("white noise", points="white"),
     Case("exact points", points="exact"),
-    Case("steps closed", path="closed"),
-    Case("smooth path", path="smooth"),
+    Case("published path", path="published"),
     Case("specified IMU", path="smooth", imu="specified"),
     Case("exact IMU", path="smooth", imu="exact"),
     Case("known rig", options=KNOWN_RIG),
@@ -150,12 +147,10 @@ def main(
                 settings = {"recorded": folder, "start_s": start_s, "duration_s": duration_s, "seed": world}
                 simulation = complete(SimulationConfig.model_validate(settings), installed)
                 recording = SimulatedRecording(simulation, installed, usable_cores())
-                followed = follow(recording, config, installed, recorded(folder))
+                followed = follow(recording, config, installed)
                 flown_mm = None
                 for case in CASES:
-                    row = estimated(case, followed, recording.calibration, folder, config, installed, world)
-                    if row is None:
-                        continue
+                    row = estimated(case, followed, recording, config, installed, world)
                     flown_mm = flown_mm or row.get("ate_mm")
                     click.echo(f"{flight}, world {world}, {case.name}: {row.get('ate_mm', np.nan):.0f} mm", err=True)
                     yield {**row, "of_flown": row["ate_mm"] / flown_mm if "ate_mm" in row and flown_mm else None}
@@ -164,13 +159,7 @@ def main(
     present("error_budget", f"{backend}: where the error comes from", rows(), COLUMNS, about, keep)
 
 
-@cache
-def recorded(folder: Path, closed: bool = False) -> Scenario:
-    """Readings and true path; ``closed`` without the steps that no IMU felt."""
-    return load_euroc(folder, remove_jumps=closed)
-
-
-def follow(recording: SimulatedRecording, config: Config, installed: Registry, true: Scenario) -> Followed:
+def follow(recording: SimulatedRecording, config: Config, installed: Registry) -> Followed:
     """Follow points through the images of ``recording``, and find the landmarks behind them."""
     calibration = recording.calibration
     detector = installed.create_detector(config.detector.name, config.detector.options)
@@ -179,7 +168,7 @@ def follow(recording: SimulatedRecording, config: Config, installed: Registry, t
     packets = synchronise(recording.measurements(), incidents=incidents, time_offset_ns=offset_ns)
     tracks = [frontend.track(imu, frames, calibration) for imu, frames in packets]
     (camera,) = calibration.cameras
-    R_WB, p_WB = true.motion(np.array([frame.t_ns for frame in tracks]))[:2]
+    R_WB, p_WB = recording.scenario.motion(np.array([frame.t_ns for frame in tracks]))[:2]
     known = landmarks_of(tracks, *camera.pose(R_WB, p_WB), recording.world.mesh.corners)
     kept, landmarks, errors = [], [], []
     for frame, *pose in zip(tracks, R_WB, p_WB, strict=True):
@@ -199,21 +188,12 @@ def pixels(camera: CameraOnBody, R_WB: Float, p_WB: Float, p_WF: Float) -> tuple
 
 
 def estimated(
-    case: Case,
-    followed: Followed,
-    calibration: Calibration,
-    folder: Path,
-    config: Config,
-    installed: Registry,
-    seed: int,
-) -> Row | None:
-    """The flight as the ``case`` has it, estimated; None where it begins at a true state that nobody knows."""
-    frames_ns = np.array([frame.t_ns for frame in followed.tracks])
-    sequence = _sequence(case, followed, calibration, folder, frames_ns, seed)
+    case: Case, followed: Followed, recording: SimulatedRecording, config: Config, installed: Registry, seed: int
+) -> Row:
+    """The flight as the ``case`` has it, estimated."""
+    sequence = _sequence(case, followed, recording, seed)
     start = None
     if case.true_start:
-        if not sequence.true_states:
-            return None
         sequence = replace(sequence, packets=sequence.packets[1:])
         start = replace(sequence.true_states[1], cov=np.diag(START_SIGMA**2))
     options = {**config.backend.options, **(case.options or {})}
@@ -228,26 +208,19 @@ def estimated(
     return {**row, **about}
 
 
-def _sequence(
-    case: Case, followed: Followed, calibration: Calibration, folder: Path, frames_ns: Int, seed: int
-) -> TrackSequence:
-    readings = recorded(folder, closed=case.path == "closed")
-    R_WB, p_WB, _ = readings.motion(frames_ns)
-    states = readings.states_at(frames_ns)
-    if case.path == "smooth":
-        flight, begin_ns = _smooth(readings, frames_ns), int(frames_ns[0])
-        motion = flight.at((frames_ns - begin_ns) / NS_PER_S)
-        R_WB, p_WB = motion.R_WB, motion.p_WB
-        if case.imu != "recorded":
-            noise = calibration.imu if case.imu == "specified" else None
-            readings = _flown(flight, frames_ns, noise, calibration.imu.rate_hz, np.random.default_rng([seed, 2]))
-            states = tuple(
-                replace(state, t_ns=t_ns)
-                for state, t_ns in zip(readings.states_at(readings.frames_ns), frames_ns.tolist(), strict=True)
-            )
-            readings = replace(readings, imu_ns=readings.imu_ns - readings.frames_ns[0] + begin_ns)
-    near = (readings.imu_ns >= frames_ns[0] - NS_PER_S) & (readings.imu_ns <= frames_ns[-1] + NS_PER_S)
-    segments = cut_segments(readings.imu_ns[near], readings.gyro_B[near], readings.accel_B[near], frames_ns)
+def _sequence(case: Case, followed: Followed, recording: SimulatedRecording, seed: int) -> TrackSequence:
+    frames_ns = np.array([frame.t_ns for frame in followed.tracks])
+    calibration, scenario = recording.calibration, recording.scenario
+    folder = recording.config.recorded
+    assert folder is not None
+    if case.path == "published":
+        published = load_euroc(folder, start_s=recording.config.start_s, duration_s=recording.config.duration_s)
+        scenario = replace(scenario, motion=published.motion)
+    elif case.path == "smooth":
+        noise = calibration.imu if case.imu == "specified" else None
+        scenario = _flown(scenario, frames_ns, noise, calibration.imu.rate_hz, np.random.default_rng([seed, 2]))
+    R_WB, p_WB, _ = scenario.motion(frames_ns)
+    segments = cut_segments(scenario.imu_ns, scenario.gyro_B, scenario.accel_B, frames_ns)
     rng, (sigma_px, _) = np.random.default_rng([seed, 1]), followed.sigma_px()
     packets = []
     frames = zip(segments, R_WB, p_WB, followed.tracks, followed.p_WF, followed.error_px, strict=True)
@@ -258,22 +231,30 @@ def _sequence(
         elif case.points == "white":
             xy = xy + rng.normal(0.0, sigma_px, xy.shape)
         packets.append((imu, replace(tracks, xy=xy).only(ahead).undistorted(*calibration.lenses).finite()))
-    return TrackSequence(folder.name, calibration, tuple(packets), Trajectory(frames_ns, R_WB, p_WB), states)
-
-
-def _smooth(flown: Scenario, frames_ns: Int) -> Flight:
-    """A spline along the recorded path, from the first of the frames to the last."""
-    begin_ns = flown.truth.t_ns[0]
-    return fit_flight(flown.truth, (frames_ns[0] - begin_ns) / NS_PER_S, (frames_ns[-1] - frames_ns[0]) / NS_PER_S)
+    truth = Trajectory(frames_ns, R_WB, p_WB)
+    return TrackSequence(folder.name, calibration, tuple(packets), truth, scenario.states_at(frames_ns))
 
 
 def _flown(
-    flight: Flight, frames_ns: Int, noise: ImuNoise | None, rate_hz: float, rng: np.random.Generator
+    felt: Scenario, frames_ns: Int, noise: ImuNoise | None, rate_hz: float, rng: np.random.Generator
 ) -> Scenario:
-    """The readings of a body that flies it."""
-    frames_s = (frames_ns - frames_ns[0]) / NS_PER_S
+    """A spline along the path, from the first of the frames to the last, and the readings of a body that flies it."""
+    after_s = (frames_ns - felt.truth.t_ns[0]) / NS_PER_S
+    flight = fit_flight(felt.truth, after_s[0], after_s[-1] - after_s[0])
+    frames_s = after_s - after_s[0]
     imu_s = np.arange(int(frames_s[-1] * rate_hz) + 2) / rate_hz
-    return fly(flight, "", rng, frames_s=frames_s, imu_s=imu_s, imu_rate_hz=rate_hz, noise=noise)
+    flown = fly(flight, "", rng, frames_s=frames_s, imu_s=imu_s, imu_rate_hz=rate_hz, noise=noise)
+    # Stamps are those of the frames as they were followed.
+    later_ns = int(frames_ns[0] - flown.frames_ns[0])
+    values = flown.truth.values
+    truth = TrueTrajectory(flown.truth.t_ns + later_ns, flown.truth.R_WB, flown.truth.p_WB, values=values)
+    return replace(
+        flown,
+        frames_ns=frames_ns,
+        imu_ns=flown.imu_ns + later_ns,
+        truth=truth,
+        motion=lambda t_ns: flown.motion(t_ns - later_ns),
+    )
 
 
 if __name__ == "__main__":

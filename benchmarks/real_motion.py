@@ -20,7 +20,6 @@ from vioframe.simulation import REAL_MOTION_SEQUENCES, TrackSequence, real_motio
 @click.option("--seed", "seeds", multiple=True, type=int, default=(0, 1, 2), help="Default: 0, 1 and 2.")
 @click.option("--pixel-sigma", default=1.0, show_default=True, help="Noise of an observation, px.")
 @click.option("--max-points", default=150, show_default=True, help="Landmarks in view.")
-@click.option("--remove-jumps", is_flag=True, help="Close the steps in the published positions, which no IMU felt.")
 def main(
     data: Path,
     backend: str,
@@ -30,7 +29,6 @@ def main(
     seeds: tuple[int, ...],
     pixel_sigma: float,
     max_points: int,
-    remove_jumps: bool,
 ) -> None:
     """Simulated landmarks along real motion with real IMU readings."""
 
@@ -44,7 +42,6 @@ def main(
                         pixel_sigma=pixel_sigma,
                         max_points=max_points,
                         seed=seed,
-                        remove_jumps=remove_jumps,
                     ),
                 )
 
@@ -53,7 +50,6 @@ def main(
         "options": list(assignments),
         "pixel_sigma": pixel_sigma,
         "max_points": max_points,
-        "remove_jumps": remove_jumps,
     }
     present(
         "real_motion",

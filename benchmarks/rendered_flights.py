@@ -1,4 +1,4 @@
-"""Whole EuRoC flights with their real IMU, camera stamps and true poses, and images rendered from those poses.
+"""Whole EuRoC flights with their real IMU and camera stamps, and images rendered along the path that the IMU felt.
 
     python benchmarks/rendered_flights.py [--record] [--against anchored=false] [--bags DIR]
 

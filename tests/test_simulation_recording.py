@@ -175,7 +175,7 @@ def seen_at(recording, t_ns) -> np.ndarray:
     """What the first camera would see, sharp and all rows at once, at instants (N,): (N, H, W), 255 for white."""
     (on_body,) = recording.true_calibration.cameras
     renderer = Renderer(on_body.model, recording.world)
-    R_WB, p_WB, _ = recording._scenario.motion(np.asarray(t_ns))
+    R_WB, p_WB, _ = recording.scenario.motion(np.asarray(t_ns))
     poses = zip(R_WB @ on_body.R_BC, R_WB @ on_body.p_BC + p_WB, strict=True)
     return np.array([np.clip(255.0 * renderer.render(*pose), 0.0, 255.0) for pose in poses])
 
@@ -235,9 +235,11 @@ def test_a_real_sequence_keeps_its_readings_stamps_and_poses(shared_data, tmp_pa
     t_ns, values = readings(recording)
     nearest = np.abs(rows[:, 0, None] - t_ns).argmin(axis=0)
     assert np.array_equal(values, rows[nearest, 1:])
-    truth = load_trajectory(folder / "state_groundtruth_estimate0" / "data.csv.gz")
-    at = np.isin(truth.t_ns, recording.ground_truth.t_ns)
-    np.testing.assert_array_equal(truth.p_WB[at], recording.ground_truth.p_WB)
+    truth = recording.ground_truth
+    published = load_trajectory(folder / "state_groundtruth_estimate0" / "data.csv.gz")
+    nearest = np.abs(published.t_ns[:, None] - truth.t_ns).argmin(axis=0)
+    off_m = np.linalg.norm(published.p_WB[nearest] - truth.p_WB, axis=1)
+    assert 0.0 < off_m.max() < 0.03
 
 
 def rig(folder: Path, **settings):
@@ -257,7 +259,7 @@ def test_every_camera_of_a_rig_sees_the_world_from_where_it_is(tmp_path):
     np.testing.assert_array_equal([frames.images[0] for frames in sets], alone)
     # The second sees what a camera there sees alone, at the instant of its own clock.
     second = both.calibration.cameras[1]
-    R_WB, p_WB, _ = both._scenario.motion(np.array([sets[3].t_ns + 5_000_000]))
+    R_WB, p_WB, _ = both.scenario.motion(np.array([sets[3].t_ns + 5_000_000]))
     renderer = Renderer(second.model, both.world)
     light = renderer.render(R_WB[0] @ second.R_BC, R_WB[0] @ second.p_BC + p_WB[0])
     np.testing.assert_array_equal(sets[3].images[1], np.clip(np.round(255.0 * light), 0.0, 255.0).astype(np.uint8))
@@ -354,7 +356,7 @@ def test_a_camera_with_stamps_of_its_own_comes_in_sets_of_one(tmp_path):
     assert stamps == [t_ns + 20_000_000 for t_ns, _ in triggered[:-1]]
     # Each image shows the world at the stamp that it bears.
     second = apart.calibration.cameras[1]
-    R_WB, p_WB, _ = apart._scenario.motion(np.array([stamps[2]]))
+    R_WB, p_WB, _ = apart.scenario.motion(np.array([stamps[2]]))
     light = Renderer(second.model, apart.world).render(R_WB[0] @ second.R_BC, R_WB[0] @ second.p_BC + p_WB[0])
     expected = np.clip(np.round(255.0 * light), 0.0, 255.0).astype(np.uint8)
     assert right[2] == (stamps[2], expected.tobytes())
@@ -385,7 +387,7 @@ def test_a_real_sequence_is_seen_by_both_cameras(shared_data, tmp_path):
     assert len(sets) == 7
     assert np.isin([m.t_ns for m in sets], stamps).all()
     second = rig.cameras[1]
-    R_WB, p_WB, _ = recording._scenario.motion(np.array([sets[3].t_ns]))
+    R_WB, p_WB, _ = recording.scenario.motion(np.array([sets[3].t_ns]))
     light = Renderer(second.model, recording.world).render(R_WB[0] @ second.R_BC, R_WB[0] @ second.p_BC + p_WB[0])
     expected = np.clip(np.round(255.0 * light), 0.0, 255.0).astype(np.uint8)
     np.testing.assert_array_equal(sets[3].images[1], expected)

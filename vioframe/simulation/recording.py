@@ -16,6 +16,7 @@ from vioframe.parts.registry import Registry
 from vioframe.simulation.camera import Shot, Studio, take_pictures
 from vioframe.simulation.conditions import check_known, misled, of_cameras
 from vioframe.simulation.config import SimulationConfig, rig_of
+from vioframe.simulation.felt import felt
 from vioframe.simulation.flights import fit_flight, levelled
 from vioframe.simulation.imu import ImuErrors, vibration
 from vioframe.simulation.scenario import Scenario, fly, load_euroc
@@ -38,7 +39,8 @@ class SimulatedRecording:
 
     ``config`` is complete. ``true_calibration`` is that of the rig which the images are rendered with, all its cameras
     triggered together unless ``delay_ms`` says otherwise; ``calibration`` is what an estimator is told. ``conditions``
-    are those that each camera meets. ``ground_truth`` holds a state for every reading of the IMU. Raises
+    are those that each camera meets, and ``scenario`` is what happens before any of them looks: its truth,
+    ``ground_truth``, holds a state for every reading of the IMU. Raises
     :class:`ConfigError` where the flight leads through a wall.
     """
 
@@ -65,9 +67,9 @@ class SimulatedRecording:
             if not camera.rotation_known:
                 raise ConfigError(f"rendering must know how {camera.name} is turned, and the calibration does not say")
         self.calibration = misled(known, self.conditions, misled_rng)
-        self._scenario = self._fly(registry, imu_rng)
-        self.name = self._scenario.name
-        self.ground_truth = self._scenario.truth
+        self.scenario = self._fly(registry, imu_rng)
+        self.name = self.scenario.name
+        self.ground_truth = self.scenario.truth
         self._imu = self._read(shaken_rng)
         frames_ns, taken = self._kept(drops_rng)
         self._gains = self._brightness(frames_ns, light_rng)
@@ -86,7 +88,8 @@ class SimulatedRecording:
     def _fly(self, registry: Registry, rng: np.random.Generator) -> Scenario:
         config, calibration = self.config, self.true_calibration
         if config.recorded is not None:
-            return load_euroc(config.recorded, start_s=config.start_s, duration_s=config.duration_s)
+            published = load_euroc(config.recorded, start_s=config.start_s, duration_s=config.duration_s)
+            return felt(published, calibration.imu)
         if config.trajectory is not None:
             file, poses = config.trajectory.name, load_trajectory(config.trajectory)
             flight: Flight = fit_flight(poses, config.start_s, config.duration_s, name=file)
@@ -115,7 +118,7 @@ class SimulatedRecording:
 
     def _read(self, rng: np.random.Generator) -> list[ImuSample]:
         """The readings, shaken and late as the conditions have it."""
-        t_ns, gyro_B, accel_B = self._scenario.imu_ns, self._scenario.gyro_B, self._scenario.accel_B
+        t_ns, gyro_B, accel_B = self.scenario.imu_ns, self.scenario.gyro_B, self.scenario.accel_B
         first = self.conditions[0]
         if first.vibration:
             d_gyro, d_accel = vibration(first.vibration, (t_ns - t_ns[0]) / NS_PER_S, rng)
@@ -127,7 +130,7 @@ class SimulatedRecording:
 
         None drops the first and the last one.
         """
-        frames_ns = self._scenario.frames_ns
+        frames_ns = self.scenario.frames_ns
         chance = rng.random(len(frames_ns))
         kept = np.array([chance >= own.dropped_part for own in self.conditions])
         kept[:, [0, -1]] = True
@@ -218,7 +221,7 @@ class SimulatedRecording:
 
     def _camera_poses(self, camera: int, t_ns: Int) -> tuple[Float, Float]:
         return self.true_calibration.cameras[camera].pose(
-            *self._scenario.body_poses(self.true_calibration, camera, t_ns)
+            *self.scenario.body_poses(self.true_calibration, camera, t_ns)
         )
 
 

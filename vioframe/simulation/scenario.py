@@ -32,10 +32,11 @@ _GROUND_TRUTH_FILES = (
     "state_groundtruth_estimate0/data.csv",
     "state_groundtruth_estimate0/data.csv.gz",
 )
-# The published positions follow their own velocity to within a micrometre, but for the jumps.
-_JUMP_M = 0.3e-3
 # Cubic interpolation needs two samples on either side.
 _STENCIL = np.array([-1, 0, 1, 2])
+
+PosesAt = Callable[[Int], tuple[Float, Float, Float]]
+"""Any stamps (Q,) to ``R_WB`` (Q, 3, 3), ``p_WB`` (Q, 3) m and ``v_WB`` (Q, 3) m/s, NaN where it is not known."""
 
 
 @dataclass(frozen=True)
@@ -43,8 +44,7 @@ class Scenario:
     """Readings ``gyro_B`` rad/s, ``accel_B`` m/s^2 (N, 3) at ``imu_ns`` (N,), and frames at ``frames_ns`` (M,).
 
     Stamps are those of the first camera's clock, but ``imu_ns`` is of the IMU's. The ``truth`` has K poses, velocity
-    and biases too where they are known. ``motion`` gives ``R_WB`` (Q, 3, 3), ``p_WB`` (Q, 3) m and ``v_WB`` (Q, 3) m/s
-    (NaN where it is not known) at any stamps (Q,), from before its beginning and after its end those there.
+    and biases too where they are known. ``motion`` gives, before its beginning and after its end, what is there.
     """
 
     name: str
@@ -53,7 +53,7 @@ class Scenario:
     gyro_B: Float
     accel_B: Float
     truth: TrueTrajectory
-    motion: Callable[[Int], tuple[Float, Float, Float]]
+    motion: PosesAt
 
     def states_at(self, t_ns: Int) -> tuple[NavState, ...]:
         """The states at stamps (M,), biases linear between two of the truth; none where that is not known."""
@@ -103,15 +103,12 @@ def fly(
     return Scenario(name, frames_ns, imu_ns + time_offset_ns, readings.gyro_B, readings.accel_B, truth, motion)
 
 
-def load_euroc(
-    path: Path, *, start_s: float = 0.0, duration_s: float | None = None, remove_jumps: bool = False
-) -> Scenario:
+def load_euroc(path: Path, *, start_s: float = 0.0, duration_s: float | None = None) -> Scenario:
     """The sequence at ``path``: an ASL folder, its ``mav0``, or the IMU's ``data.csv`` in one (gzip'd or not).
 
     Frames are those that the readings and the ground truth both cover; ``start_s`` and ``duration_s`` count from the
-    first of them. ``remove_jumps`` takes every step in position that the published velocity does not explain out of
-    the truth: that of the machine hall jumps, by up to 8 cm from one sample to the next, where its batch solution
-    corrects itself, and no IMU feels that. Raises :class:`DatasetError` where a file is missing or no frame is left.
+    first of them. The truth is as it was published, see :func:`~vioframe.simulation.felt.felt`. Raises
+    :class:`DatasetError` where a file is missing or no frame is left.
     """
     readings_file, stamps_file, truth_file = motion_files(path)
     imu_ns, imu = _read_csv(readings_file, range(1, 7))
@@ -124,21 +121,6 @@ def load_euroc(
     frames_ns = frames_ns[(elapsed_s >= start_s) & (elapsed_s <= end_s)]
     if not len(frames_ns):
         raise DatasetError(f"{path}: no frame lies in the time asked for; start earlier or take longer")
-    values = true_values(truth)
-    v_WB = values[:, 7:10] if values.shape[1] > 7 else np.full((len(truth), 3), np.nan)
-    p_WB = truth.p_WB
-    if remove_jumps:
-        dt = np.diff(truth.t_ns)[:, None] * 1e-9
-        step = np.diff(p_WB, axis=0) - 0.5 * (v_WB[1:] + v_WB[:-1]) * dt
-        # Without published velocities there is nothing to tell a jump by, and none is found.
-        step[~(np.linalg.norm(step, axis=1) >= _JUMP_M)] = 0.0
-        p_WB = p_WB - np.vstack([np.zeros(3), np.cumsum(step, axis=0)])
-        values = np.hstack([p_WB, values[:, 3:]])
-
-    def motion(t_ns: Int) -> tuple[Float, Float, Float]:
-        t_ns = np.clip(t_ns, truth.t_ns[0], truth.t_ns[-1])
-        return *interpolate_poses(truth.t_ns, truth.R_WB, p_WB, t_ns), _linear(truth.t_ns, v_WB, t_ns)
-
     folder = readings_file.parent.parent
     # A reading to spare on either side, so that no frame is left without its segment.
     near, known = (
@@ -150,9 +132,21 @@ def load_euroc(
         imu_ns[near],
         imu[near, :3],
         imu[near, 3:],
-        TrueTrajectory(truth.t_ns[known], truth.R_WB[known], p_WB[known], values=values[known]),
-        motion,
+        TrueTrajectory(truth.t_ns[known], truth.R_WB[known], truth.p_WB[known], values=true_values(truth)[known]),
+        motion_along(truth),
     )
+
+
+def motion_along(truth: Trajectory) -> PosesAt:
+    """The ``motion`` of a scenario between the poses of its truth."""
+    values = true_values(truth)
+    v_WB = values[:, 7:10] if values.shape[1] > 7 else np.full((len(truth), 3), np.nan)
+
+    def motion(t_ns: Int) -> tuple[Float, Float, Float]:
+        t_ns = np.clip(t_ns, truth.t_ns[0], truth.t_ns[-1])
+        return *interpolate_poses(truth.t_ns, truth.R_WB, truth.p_WB, t_ns), _linear(truth.t_ns, v_WB, t_ns)
+
+    return motion
 
 
 def motion_files(path: Path) -> tuple[Path, Path, Path]:

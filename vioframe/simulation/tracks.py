@@ -20,6 +20,7 @@ from vioframe.incidents import Incidents
 from vioframe.interfaces import Flight
 from vioframe.io.calibration import packaged_calibration
 from vioframe.io.synchronise import synchronise
+from vioframe.simulation.felt import felt
 from vioframe.simulation.flights import flight as named_flight
 from vioframe.simulation.imu import ImuErrors
 from vioframe.simulation.scenario import Scenario, fly, load_euroc
@@ -62,7 +63,7 @@ class TrackSequence:
     """Packets for :meth:`vioframe.interfaces.Backend.process`, one a frame, and the motion behind them.
 
     ``ground_truth`` holds a pose for each frame. ``true_states``, where they are known, hold velocity and biases too
-    (one a frame, or none at all); those of a simulated flight are exact, a recording's are its publisher's estimate.
+    (one a frame, or none at all).
     """
 
     name: str
@@ -142,16 +143,14 @@ def real_motion_sequence(
     seed: int = 0,
     start_s: float = 0.0,
     duration_s: float | None = None,
-    remove_jumps: bool = False,
 ) -> TrackSequence:
-    """Landmarks seen from the true poses of ``folder`` at its camera's stamps, and its recorded IMU.
+    """Landmarks seen at its camera's stamps along the path that the IMU of ``folder`` :func:`felt`, and what it read.
 
-    ``folder``, ``start_s``, ``duration_s`` and ``remove_jumps``, which closes the jumps in the truth that is returned
-    too, are those of :func:`~vioframe.simulation.scenario.load_euroc`. ``calibration`` is EuRoC's as published unless
-    given.
+    ``folder``, ``start_s`` and ``duration_s`` are those of :func:`~vioframe.simulation.scenario.load_euroc`.
+    ``calibration`` is EuRoC's as published unless given.
     """
     calibration = calibration or packaged_calibration("euroc", cameras=["cam0"])
-    scenario = load_euroc(folder, start_s=start_s, duration_s=duration_s, remove_jumps=remove_jumps)
+    scenario = felt(load_euroc(folder, start_s=start_s, duration_s=duration_s), calibration.imu)
     options = TrackOptions(max_points, pixel_sigma)
     return _sequence(scenario, calibration, TrackSimulator(calibration, options, np.random.default_rng(seed)))
 
