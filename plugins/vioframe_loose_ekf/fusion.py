@@ -131,7 +131,7 @@ class Fusion:
         still, s = Standstill.over(imu, noise), self.state
         residual = still.residual(s.R_WB, s.v_WB, s.bias_gyro_B, s.bias_accel_B)
         H = np.zeros((9, SIZE))
-        H[:, :IMU] = still.jacobian(s.R_WB)
+        H[:, :IMU] = still.jacobian(s.R_WB, s.v_WB)
         if not self._update(residual, H, np.diag(still.sigma**2), standstill_gate()):
             return False
         Q = np.zeros((SIZE, SIZE))

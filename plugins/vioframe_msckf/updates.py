@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from vioframe.estimation.factors.tracks import TrackTable
 from vioframe.estimation.standstill import Standstill
-from vioframe.types import Float, FrameTracks, ImuNoise, ImuSegment, Int
+from vioframe.types import DP, Float, FrameTracks, ImuNoise, ImuSegment, Int
 from vioframe_msckf.covariance import distances
 from vioframe_msckf.measurement import (
     ACCEPTED,
@@ -23,6 +23,9 @@ from vioframe_msckf.measurement import (
 from vioframe_msckf.options import MsckfOptions
 from vioframe_msckf.state import IMU, FilterState, compress
 
+# A landmark is taken in once its distance from the body is known to this part. Before, nothing about it is Gaussian,
+# and it would never be linearised where it is.
+_KNOWN_TO = 0.2
 # How much larger noise is taken for than it is at least, and how many tracks it is found by.
 _AT_FIRST, _AT_MOST, _REMEMBERED = 1.4, 4.0, 100
 
@@ -42,7 +45,8 @@ def hold_still(state: FilterState, imu: ImuSegment, noise: ImuNoise, first_estim
     """
     still = Standstill.over(imu, noise)
     residual = still.residual(state.R_WB, state.v_WB, state.bias_gyro_B, state.bias_accel_B)
-    H = still.jacobian(state.first[0] if first_estimates else state.R_WB)
+    R_WB, _, v_WB = state.first if first_estimates else (state.R_WB, state.p_WB, state.v_WB)
+    H = still.jacobian(R_WB, v_WB)
     if not still.agrees(residual, H, state.cov[:IMU, :IMU]):
         return False
     state.drift_biases(imu.duration_s, noise)
@@ -193,6 +197,8 @@ def promote_tracks(
 ) -> NDArray[np.intp]:
     """Take the tracks ``rows`` into the state as landmarks; returns the rows used up, promoted or implausible.
 
+    Those whose distance nobody knows yet wait, with as many sightings as the window has.
+
     Delayed initialisation (Li, "Visual-inertial odometry on resource-constrained systems", 2014): the three rows that
     an orthogonal transformation leaves to the landmark initialise it, the others update the state.
     """
@@ -206,16 +212,22 @@ def promote_tracks(
         )
         if not ok:
             continue
-        used.append(row)
         reduce_landmark(H, H_f, residual)
         columns = slice(IMU, state.landmarks_begin)
         P = np.ascontiguousarray(state.cov[columns, columns])
         if mahalanobis(H[3:], residual[3:], P, variance) > gate[len(residual) - 3]:
+            used.append(row)
             continue
         T_inverse = np.linalg.inv(H_f[:3])
         gain = -T_inverse @ H[:3]
         cross = gain @ state.cov[columns]
         cov = gain @ P @ gain.T + variance * T_inverse @ T_inverse.T
+        # How unsure where it is from the body, not where both are in the world.
+        relative = cov - cross[:, DP] - cross[:, DP].T + state.cov[DP, DP]
+        from_body = p_WF - state.p_WB
+        if from_body @ relative @ from_body > (_KNOWN_TO * (from_body @ from_body)) ** 2:
+            continue
+        used.append(row)
         state.add_landmark(int(observations.ids[row]), p_WF + T_inverse @ residual[:3], p_WF, cross, cov)
         state.update(H[3:], residual[3:], columns, variance)
     return np.array(used, dtype=np.intp)

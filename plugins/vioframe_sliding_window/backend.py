@@ -98,7 +98,7 @@ class SlidingWindow:
         assert predicted.cov is not None
         still = Standstill.over(imu, self._noise)
         residual = still.residual(predicted.R_WB, predicted.v_WB, predicted.bias_gyro_B, predicted.bias_accel_B)
-        return still.agrees(residual, still.jacobian(predicted.R_WB), predicted.cov)
+        return still.agrees(residual, still.jacobian(predicted.R_WB, predicted.v_WB), predicted.cov)
 
     def _check_jump(self, predicted: NavState, newest: NavState) -> None:
         jump = float(np.linalg.norm(newest.p_WB - predicted.p_WB))

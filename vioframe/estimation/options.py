@@ -17,7 +17,7 @@ class EstimationOptions:
     zero_velocity_update: bool = True
     """Recognise standstill and use it."""
     standstill_disparity_px: float = 0.7
-    """Median image motion over half a second below which the camera may be standing still."""
+    """Motion that the points of an image have in common in half a second; with less, a camera may be standing still."""
     max_blind_s: float = 4.0
     """Seconds in which nothing seen corrects the estimate, after which it is given up and begun anew."""
 

@@ -34,8 +34,8 @@ def standstill_gate() -> float:
 class StandstillDetector:
     """Tells from the tracks of the last half second whether the camera may be standing still."""
 
-    def __init__(self, max_disparity_px: float) -> None:
-        self._max_disparity_px = max_disparity_px
+    def __init__(self, max_motion_px: float) -> None:
+        self._max_motion_px = max_motion_px
         self._recent: deque[FrameTracks] = deque()
 
     def sees_standstill(self, tracks: FrameTracks) -> bool:
@@ -46,23 +46,42 @@ class StandstillDetector:
             recent.popleft()
         if tracks.t_ns - recent[0].t_ns < _LOOK_BACK_NS:
             return False
-        return median_disparity_px(recent[0], tracks) <= self._max_disparity_px
+        return common_motion_px(recent[0], tracks) <= self._max_motion_px
 
 
-def median_disparity_px(before: FrameTracks, now: FrameTracks) -> float:
-    """Median motion of the tracks common to both frames, px; infinite where there are too few to tell."""
-    _, i, j = np.intersect1d(before.ids, now.ids, assume_unique=True, return_indices=True)
-    if len(i) < _MIN_COMMON_TRACKS:
-        return float("inf")
-    return float(np.median(np.linalg.norm(now.xy[j] - before.xy[i], axis=1)))
+def common_motion_px(before: FrameTracks, now: FrameTracks) -> float:
+    """How far the picture of a camera has moved, turned and grown, px, the largest of all cameras'.
+
+    By medians over the tracks that both frames have, so that it is neither what some of them do nor that all of them
+    tremble. Infinite where no camera has enough to tell.
+    """
+    motions = [float("inf")]
+    for camera in np.unique(now.camera):
+        old, new = before.only(before.camera == camera), now.only(now.camera == camera)
+        _, i, j = np.intersect1d(old.ids, new.ids, assume_unique=True, return_indices=True)
+        if len(i) >= _MIN_COMMON_TRACKS:
+            motions.append(_picture_motion_px(old.xy[i], new.xy[j]))
+    return max(motions[1:] or motions)
+
+
+def _picture_motion_px(before: Float, now: Float) -> float:
+    """Of points (N, 2)."""
+    flow = now - before
+    shift = np.median(flow, axis=0)
+    outward = before - before.mean(axis=0)
+    outward /= np.maximum(np.linalg.norm(outward, axis=1), 1e-9)[:, None]
+    rest = flow - shift
+    growth = np.median(np.sum(rest * outward, axis=1))
+    turn = np.median(rest[:, 1] * outward[:, 0] - rest[:, 0] * outward[:, 1])
+    return float(np.linalg.norm([*shift, growth, turn]))
 
 
 @dataclass(frozen=True, slots=True)
 class Standstill:
     """The readings of a body that stood still: means ``gyro_B`` (3,) and ``accel_B`` (3,) over ``duration_s``.
 
-    They say: mean gyro = bias, mean accelerometer = -R_WB^T g + bias, velocity = 0. ``sigma`` (9,) are the standard
-    deviations of the three.
+    They say: mean gyro = bias, mean accelerometer = -R_WB^T g + bias, velocity = 0, in the body's frame: in the world's
+    it would be a compass to a state that moves. ``sigma`` (9,) are the standard deviations of the three.
     """
 
     gyro_B: Float
@@ -94,15 +113,15 @@ class Standstill:
 
     def residual(self, R_WB: Float, v_WB: Float, bias_gyro_B: Float, bias_accel_B: Float) -> Float:
         """(9,) the readings beyond what the state makes of them."""
-        return np.concatenate([self.gyro_B - bias_gyro_B, self.accel_B - bias_accel_B + R_WB.T @ g_W, -v_WB])
+        return np.concatenate([self.gyro_B - bias_gyro_B, self.accel_B - bias_accel_B + R_WB.T @ g_W, -R_WB.T @ v_WB])
 
     @staticmethod
-    def jacobian(R_WB: Float) -> Float:
+    def jacobian(R_WB: Float, v_WB: Float) -> Float:
         """(9, 15) of what is measured, by the error of the state; minus that of the residual."""
         H = np.zeros((9, 15))
         H[0:3, DBG] = np.eye(3)
         H[3:6, DTHETA], H[3:6, DBA] = so3.hat(-R_WB.T @ g_W), np.eye(3)
-        H[6:9, DV] = np.eye(3)
+        H[6:9, DTHETA], H[6:9, DV] = so3.hat(R_WB.T @ v_WB), R_WB.T
         return H
 
     def agrees(self, residual: Float, H: Float, cov: Float) -> bool:

@@ -25,6 +25,8 @@ from vioframe.types import NS_PER_S, ImuNoise, g_W
 _ROTATION_SIGMA = 0.002
 _POSITION_SIGMA = 0.005
 _SAME_ERROR_S = 1.0
+# A body is at rest where its published positions of a second lie within this, m; it then moves by so much, m/s.
+_AT_REST_M, _AT_REST_SIGMA = 0.005, 0.001
 # Between published poses farther apart than this nothing is known of the path but what was felt.
 _LONGEST_GAP_S = 0.1
 _MOST_STEPS, _SMALL_STEP = 10, 1e-6
@@ -46,7 +48,7 @@ def felt(published: Scenario, noise: ImuNoise) -> Scenario:
     after = np.clip(np.searchsorted(known.t_ns, t_ns), 1, len(known) - 1)
     trusted = known.t_ns[after] - known.t_ns[after - 1] <= _LONGEST_GAP_S * NS_PER_S
     R_WB, p_WB, _ = published.motion(t_ns)
-    R_WB, p_WB, *others = most_likely(t_ns, gyro_B, accel_B, R_WB, p_WB, trusted, noise)
+    R_WB, p_WB, *others = most_likely(t_ns, gyro_B, accel_B, R_WB, p_WB, trusted, _at_rest(t_ns, p_WB), noise)
     poses = Trajectory(t_ns, R_WB, p_WB)
     truth = TrueTrajectory(t_ns, R_WB, p_WB, values=np.hstack([true_values(poses), *others]))
     frames_ns = published.frames_ns
@@ -54,24 +56,34 @@ def felt(published: Scenario, noise: ImuNoise) -> Scenario:
     return replace(published, frames_ns=frames_ns, truth=truth, motion=motion_along(truth))
 
 
+def _at_rest(t_ns: Int, p_WB: Float) -> Bool:
+    """(N,) whether the body stays, from half a second before to half a second after."""
+    first, last = (np.searchsorted(t_ns, t_ns + sign * NS_PER_S // 2) for sign in (-1, 1))
+    spread = [np.ptp(p_WB[begin:end], axis=0) for begin, end in zip(first, last, strict=True)]
+    return np.asarray(np.linalg.norm(spread, axis=1) < _AT_REST_M)
+
+
 def most_likely(
-    t_ns: Int, gyro_B: Float, accel_B: Float, R_WB: Float, p_WB: Float, trusted: Bool, noise: ImuNoise
+    t_ns: Int, gyro_B: Float, accel_B: Float, R_WB: Float, p_WB: Float, trusted: Bool, at_rest: Bool, noise: ImuNoise
 ) -> tuple[Float, Float, Float, Float]:
     """``R_WB`` (N, 3, 3), ``p_WB`` m, ``v_WB`` m/s (N, 3) and both biases (N, 6) at N readings, from poses there.
 
-    Only the poses that are ``trusted`` (N,) hold it.
+    Only the poses that are ``trusted`` (N,) hold it, and that it does not move where it is ``at_rest`` (N,).
     """
     from scipy.linalg import solveh_banded
 
     t_s = (t_ns - t_ns[0]) / NS_PER_S
     weight = np.zeros((len(t_s), _DIM))
     weight[:, :6] = 1.0 / np.repeat([_ROTATION_SIGMA, _POSITION_SIGMA], 3) ** 2
-    weight *= (trusted * np.gradient(t_s) / _SAME_ERROR_S)[:, None]
+    weight[~trusted] = 0.0
+    weight[at_rest, _V] = 1.0 / _AT_REST_SIGMA**2
+    weight *= np.gradient(t_s)[:, None] / _SAME_ERROR_S
     known_R, known_p = R_WB, p_WB
     v_WB, biases = np.gradient(p_WB, t_s, axis=0), np.zeros((len(t_s), 6))
     for _ in range(_MOST_STEPS):
         off = np.zeros_like(weight)
         off[:, _TH], off[:, _P] = so3.log(np.swapaxes(known_R, 1, 2) @ R_WB), p_WB - known_p
+        off[:, _V] = v_WB
         residual, before, after = between(np.diff(t_s), gyro_B, accel_B, R_WB, p_WB, v_WB, biases, noise)
         # The normal equations: a block on the diagonal a node, and one below it that ties it to the next.
         own, tie = np.zeros((len(t_s), _DIM, _DIM)), np.swapaxes(after, 1, 2) @ before

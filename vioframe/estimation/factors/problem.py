@@ -139,7 +139,7 @@ class Problem:
         for k, still in self.still.items():
             residual = still.residual(*(part[k] for part in states if part is not x.states.p_WB)) / still.sigma
             first = self.prior.first(x.states) if self.first_estimates else x.states
-            J = -still.jacobian(first.R_WB[k]) / still.sigma[:, None]
+            J = -still.jacobian(first.R_WB[k], first.v_WB[k]) / still.sigma[:, None]
             at = slice(STATE_SIZE * k, STATE_SIZE * (k + 1))
             normal.H[at, at] += J.T @ J
             normal.b[at] += J.T @ residual
