@@ -204,3 +204,14 @@ def test_an_implausible_track_is_used_up_and_changes_nothing():
     assert promote_tracks(state, table, np.array([row]), MsckfOptions(), PointNoise(0.7), gate).tolist() == [row]
     assert not len(state.landmark_ids)
     np.testing.assert_array_equal(state.cov, cov)
+
+
+def test_a_track_waits_until_its_distance_is_known():
+    """With points as noisy as that nobody can tell how far it is: neither taken in nor used up."""
+    state, table = seeing_state()
+    rows = np.flatnonzero(table.seen.all(axis=1))[:1]
+    cov, gate = state.cov.copy(), np.full(40, np.inf)
+    assert not len(promote_tracks(state, table, rows, MsckfOptions(), PointNoise(20.0), gate))
+    assert not len(state.landmark_ids)
+    np.testing.assert_array_equal(state.cov, cov)
+    assert promote_tracks(state, table, rows, MsckfOptions(), PointNoise(0.5), gate).tolist() == rows.tolist()

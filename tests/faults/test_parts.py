@@ -194,8 +194,8 @@ def test_an_estimate_that_cannot_be_ends_the_run_and_names_the_plugin(spoil, say
     assert says in line
     assert line.endswith("what was estimated until then is in out\n")
     run = RunFolder.open("out")
-    # That of the start, four, and two that were told before the back-end was given them: the images stand still.
-    assert len(run.trajectory()) == 7
+    # That of the start, four, and one that was told before the back-end was given it: the images stand still.
+    assert len(run.trajectory()) == 6
     assert run.summary["finished"] is False
     assert "spoilt 1.0" in run.summary["stopped_by"]
     assert vioframe_("evaluate", "out", "--ground-truth", "truth.tum").exit_code == 0
