@@ -41,7 +41,6 @@ from vioframe.frontend import Frontend
 from vioframe.geometry.trajectory import Trajectory
 from vioframe.incidents import Incidents
 from vioframe.io.synchronise import synchronise
-from vioframe.io.trajectories import TrueTrajectory
 from vioframe.parts import config as configuration
 from vioframe.parts import registry
 from vioframe.parts.config import Config, PartConfig
@@ -243,17 +242,8 @@ def _flown(
     flight = fit_flight(felt.truth, after_s[0], after_s[-1] - after_s[0])
     frames_s = after_s - after_s[0]
     imu_s = np.arange(int(frames_s[-1] * rate_hz) + 2) / rate_hz
-    flown = fly(flight, "", rng, frames_s=frames_s, imu_s=imu_s, imu_rate_hz=rate_hz, noise=noise)
-    # Stamps are those of the frames as they were followed.
-    later_ns = int(frames_ns[0] - flown.frames_ns[0])
-    values = flown.truth.values
-    truth = TrueTrajectory(flown.truth.t_ns + later_ns, flown.truth.R_WB, flown.truth.p_WB, values=values)
-    return replace(
-        flown,
-        frames_ns=frames_ns,
-        imu_ns=flown.imu_ns + later_ns,
-        truth=truth,
-        motion=lambda t_ns: flown.motion(t_ns - later_ns),
+    return fly(
+        flight, "", rng, frames_s=frames_s, imu_s=imu_s, imu_rate_hz=rate_hz, noise=noise, begin_ns=int(frames_ns[0])
     )
 
 

@@ -55,13 +55,13 @@ def common_motion_px(before: FrameTracks, now: FrameTracks) -> float:
     By medians over the tracks that both frames have, so that it is neither what some of them do nor that all of them
     tremble. Infinite where no camera has enough to tell.
     """
-    motions = [float("inf")]
+    motions = []
     for camera in np.unique(now.camera):
         old, new = before.only(before.camera == camera), now.only(now.camera == camera)
         _, i, j = np.intersect1d(old.ids, new.ids, assume_unique=True, return_indices=True)
         if len(i) >= _MIN_COMMON_TRACKS:
             motions.append(_picture_motion_px(old.xy[i], new.xy[j]))
-    return max(motions[1:] or motions)
+    return max(motions, default=float("inf"))
 
 
 def _picture_motion_px(before: Float, now: Float) -> float:

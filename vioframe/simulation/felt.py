@@ -4,7 +4,7 @@ A published path is itself an estimate. Where its batch solution corrects itself
 up to 8 cm and 15 cm/s from one pose to the next, and images rendered along it show what no IMU felt. Found here are the
 states that explain the readings and lie nearest to the published poses: the most likely ones of a chain with a node a
 reading (Dellaert and Kaess, "Factor Graphs for Robot Perception", 2017), by Gauss-Newton steps, each with one banded
-Cholesky factorisation.
+Cholesky factorisation. It shares no code with the estimators, which are judged by what comes out.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from vioframe.geometry import so3
 from vioframe.geometry.trajectory import Trajectory
 from vioframe.io.trajectories import TrueTrajectory, true_values
 from vioframe.simulation.scenario import Scenario, motion_along
-from vioframe.types import NS_PER_S, ImuNoise, g_W
+from vioframe.types import DBA, DBG, DP, DTHETA, DV, NS_PER_S, ImuNoise, g_W
 
 # Of a published pose, rad and m, and for how long its error is about the same. Then what is left over of EuRoC's
 # readings in a second is as large as the calibration's noise has it; poses trusted more would contradict them.
@@ -30,10 +30,8 @@ _AT_REST_M, _AT_REST_SIGMA = 0.005, 0.001
 # Between published poses farther apart than this nothing is known of the path but what was felt.
 _LONGEST_GAP_S = 0.1
 _MOST_STEPS, _SMALL_STEP = 10, 1e-6
-# The errors of a node: rotation (on the right), position, velocity, bias of the gyroscope and of the accelerometer.
-_DIM = 15
-_TH, _P, _V, _BG, _BA = (slice(k, k + 3) for k in range(0, _DIM, 3))
-_BIASES = slice(9, 15)
+_BIASES = slice(DBG.start, DBA.stop)
+_DIM = DBA.stop
 
 
 def felt(published: Scenario, noise: ImuNoise) -> Scenario:
@@ -76,14 +74,14 @@ def most_likely(
     weight = np.zeros((len(t_s), _DIM))
     weight[:, :6] = 1.0 / np.repeat([_ROTATION_SIGMA, _POSITION_SIGMA], 3) ** 2
     weight[~trusted] = 0.0
-    weight[at_rest, _V] = 1.0 / _AT_REST_SIGMA**2
+    weight[at_rest, DV] = 1.0 / _AT_REST_SIGMA**2
     weight *= np.gradient(t_s)[:, None] / _SAME_ERROR_S
     known_R, known_p = R_WB, p_WB
     v_WB, biases = np.gradient(p_WB, t_s, axis=0), np.zeros((len(t_s), 6))
     for _ in range(_MOST_STEPS):
         off = np.zeros_like(weight)
-        off[:, _TH], off[:, _P] = so3.log(np.swapaxes(known_R, 1, 2) @ R_WB), p_WB - known_p
-        off[:, _V] = v_WB
+        off[:, DTHETA], off[:, DP] = so3.log(np.swapaxes(known_R, 1, 2) @ R_WB), p_WB - known_p
+        off[:, DV] = v_WB
         residual, before, after = between(np.diff(t_s), gyro_B, accel_B, R_WB, p_WB, v_WB, biases, noise)
         # The normal equations: a block on the diagonal a node, and one below it that ties it to the next.
         own, tie = np.zeros((len(t_s), _DIM, _DIM)), np.swapaxes(after, 1, 2) @ before
@@ -99,8 +97,8 @@ def most_likely(
         right[:-1] -= np.einsum("nki,nk->ni", before, residual)
         right[1:] -= np.einsum("nki,nk->ni", after, residual)
         step = solveh_banded(band.reshape(2 * _DIM, -1), right.ravel(), lower=True).reshape(right.shape)
-        R_WB = R_WB @ so3.exp(step[:, _TH])
-        p_WB, v_WB, biases = p_WB + step[:, _P], v_WB + step[:, _V], biases + step[:, _BIASES]
+        R_WB = R_WB @ so3.exp(step[:, DTHETA])
+        p_WB, v_WB, biases = p_WB + step[:, DP], v_WB + step[:, DV], biases + step[:, _BIASES]
         if np.abs(step).max() < _SMALL_STEP:
             break
     return R_WB, p_WB, v_WB, biases
@@ -120,21 +118,19 @@ def between(
     accel, accel_next = accel_B[:-1] - biases[:-1, 3:], accel_B[1:] - biases[:-1, 3:]
     a_WB = 0.5 * (np.einsum("nij,nj->ni", R, accel) + np.einsum("nij,nj->ni", R_next, accel_next)) + g_W
     residual = np.empty((len(dt), _DIM))
-    residual[:, _TH] = so3.log(np.swapaxes(R @ turn, 1, 2) @ R_next)
-    residual[:, _P] = np.diff(p_WB, axis=0) - 0.5 * dt[:, None] * (v_WB[1:] + v_WB[:-1])
-    residual[:, _V] = np.diff(v_WB, axis=0) - dt[:, None] * a_WB
+    residual[:, DTHETA] = so3.log(np.swapaxes(R @ turn, 1, 2) @ R_next)
+    residual[:, DP] = np.diff(p_WB, axis=0) - 0.5 * dt[:, None] * (v_WB[1:] + v_WB[:-1])
+    residual[:, DV] = np.diff(v_WB, axis=0) - dt[:, None] * a_WB
     residual[:, _BIASES] = np.diff(biases, axis=0)
 
-    before, after = np.zeros((2, len(dt), _DIM, _DIM))
+    before, after = (np.tile(sign * np.eye(_DIM), (len(dt), 1, 1)) for sign in (-1.0, 1.0))
     dt_I = dt[:, None, None] * np.eye(3)
-    before[:] = -np.eye(_DIM)
-    after[:] = np.eye(_DIM)
-    before[:, _TH, _TH] = -np.swapaxes(turn, 1, 2)
-    before[:, _TH, _BG] = dt_I
-    before[:, _P, _V] = after[:, _P, _V] = -0.5 * dt_I
-    before[:, _V, _TH] = 0.5 * dt_I @ R @ so3.hat(accel)
-    after[:, _V, _TH] = 0.5 * dt_I @ R_next @ so3.hat(accel_next)
-    before[:, _V, _BA] = 0.5 * dt_I @ (R + R_next)
+    before[:, DTHETA, DTHETA] = -np.swapaxes(turn, 1, 2)
+    before[:, DTHETA, DBG] = dt_I
+    before[:, DP, DV] = after[:, DP, DV] = -0.5 * dt_I
+    before[:, DV, DTHETA] = 0.5 * dt_I @ R @ so3.hat(accel)
+    after[:, DV, DTHETA] = 0.5 * dt_I @ R_next @ so3.hat(accel_next)
+    before[:, DV, DBA] = 0.5 * dt_I @ (R + R_next)
 
     densities = (
         noise.gyro_density,

@@ -40,8 +40,8 @@ class SimulatedRecording:
     ``config`` is complete. ``true_calibration`` is that of the rig which the images are rendered with, all its cameras
     triggered together unless ``delay_ms`` says otherwise; ``calibration`` is what an estimator is told. ``conditions``
     are those that each camera meets, and ``scenario`` is what happens before any of them looks: its truth,
-    ``ground_truth``, holds a state for every reading of the IMU. Raises
-    :class:`ConfigError` where the flight leads through a wall.
+    ``ground_truth``, holds a state for every reading of the IMU. Raises :class:`ConfigError` where the flight leads
+    through a wall.
     """
 
     def __init__(self, config: SimulationConfig, registry: Registry, workers: int = 1) -> None:

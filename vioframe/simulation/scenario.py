@@ -83,18 +83,19 @@ def fly(
     noise: ImuNoise | None,
     errors: ImuErrors | None = None,
     time_offset_ns: int = 0,
+    begin_ns: int = _START_NS,
 ) -> Scenario:
-    """``flight`` with frames at ``frames_s`` (M,) and readings at ``imu_s`` (N,) after its beginning, both ascending.
+    """``flight`` with frames at ``frames_s`` (M,) and readings at ``imu_s`` (N,) after ``begin_ns``, both ascending.
 
     ``noise`` None reads it exactly.
     """
-    frames_ns, imu_ns = ((_START_NS + np.round(t_s * NS_PER_S)).astype(np.int64) for t_s in (frames_s, imu_s))
+    frames_ns, imu_ns = (begin_ns + np.round(t_s * NS_PER_S).astype(np.int64) for t_s in (frames_s, imu_s))
     at_readings = flight.at(imu_s)
     readings = read_imu(at_readings, noise, rng, imu_rate_hz, errors)
     end_s = max(flight.duration_s, imu_s[-1])
 
     def motion(t_ns: Int) -> tuple[Float, Float, Float]:
-        at = flight.at(np.clip((t_ns - _START_NS) / NS_PER_S, 0.0, end_s))
+        at = flight.at(np.clip((t_ns - begin_ns) / NS_PER_S, 0.0, end_s))
         return at.R_WB, at.p_WB, at.v_WB
 
     poses = Trajectory(imu_ns, at_readings.R_WB, at_readings.p_WB)
