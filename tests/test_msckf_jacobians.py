@@ -14,6 +14,7 @@ from vioframe_msckf.options import MsckfOptions
 from vioframe_msckf.state import IMU, OFFSET, READOUT
 from vioframe_msckf.updates import PointNoise, promote_tracks
 
+NOISE = PointNoise(0.7, 1.4)
 CAMERAS = {
     "radtan": Camera(458.654, 457.296, 367.215, 248.375, (-0.283, 0.0740, 0.00019, 1.76e-05), (752, 480), "radtan"),
     "equidistant": Camera(380.0, 379.0, 367.0, 248.0, (0.01, -0.02, 0.005, -0.001), (752, 480), "equidistant"),
@@ -158,7 +159,7 @@ def test_mahalanobis_distance():
 
 def test_delayed_initialisation_is_the_joint_update_with_nothing_known_of_the_landmark():
     state, table = seeing_state()
-    options, noise = MsckfOptions(), PointNoise(0.5)
+    options, noise = MsckfOptions(), PointNoise(0.5, 1.4)
     row = np.flatnonzero(table.seen.all(axis=1))[0]
     _, p_WF, H, H_f, residual = rows_of(table, row, Window.of(state, True), noise.px)
     # In information form the landmark's prior is exactly nothing.
@@ -191,7 +192,7 @@ def test_delayed_initialisation_is_gated_by_two_rows_a_view_but_for_the_three_of
             gate = np.full(40, elsewhere)
             gate[2 * count - 3] = at_dof
             rows = np.flatnonzero(views == count)[:1]
-            assert promote_tracks(state, table, rows, MsckfOptions(), PointNoise(0.7), gate).tolist() == rows.tolist()
+            assert promote_tracks(state, table, rows, MsckfOptions(), NOISE, gate).tolist() == rows.tolist()
             assert len(state.landmark_ids) == (at_dof > 0.0)
 
 
@@ -201,7 +202,7 @@ def test_an_implausible_track_is_used_up_and_changes_nothing():
     table.xy[row, 2] += 60.0
     cov = state.cov.copy()
     gate = np.r_[0.0, chi2.ppf(0.95, np.arange(1, 40))]
-    assert promote_tracks(state, table, np.array([row]), MsckfOptions(), PointNoise(0.7), gate).tolist() == [row]
+    assert promote_tracks(state, table, np.array([row]), MsckfOptions(), NOISE, gate).tolist() == [row]
     assert not len(state.landmark_ids)
     np.testing.assert_array_equal(state.cov, cov)
 
@@ -211,7 +212,7 @@ def test_a_track_waits_until_its_distance_is_known():
     state, table = seeing_state()
     rows = np.flatnonzero(table.seen.all(axis=1))[:1]
     cov, gate = state.cov.copy(), np.full(40, np.inf)
-    assert not len(promote_tracks(state, table, rows, MsckfOptions(), PointNoise(20.0), gate))
+    assert not len(promote_tracks(state, table, rows, MsckfOptions(), PointNoise(20.0, 1.4), gate))
     assert not len(state.landmark_ids)
     np.testing.assert_array_equal(state.cov, cov)
-    assert promote_tracks(state, table, rows, MsckfOptions(), PointNoise(0.5), gate).tolist() == rows.tolist()
+    assert promote_tracks(state, table, rows, MsckfOptions(), PointNoise(0.5, 1.4), gate).tolist() == rows.tolist()

@@ -24,7 +24,7 @@ from sliding_window_helpers import (
 from vioframe.estimation.factors import reprojection
 from vioframe.estimation.factors.inertial import ImuFactors
 from vioframe.estimation.factors.landmarks import camera_poses, positions
-from vioframe.estimation.factors.problem import Prior, Problem, Variables, pose_columns, symmetric
+from vioframe.estimation.factors.problem import INFINITELY_FAR, Prior, Problem, Variables, pose_columns, symmetric
 from vioframe.estimation.factors.reprojection import CALIBRATION_SIZE, OFFSET, READOUT, Poses, Sightings
 from vioframe.estimation.factors.solver import covariance
 from vioframe.geometry import so3
@@ -377,6 +377,15 @@ def test_landmarks_are_eliminated_exactly():
         step = -s * np.linalg.solve(symmetric(S) * np.outer(s, s), g * s)
         np.testing.assert_allclose(step / natural(x), expected[:n] / natural(x), rtol=1e-6, atol=1e-8)
         np.testing.assert_allclose(normal.landmark_step(step, eliminated).ravel(), expected[n:], rtol=1e-6, atol=1e-8)
+
+
+def test_no_step_takes_a_landmark_behind_infinity():
+    _, x = flown_window()
+    step = np.zeros_like(x.landmarks)
+    step[:, 2] = np.where(np.arange(len(step)) % 2, -2.0, 1.0) * x.landmarks[:, 2]
+    rho = x.retract(np.zeros(len(natural(x))), step).landmarks[:, 2]
+    np.testing.assert_array_equal(rho[1::2], INFINITELY_FAR)
+    np.testing.assert_allclose(rho[::2], 2.0 * x.landmarks[::2, 2])
 
 
 def test_a_landmark_seen_from_one_place_only_is_survived():

@@ -10,13 +10,13 @@ import numpy as np
 
 from vioframe.estimation.factors.tracks import TrackTable
 from vioframe.estimation.inertial.noise import noise_over
+from vioframe.estimation.point_noise import PointNoise
 from vioframe.quantiles import chi2_quantile
 from vioframe.stopwatch import Stopwatch
 from vioframe.types import Estimate, FrameTracks, ImuSegment, Start, Status
 from vioframe_msckf.options import MsckfOptions
 from vioframe_msckf.state import FilterState
 from vioframe_msckf.updates import (
-    PointNoise,
     Turns,
     hold_still,
     promote_tracks,
@@ -24,6 +24,9 @@ from vioframe_msckf.updates import (
     update_from_landmarks,
     update_from_tracks,
 )
+
+# Times that the noise of points is taken for larger than it is at least, until tracks tell.
+_NOISE_AT_FIRST = 1.4
 
 
 class Msckf:
@@ -46,7 +49,7 @@ class Msckf:
             readout=options.calibrate_readout,
         )
         self._imu_noise, self._noise_at_rest = start.calibration.calibration.imu, start.noise_at_rest
-        self.point_noise = PointNoise(options.pixel_sigma)
+        self.point_noise = PointNoise(options.pixel_sigma, _NOISE_AT_FIRST)
         cameras = len(start.calibration.calibration.cameras)
         self._observations, self._turns = TrackTable(cameras), Turns(cameras)
         dof = np.arange(1, 2 * cameras * options.max_clones + 3)

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vioframe.estimation.factors.tracks import TrackTable
+from vioframe.estimation.point_noise import PointNoise
 from vioframe.estimation.standstill import Standstill
 from vioframe.types import DP, Float, FrameTracks, ImuNoise, ImuSegment, Int
 from vioframe_msckf.covariance import distances
@@ -26,8 +27,6 @@ from vioframe_msckf.state import IMU, FilterState, compress
 # A landmark is taken in once its distance from the body is known to this part. Before, nothing about it is Gaussian,
 # and it would never be linearised where it is.
 _KNOWN_TO = 0.2
-# How much larger noise is taken for than it is at least, and how many tracks it is found by.
-_AT_FIRST, _AT_MOST, _REMEMBERED = 1.4, 4.0, 100
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,29 +72,6 @@ def select_tracks(observations: TrackTable, state: FilterState, options: MsckfOp
     # Lost tracks have no second chance, full ones come again with the next frame.
     order = np.lexsort((-lengths[rest], ~lost[rest]))
     return Selection(rest[order][: options.max_features], promoted)
-
-
-class PointNoise:
-    """The standard deviation of a tracked point, px: at least what the options say, and more where tracks fit worse.
-
-    A gate that takes noise for smaller than it is turns good tracks away, the long ones first; what is too large for a
-    while does less harm, and so it begins.
-    """
-
-    def __init__(self, least_px: float) -> None:
-        self._least_px, self.px = least_px, _AT_FIRST * least_px
-
-    def add(self, excess: Float) -> None:
-        """Go by (N,) tracks' Mahalanobis distances over their medians: 1 in the middle, where the noise is right.
-
-        Not all that is accepted, which would agree with any noise; of several the middle one is no outlier. Each counts
-        for one of the last ``_REMEMBERED``.
-        """
-        found = excess[excess > 0.0]
-        if len(found):
-            share = len(found) / (len(found) + _REMEMBERED)
-            px = self.px * float(np.median(found)) ** (0.5 * share)
-            self.px = min(max(px, self._least_px), _AT_MOST * self._least_px)
 
 
 def update_from_tracks(

@@ -19,7 +19,15 @@ from vioframe.estimation.factors.landmarks import (
     positions,
     triangulate_tracks,
 )
-from vioframe.estimation.factors.problem import STATE_SIZE, Normal, Prior, Problem, Variables, marginalise_oldest
+from vioframe.estimation.factors.problem import (
+    INFINITELY_FAR,
+    STATE_SIZE,
+    Normal,
+    Prior,
+    Problem,
+    Variables,
+    marginalise_oldest,
+)
 from vioframe.estimation.factors.reprojection import (
     CALIBRATION_SIZE,
     FIXED_LENS,
@@ -38,6 +46,7 @@ from vioframe.estimation.factors.solver import covariance, solve
 from vioframe.estimation.factors.tracks import LandmarkTable, TrackTable
 from vioframe.estimation.inertial.noise import noise_over
 from vioframe.estimation.inertial.preintegration import Preintegrated, join_segments, preintegrate
+from vioframe.estimation.point_noise import PointNoise
 from vioframe.estimation.standstill import Standstill
 from vioframe.geometry.cameras import intrinsics_of
 from vioframe.geometry.kernels import undistorted
@@ -56,9 +65,12 @@ from vioframe.types import (
 )
 from vioframe_sliding_window.options import SlidingWindowOptions
 
-# What a step must lower the cost by for another to follow: 1 is sqrt(2) standard deviations of all unknowns together,
+# What a step must lower the cost by for another to follow: 4 is sqrt(8) standard deviations of all unknowns together,
 # and the next frame begins where this one ended.
-_DECREASE = 1.0
+_DECREASE = 4.0
+# Times that the noise of points is taken for larger than it is at least, until landmarks tell: with a loss as robust as
+# that, a calibration that is off would not be found.
+_NOISE_AT_FIRST = 4.0
 # Biases that moved farther from those the readings were integrated with have them integrated anew, rad/s and m/s^2.
 _REPROPAGATE_GYRO, _REPROPAGATE_ACCEL = 0.01, 0.1
 
@@ -75,7 +87,7 @@ class Window:
         self._noise_at_rest, self._noise = start.noise_at_rest, calibration.imu
         self._options = options
         self._focal_px = np.array([camera.model.focal_px for camera in calibration.cameras])
-        self._sigma = options.pixel_sigma / self._focal_px[0]
+        self.point_noise = PointNoise(options.pixel_sigma, _NOISE_AT_FIRST)
         self._t_ns = [state.t_ns]
         self._states = StateArrays.stack([state])
         self._gyro_B = start.imu.gyro_B[-1:]
@@ -103,6 +115,10 @@ class Window:
     def newest(self) -> NavState:
         """The newest state, with covariance."""
         return replace(self._states[-1:].unstack(np.array(self._t_ns[-1:]))[0], cov=self._cov)
+
+    @property
+    def _sigma(self) -> float:
+        return self.point_noise.px / float(self._focal_px[0])
 
     @property
     def cameras(self) -> Calibrated:
@@ -233,7 +249,11 @@ class Window:
         x = solution.variables
         self._states, self._cameras, self.tracks.landmarks[rows] = x.states, x.cameras, x.landmarks
         self._cov, self._camera_sigma = self._covariance(solution.normal)
-        bad = (solution.normal.errors * options.pixel_sigma > options.outlier_px) | (x.landmarks[:, 2] <= 0.0)
+        errors = solution.normal.errors
+        bad = errors * self.point_noise.px > options.outlier_px
+        # Of two residuals a view three are taken up by the landmark itself.
+        residuals = 2.0 * self.tracks.lengths()[rows]
+        self.point_noise.add((residuals * errors**2 / (residuals - 3.0 - 2.0 / 3.0))[~bad])
         newest = self.tracks.in_sight()[rows]
         self.tracks.drop(rows[bad])
         return int((bad & newest).sum()), int(newest.sum())
@@ -244,8 +264,8 @@ class Window:
         return int((self.tracks.known & self.tracks.in_sight()).sum())
 
     def landmarks(self) -> tuple[Int, Float]:
-        """Ids (L,) and positions p_WF (L, 3) m of the known landmarks."""
-        rows = np.flatnonzero(self.tracks.known)
+        """Ids (L,) and positions p_WF (L, 3) m of the known landmarks that are not infinitely far."""
+        rows = np.flatnonzero(self.tracks.known & (self.tracks.landmarks[:, 2] > INFINITELY_FAR))
         p_WF = positions(self._states, self._cameras, self.tracks.hosts[rows], self.tracks.landmarks[rows])
         return self.tracks.ids[rows], p_WF
 
@@ -298,7 +318,7 @@ class Window:
             tracks.xy_normalised[rows],
             velocity,
             tracks.to_px[rows],
-            options.pixel_sigma,
+            self.point_noise.px,
             options.cauchy_sigmas,
             options.residual == "sphere",
             self._shutter(rows),

@@ -39,6 +39,8 @@ PriorArrays = tuple[Float, Float, States, Calibrated, Bool]
 """A :class:`Prior` as kernels take it."""
 Eliminated = tuple[Float, Float, Float]
 """Y, z and inverse factors of :func:`eliminate`."""
+INFINITELY_FAR = 1e-4
+"""An inverse depth, 1/m, that no parallax tells from zero."""
 # Eigenvalues below this part of the largest tell nothing: rounding made them.
 _NULL = 1e-12
 
@@ -56,9 +58,14 @@ class Variables:
         return Poses.of(self.states.R_WB, self.states.p_WB)
 
     def retract(self, step: Float, landmark_step: Float) -> Variables:
-        """Moved by ``step`` (15 K + 16 N,) and ``landmark_step`` (L, 3)."""
+        """Moved by ``step`` (15 K + 16 N,) and ``landmark_step`` (L, 3), but no landmark beyond infinity.
+
+        Behind it, seen from the other side, they would fit a body that flies the other way.
+        """
         states, cameras = _moved(self.states.parts, self.cameras, step)
-        return Variables(StateArrays(*states), cameras, self.landmarks + landmark_step)
+        landmarks = self.landmarks + landmark_step
+        np.maximum(landmarks[:, 2], INFINITELY_FAR, out=landmarks[:, 2])
+        return Variables(StateArrays(*states), cameras, landmarks)
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,0 +1,33 @@
+"""How far tracked points are from where they should be, as their own residuals show it."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from vioframe.arrays import Float
+
+# How much larger noise is taken for than it is at least, and how many tracks it is found by.
+_AT_MOST, _REMEMBERED = 8.0, 100
+
+
+class PointNoise:
+    """The standard deviation of a tracked point, px: at least what the options say, and more where tracks fit worse.
+
+    A gate or a robust loss that takes noise for smaller than it is turns good tracks away, the long ones first; what is
+    too large for a while does less harm, and so it begins: ``at_first`` times as large.
+    """
+
+    def __init__(self, least_px: float, at_first: float) -> None:
+        self._least_px, self.px = least_px, at_first * least_px
+
+    def add(self, excess: Float) -> None:
+        """Go by (N,) tracks' squared distances over their medians: 1 in the middle, where the noise is right.
+
+        Not all that is accepted, which would agree with any noise; of several the middle one is no outlier. Each counts
+        for one of the last ``_REMEMBERED``; those of zero for none.
+        """
+        found = excess[excess > 0.0]
+        if len(found):
+            share = len(found) / (len(found) + _REMEMBERED)
+            px = self.px * float(np.median(found)) ** (0.5 * share)
+            self.px = min(max(px, self._least_px), _AT_MOST * self._least_px)
