@@ -211,13 +211,13 @@ def msckf_rows(w, xy, xy_normalised, seen, P, pixel_sigma, gate):
     """Triangulate (F, C) tracks, linearise them, project out the landmarks, and gate each at ``gate[dof]``.
 
     The stacked H and residual over [cameras, clones], whose covariance is ``P``; p_WF (F, 3); each one's Mahalanobis
-    distance by the median of what it should be, zero where there is none; each one's verdict.
+    distance, squared, zero where there is none; each one's verdict.
     """
     F = len(seen)
     H_all = np.empty((2 * seen.sum(), len(P)))
     r_all = np.empty(2 * seen.sum())
     p_WF = np.empty((F, 3))
-    excess = np.zeros(F)
+    distances = np.zeros(F)
     verdict = np.empty(F, dtype=np.int64)
     rows = 0
     for f in range(F):
@@ -227,13 +227,12 @@ def msckf_rows(w, xy, xy_normalised, seen, P, pixel_sigma, gate):
             continue
         reduce_landmark(H, H_f, residual)
         H, residual = H[3:], residual[3:]
-        distance = mahalanobis(H, residual, P, pixel_sigma**2)
-        excess[f] = distance / (len(residual) - 2.0 / 3.0)
-        if distance > gate[len(residual)]:
+        distances[f] = mahalanobis(H, residual, P, pixel_sigma**2)
+        if distances[f] > gate[len(residual)]:
             verdict[f] = GATED
             continue
         verdict[f] = ACCEPTED
         H_all[rows : rows + len(residual)] = H
         r_all[rows : rows + len(residual)] = residual
         rows += len(residual)
-    return H_all[:rows], r_all[:rows], p_WF, excess, verdict
+    return H_all[:rows], r_all[:rows], p_WF, distances, verdict

@@ -84,7 +84,7 @@ def update_from_tracks(
 ) -> tuple[Int, Float]:
     """The multi-state constraint update; returns ids and positions of the landmarks it accepted."""
     columns = slice(IMU, state.landmarks_begin)
-    H, residual, p_WF, excess, verdict = msckf_rows(
+    H, residual, p_WF, squares, verdict = msckf_rows(
         Window.of(state, options.first_estimate_jacobians),
         observations.xy[rows],
         observations.xy_normalised[rows],
@@ -96,7 +96,7 @@ def update_from_tracks(
     if len(residual):
         H, residual = compress(H, residual)
         state.update(H, residual, columns, point_noise.px**2)
-    point_noise.add(excess)
+    point_noise.add(squares, observations.lengths()[rows])
     accepted = verdict == ACCEPTED
     return observations.ids[rows[accepted]], p_WF[accepted]
 

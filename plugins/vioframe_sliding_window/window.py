@@ -117,10 +117,6 @@ class Window:
         return replace(self._states[-1:].unstack(np.array(self._t_ns[-1:]))[0], cov=self._cov)
 
     @property
-    def _sigma(self) -> float:
-        return self.point_noise.px / float(self._focal_px[0])
-
-    @property
     def cameras(self) -> Calibrated:
         return self._cameras
 
@@ -217,8 +213,9 @@ class Window:
         """Find the landmarks of tracks that have been seen often enough."""
         tracks = self.tracks
         rows = np.flatnonzero(~tracks.known & (tracks.lengths() >= self._options.min_observations))
+        sigma = self.point_noise.px / self._focal_px[0]
         known, landmarks = triangulate_tracks(
-            self._states, self._cameras, tracks.seen[rows], tracks.xy_normalised[rows], self._sigma, self._shutter(rows)
+            self._states, self._cameras, tracks.seen[rows], tracks.xy_normalised[rows], sigma, self._shutter(rows)
         )
         tracks.landmarks[rows], tracks.known[rows] = landmarks, known
 
@@ -251,9 +248,8 @@ class Window:
         self._cov, self._camera_sigma = self._covariance(solution.normal)
         errors = solution.normal.errors
         bad = errors * self.point_noise.px > options.outlier_px
-        # Of two residuals a view three are taken up by the landmark itself.
-        residuals = 2.0 * self.tracks.lengths()[rows]
-        self.point_noise.add((residuals * errors**2 / (residuals - 3.0 - 2.0 / 3.0))[~bad])
+        views = self.tracks.lengths()[rows[~bad]]
+        self.point_noise.add(2.0 * views * errors[~bad] ** 2, views)
         newest = self.tracks.in_sight()[rows]
         self.tracks.drop(rows[bad])
         return int((bad & newest).sum()), int(newest.sum())

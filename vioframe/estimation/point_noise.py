@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from vioframe.arrays import Float
+from vioframe.arrays import Float, Int
 
 # How much larger noise is taken for than it is at least, and how many tracks it is found by.
 _AT_MOST, _REMEMBERED = 8.0, 100
@@ -20,14 +20,17 @@ class PointNoise:
     def __init__(self, least_px: float, at_first: float) -> None:
         self._least_px, self.px = least_px, at_first * least_px
 
-    def add(self, excess: Float) -> None:
-        """Go by (N,) tracks' squared distances over their medians: 1 in the middle, where the noise is right.
+    def add(self, squares: Float, views: Int) -> None:
+        """Go by what (N,) tracks are off by, seen by ``views`` (N,): sums of squares, in standard deviations.
 
         Not all that is accepted, which would agree with any noise; of several the middle one is no outlier. Each counts
         for one of the last ``_REMEMBERED``; those of zero for none.
         """
-        found = excess[excess > 0.0]
-        if len(found):
-            share = len(found) / (len(found) + _REMEMBERED)
-            px = self.px * float(np.median(found)) ** (0.5 * share)
+        found = squares > 0.0
+        if found.any():
+            # A landmark takes up three of two residuals a view; where the noise is right, this is 1 in the middle.
+            dof = 2.0 * views[found] - 3.0
+            excess = float(np.median(squares[found] / (dof - 2.0 / 3.0)))
+            share = len(dof) / (len(dof) + _REMEMBERED)
+            px = self.px * excess ** (0.5 * share)
             self.px = min(max(px, self._least_px), _AT_MOST * self._least_px)
