@@ -29,8 +29,7 @@ def network(architecture: Architecture, seed: int = 0) -> KeypointNet:
             last.weight.mul_(4.0)
         net.train()
         for number in range(4):
-            grey = torch.from_numpy(texture(seed=number)).float()[None, None] / 255.0
-            net(grey.expand(-1, architecture.image_channels, -1, -1))
+            net(torch.from_numpy(texture(seed=number)).float()[None, None] / 255.0)
     return net.eval()
 
 

@@ -23,6 +23,7 @@ from vioframe_keypointnet.training.followed import (  # noqa: E402
     follow,
     followed_losses,
     rank_correlation,
+    told,
     wanted,
 )
 from vioframe_keypointnet.training.trainer import Training  # noqa: E402
@@ -133,7 +134,7 @@ def test_a_step_depends_on_its_number_alone():
     training = Training(SMALL, scenes())
     training.network.eval()
     first, second = (
-        [float(followed_losses(training.network, scenes(), SMALL, step)["total"].detach()) for step in range(6)]
+        [float(followed_losses(training.network, told(scenes(), SMALL, step))["total"].detach()) for step in range(6)]
         for _ in range(2)
     )
     assert first == second

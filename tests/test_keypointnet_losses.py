@@ -62,7 +62,7 @@ def test_network_is_the_published_one():
 @pytest.mark.parametrize("architecture", [FULL.widened(0.125), COMPACT], ids=["regressed", "peaks"])
 def test_places_are_in_their_cells_reach_and_in_the_image(architecture):
     torch.manual_seed(0)
-    seen = KeypointNet(architecture).eval()(torch.rand(2, architecture.image_channels, 64, 96))
+    seen = KeypointNet(architecture).eval()(torch.rand(2, 1, 64, 96))
     centre = keypoint_places(torch.zeros(1, 2, 8, 12))
     assert centre[0, :, 2, 3].tolist() == [3 * 8 + 3.5, 2 * 8 + 3.5]
     assert (seen.xy - centre).abs().max() <= (3.5 if architecture.peaks else 7.0)

@@ -30,8 +30,7 @@ def as_trained(net, image):
         for name in ("Db", place)
     ]
     with torch.inference_mode():
-        images = torch.from_numpy(image).float()[None, None] / 255.0
-        found = net(images.expand(-1, net.architecture.image_channels, -1, -1))
+        found = net(torch.from_numpy(image).float()[None, None] / 255.0)
     for hook in hooks:
         hook.remove()
     heads = caught["R"].permute(1, 2, 0) if net.architecture.peaks else torch.cat([caught["Db"], caught["Pb"]])

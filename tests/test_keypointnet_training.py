@@ -62,8 +62,6 @@ def folder(tmp_path_factory):
 @pytest.mark.parametrize("taught", [True, False], ids=["lessons", "published losses"])
 def test_steps_lower_the_loss_of_a_fixed_batch(pictures, options, taught):
     options = replace(options, dropout=0.0)
-    if options.network == "full":
-        pictures = [Picture(p.name, np.repeat(p.pixels[..., None], 3, axis=2)) for p in pictures]
     training = Training(options, pictures)
     pairs = batch(pictures, options, 0)
     optimiser = torch.optim.Adam([*training.network.parameters(), *training.judge.parameters()], lr=1e-3)
@@ -100,16 +98,13 @@ def test_losses_are_weighted_as_published(pictures, monkeypatch, taught, descrip
 
 @pytest.mark.parametrize("options", [SMALL, PUBLISHED], ids=["compact", "full"])
 def test_descriptors_alone_are_trained_beside_a_detector_left_as_it_is(pictures, options):
-    if options.network == "full":
-        pictures = [Picture(p.name, np.repeat(p.pixels[..., None], 3, axis=2)) for p in pictures]
     training = Training(replace(options, descriptors_only=True, lesson_epochs=1), pictures)
     before = training.weights()
     totals = [values["total"] for values in training.steps()]
     after = training.weights()
     assert len(totals) == 4
     assert np.isfinite(totals).all()
-    grey = pictures[0].pixels if options.network == "compact" else pictures[0].pixels[..., 0]
-    image = padded_to_cells(np.ascontiguousarray(grey))
+    image = padded_to_cells(pictures[0].pixels)
     found = [runtimes.start("torch", "float32", w, descriptors=True, threads=1)(image) for w in (before, after)]
     np.testing.assert_array_equal(found[0][0], found[1][0])
     assert np.abs(found[0][1] - found[1][1]).max() > 1e-4
@@ -136,6 +131,14 @@ def test_a_resumed_training_is_one_not_interrupted(pictures, tmp_path, stop):
         pass
     assert second.step == whole.step == 4
     assert all(torch.equal(a, b) for a, b in zip(states(whole), states(second), strict=True))
+
+
+def test_it_does_not_matter_who_makes_the_views(pictures):
+    trained = [Training(replace(SMALL, workers=workers), pictures) for workers in (0, 2)]
+    for training in trained:
+        assert len(list(training.steps())) == 4
+    for alone, together in zip(*map(states, trained), strict=True):
+        assert torch.equal(alone, together)
 
 
 def test_a_checkpoint_of_another_training_is_refused(pictures, tmp_path):
@@ -202,22 +205,20 @@ def test_each_photometric_effect_does_what_it_says(monkeypatch):
     assert abs(in_light(1, _BRIGHTNESS=0.2).mean() - image.mean()) > 0.005
 
 
-def test_images_come_from_folders_in_grey_or_colour(tmp_path):
+def test_images_come_from_folders_in_grey(tmp_path):
     (tmp_path / "deep").mkdir()
     colour = np.zeros((80, 100, 3), np.uint8)
     colour[..., 2] = 200  # red, in OpenCV's order
     cv2.imwrite(str(tmp_path / "deep" / "red.png"), colour)
     cv2.imwrite(str(tmp_path / "small.png"), np.zeros((20, 20), np.uint8))
     (tmp_path / "notes.txt").write_text("no image")
-    (rgb,) = gather([tmp_path], 3, 10)
-    assert rgb.pixels.shape == (80, 100, 3)
-    assert rgb.pixels[0, 0].tolist() == [200, 0, 0]
-    (grey,) = gather([tmp_path], 1, 10)
+    (grey,) = gather([tmp_path], 10)
     assert grey.pixels.shape == (80, 100)
+    assert grey.pixels[0, 0] == 60  # 0.299 of 200
 
 
 def test_images_come_from_recordings(shared_data):
-    frames = gather([shared_data / "euroc/MH_01_easy_15s"], 1, 7)
+    frames = gather([shared_data / "euroc/MH_01_easy_15s"], 7)
     assert len(frames) == 7
     assert len({f.name for f in frames}) == 7
     assert frames[0].pixels.shape == (480, 752)

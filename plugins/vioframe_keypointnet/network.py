@@ -22,7 +22,7 @@ _PEAK_REACH_PX = 2
 
 @dataclass(frozen=True, slots=True)
 class Detection:
-    """What the network sees in (B, C, H, W) images: one candidate a cell of a grid of h x w = H/8 x W/8."""
+    """What the network sees in (B, 1, H, W) images: one candidate a cell of a grid of h x w = H/8 x W/8."""
 
     score: Tensor
     """(B, h, w) in [0, 1]; 0 in the outermost ring of cells, which sees less than it should.
@@ -55,12 +55,12 @@ class KeypointNet(nn.Module):
         self.act, self.pool = nn.LeakyReLU(inplace=True), nn.MaxPool2d(2)
         self.dropout = nn.Dropout2d(dropout)
 
-    def forward(self, images: Tensor) -> Detection:
-        """Of ``images`` (B, C, H, W) in [0, 1], H and W multiples of 8; for training."""
-        after = self._encode(images)
+    def forward(self, grey: Tensor) -> Detection:
+        """Of ``grey`` (B, 1, H, W) in [0, 1], H and W multiples of 8; for training."""
+        after = self._encode(grey)
         score, response = self._regress("D", after[4])[:, 0], None
         if self.architecture.peaks:
-            response = cells_of(self._conv("R", after[2]).float())
+            response = cells_of(self._last("R", after[2]))
             score = score + torch.logsumexp(response, dim=1)
             place = peak_places(response)
         else:
@@ -77,10 +77,9 @@ class KeypointNet(nn.Module):
         not normalised.
         """
         peaks = self.architecture.peaks
-        images = grey.expand(-1, self.architecture.image_channels, -1, -1)
-        after = self._encode(images, blocks=4 if descriptors or not peaks else 2)
+        after = self._encode(grey, blocks=4 if descriptors or not peaks else 2)
         if peaks:
-            first = self._conv("R", after[2]).permute(0, 2, 3, 1)
+            first = self._last("R", after[2]).permute(0, 2, 3, 1)
         else:
             first = torch.cat([self._regress("D", after[4]), self._regress("P", after[4])], dim=1)
         return (first, self._describe(after)) if descriptors else (first,)
@@ -89,9 +88,16 @@ class KeypointNet(nn.Module):
         out: Tensor = self.get_submodule(f"conv{name}")(x)
         return out
 
-    def _encode(self, images: Tensor, blocks: int = 4) -> dict[int, Tensor]:
+    def _last(self, name: str, x: Tensor) -> Tensor:
+        """A layer whose output is the network's: pixels of a large image do not fit into half precision."""
+        return self._conv(name, x).float()
+
+    def _encode(self, grey: Tensor, blocks: int = 4) -> dict[int, Tensor]:
         """What each of the first ``blocks`` gives, before the resolution is halved."""
-        x = self.fold(locally_normalised(images) if self.architecture.peaks else (images - 0.5) * 0.225)
+        images = grey.expand(-1, self.architecture.image_channels, -1, -1)
+        seen = locally_normalised(images) if self.architecture.peaks else (images - 0.5) * 0.225
+        # The convolutions may have half precision; what comes before and after has not.
+        x = self.fold(seen).to(next(self.parameters()).dtype)
         after: dict[int, Tensor] = {}
         for number, layers in self.architecture.encoder.items():
             if number > blocks:
@@ -108,12 +114,12 @@ class KeypointNet(nn.Module):
     def _regress(self, head: str, deepest: Tensor) -> Tensor:
         """What the head of the score (D) or of the place (P) gives."""
         hidden = self.dropout(self.act(self._conv(f"{head}a", deepest)))
-        return self._conv(f"{head}b", hidden).float()  # pixels of a large image do not fit into half precision
+        return self._last(f"{head}b", hidden)
 
     def _describe(self, after: dict[int, Tensor]) -> Tensor:
         x = self._conv("Fb", self.dropout(self.act(self._conv("Fa", after[4]))))
         x = self.act(self._conv("Faa", torch.cat([self.unfold(x), after[3]], dim=1)))
-        return self._conv("Fbb", x)
+        return self._last("Fbb", x)
 
 
 def fill(network: KeypointNet, weights: Weights) -> None:

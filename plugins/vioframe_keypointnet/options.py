@@ -12,6 +12,7 @@ from vioframe_keypointnet.architecture import ARCHITECTURES, Architecture
 
 Runtime = Literal["auto", "cuda", "openvino", "torch"]
 Precision = Literal["auto", "float32", "float16", "int8"]
+TrainingPrecision = Literal["float32", "bfloat16"]
 Target = Literal["repeatability", "life", "drift", "faithful", "information", "clean"]
 """Of a training; what each but the first says of a point is in :mod:`vioframe_keypointnet.training.followed`."""
 
@@ -78,10 +79,12 @@ class TrainingOptions:
     """Images taken, evenly, from each recording."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """Where to train; auto takes CUDA where there is any."""
-    precision: Literal["float32", "bfloat16"] = "float32"
+    precision: TrainingPrecision = "float32"
     """Of the convolutions; bfloat16 is faster where the processor has it."""
     threads: NonNegativeInt = 0
     """Threads on a CPU; 0 leaves torch's choice."""
+    workers: NonNegativeInt = 0
+    """Processes that make the next views meanwhile, as a GPU needs them; 0 makes them in between. The same views."""
 
     def __post_init__(self) -> None:
         if any(n < 32 or n % 8 for n in self.size):

@@ -56,7 +56,9 @@ def start(runtime: str, precision: str, weights: Weights, *, descriptors: bool, 
     """The network of ``weights`` in ``runtime``, with so many ``threads``, or as many as the library likes if 0."""
     if runtime == "openvino":
         return _by_openvino(weights, descriptors, precision == "int8", threads)
-    return _by_torch(weights, descriptors, "cuda" if runtime == "cuda" else "cpu", precision == "float16", threads)
+    if runtime == "cuda":
+        return _by_cuda(weights, descriptors, precision == "float16")
+    return _by_torch(weights, descriptors, threads)
 
 
 def _by_openvino(weights: Weights, descriptors: bool, int8: bool, threads: int) -> Run:
@@ -82,30 +84,69 @@ def _by_openvino(weights: Weights, descriptors: bool, int8: bool, threads: int) 
     return run
 
 
-def _by_torch(weights: Weights, descriptors: bool, device: str, half: bool, threads: int) -> Run:
-    """The network as it was trained; the number of threads, if given, is set for torch as a whole.
-
-    With ``half`` the convolutions have half precision, and nothing else.
-    """
-    user = "KeypointNet by PyTorch"
-    if device == "cpu":
-        user += " (for a CPU -o runtime=openvino is enough, with vioframe[openvino],)"
+def _by_torch(weights: Weights, descriptors: bool, threads: int) -> Run:
+    """The network as it was trained, on a CPU; the number of threads, if given, is set for torch as a whole."""
+    user = "KeypointNet by PyTorch (for a CPU -o runtime=openvino is enough, with vioframe[openvino],)"
     with needs("torch", "keypointnet", user=user):
         import torch
 
         from vioframe_keypointnet.network import of_weights
-    if device == "cuda" and not torch.cuda.is_available():
-        raise ConfigError("torch finds no CUDA device; leave -o runtime out, or install torch with CUDA")
     if threads:
         torch.set_num_threads(threads)
-    network = of_weights(weights).to(device)
+    network = of_weights(weights)
 
     def run(image: Image) -> tuple[NDArray[np.float32], ...]:
         # A copy: torch wants no memory that it may not write to.
-        grey = torch.from_numpy(image.copy()).to(device)[None, None] / 255.0
-        with torch.inference_mode(), torch.autocast(device, torch.float16, enabled=half):
+        grey = torch.from_numpy(image.copy())[None, None] / 255.0
+        with torch.inference_mode():
             outputs = network.found(grey, descriptors=descriptors)
-        return tuple(output[0].float().cpu().contiguous().numpy() for output in outputs)
+        return tuple(output[0].contiguous().numpy() for output in outputs)
+
+    return run
+
+
+def _by_cuda(weights: Weights, descriptors: bool, half: bool) -> Run:
+    """The same on a GPU, from the image in to the outputs back one CUDA graph, captured for each size of image when the
+    first comes: to launch it costs the same however many layers there are.
+
+    With ``half`` the convolutions have half precision, and nothing else.
+    """
+    with needs("torch", "keypointnet", user="KeypointNet by PyTorch"):
+        import torch
+
+        from vioframe_keypointnet.network import of_weights
+    if not torch.cuda.is_available():
+        raise ConfigError("torch finds no CUDA device; leave -o runtime out, or install torch with CUDA")
+    network = of_weights(weights).to("cuda", torch.float16 if half else torch.float32)
+
+    @lru_cache(maxsize=4)
+    def captured(shape: tuple[int, int]) -> tuple[torch.cuda.CUDAGraph, Image, list[NDArray[np.float32]]]:
+        """The graph, the array that it takes the image from, and those it leaves the outputs in."""
+        image = torch.empty(shape, dtype=torch.uint8, pin_memory=True)
+
+        def work() -> list[torch.Tensor]:
+            grey = image.to("cuda", non_blocking=True)[None, None] / 255.0
+            return [output[0].contiguous() for output in network.found(grey, descriptors=descriptors)]
+
+        aside, graph = torch.cuda.Stream(), torch.cuda.CUDAGraph()
+        # In full precision TF32 would round to ten bits; the quickest of cuDNN's algorithms is found by trying them.
+        with torch.inference_mode(), torch.backends.cudnn.flags(enabled=True, benchmark=True, allow_tf32=half):
+            with torch.cuda.stream(aside):
+                for _ in range(3):
+                    warm = work()
+            aside.synchronize()
+            outputs = [torch.empty(output.shape, pin_memory=True) for output in warm]
+            with torch.cuda.graph(graph, stream=aside, capture_error_mode="thread_local"):
+                for output, made in zip(outputs, work(), strict=True):
+                    output.copy_(made, non_blocking=True)
+        return graph, image.numpy(), [output.numpy() for output in outputs]
+
+    def run(image: Image) -> tuple[NDArray[np.float32], ...]:
+        graph, seen, outputs = captured(cast(tuple[int, int], image.shape))
+        seen[:] = image
+        graph.replay()
+        torch.cuda.current_stream().synchronize()
+        return tuple(outputs)
 
     return run
 

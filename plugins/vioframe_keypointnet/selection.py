@@ -47,19 +47,11 @@ def select(
     (8 h, 8 w) is what it saw. Not taken: the outermost ring of cells, which sees less than it should, what lies outside
     the image's first ``shape`` (H, W) pixels, which are not padding, and what is near a stronger candidate.
     """
-    from scipy.spatial import cKDTree
-
-    off_border = np.zeros(heads.shape[1:], bool)
-    off_border[1:-1, 1:-1] = True
-    order = np.argsort(heads[0], axis=None)[::-1]
-    order = order[(off_border & np.isfinite(heads[0])).ravel()[order]]
-    score = heads[0].ravel()[order]
-    xy = np.stack([places.ravel()[order] for places in candidate_places(heads)], axis=1)
-    apart = np.ones(len(xy), bool)
-    # Of each pair the one that comes later is the weaker.
-    apart[cKDTree(xy).query_pairs(rules.nms_px, output_type="ndarray").max(axis=1)] = False
-    apart &= (xy <= np.array(shape[::-1]) - 1).all(axis=1)
-    score, xy = score[apart], xy[apart]
+    score, (x, y) = heads[0], candidate_places(heads)
+    reach = int((2.0 * OFFSET_PX + rules.nms_px) / CELL_PX)
+    found = _strongest(score, x, y, np.float32(rules.nms_px), reach, shape[0], shape[1])
+    found = found[np.argsort(-found[:, 2])]
+    xy, score = found[:, :2], found[:, 2]
     kept = _first_varied(image, np.rint(xy).astype(np.int64), shape[0], shape[1], rules.min_contrast, max_points)
     return xy[kept], _sigmoid(score[kept])
 
@@ -143,6 +135,35 @@ def _summits(before: Array, here: Array, after: Array) -> NDArray[np.float64]:
     """Where the parabolas through three values, a pixel apart, are highest: at most half a pixel from the middle."""
     bend = 2.0 * here.astype(np.float64) - before - after
     return np.divide(0.5 * (after - before).astype(np.float64), bend, out=np.zeros(len(bend)), where=bend > 0.0)
+
+
+@kernel
+def _strongest(score: Array, x: Array, y: Array, nms_px: np.float32, reach: int, height: int, width: int) -> Array:
+    """(N, 3) x, y and score of the candidates within the image and off the border, none stronger within ``nms_px``.
+
+    Candidates so near each other are at most ``reach`` cells apart; of equals the first row by row is the stronger.
+    """
+    rows, columns = score.shape
+    beaten = np.zeros(score.shape, np.bool_)
+    for row in range(1, rows - 1):
+        for column in range(1, columns - 1):
+            # Each pair once: which of two is the stronger no processor can guess, that they are far apart it can.
+            for r in range(row, min(row + reach + 1, rows - 1)):
+                first = column + 1 if r == row else max(column - reach, 1)
+                for c in range(first, min(column + reach + 1, columns - 1)):
+                    dx, dy = x[r, c] - x[row, column], y[r, c] - y[row, column]
+                    if dx * dx + dy * dy <= nms_px * nms_px:
+                        beaten[row, column] |= score[r, c] > score[row, column]
+                        beaten[r, c] |= score[r, c] <= score[row, column]
+    found = np.empty((score.size, 3), np.float32)
+    count = 0
+    for row in range(1, rows - 1):
+        for column in range(1, columns - 1):
+            inside = x[row, column] <= width - 1 and y[row, column] <= height - 1
+            if inside and not beaten[row, column] and np.isfinite(score[row, column]):
+                found[count] = x[row, column], y[row, column], score[row, column]
+                count += 1
+    return found[:count]
 
 
 @kernel

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import get_args
+from typing import NamedTuple, get_args
 
 import numpy as np
 import torch
@@ -29,9 +29,9 @@ from vioframe.io.synchronise import synchronise
 from vioframe.parts import registry
 from vioframe.simulation.config import MESH, simulation_folder
 from vioframe.stopwatch import Stopwatch
-from vioframe.types import Bool, Float, FrameTracks, Int
+from vioframe.types import Bool, Float, FrameTracks
 from vioframe_keypointnet.network import KeypointNet
-from vioframe_keypointnet.options import Target, TrainingOptions
+from vioframe_keypointnet.options import Target, TrainingOptions, TrainingPrecision
 from vioframe_keypointnet.selection import padded_to_cells
 from vioframe_keypointnet.training.samples import Picture
 
@@ -188,27 +188,41 @@ def responses(network: KeypointNet, images: Tensor) -> Tensor:
     return pixel_shuffle(network.found(images, descriptors=False)[0].permute(0, 3, 1, 2), 2)[:, 0]
 
 
-def followed_losses(
-    network: KeypointNet, pictures: Sequence[Followed], options: TrainingOptions, step: int
-) -> dict[str, Tensor]:
-    """Cross entropy of what the network says of points from what became of them; of crops of a batch of pictures."""
+class Told(NamedTuple):
+    """Crops of a batch of pictures, and what a network is to say of K points in them."""
+
+    crops: Tensor
+    """(B, 1, H, W) uint8."""
+    at: Tensor
+    """(K, 3) crop, row and column of each point."""
+    score: Tensor
+    """(K,) in [0, 1]."""
+
+
+def told(pictures: Sequence[Followed], options: TrainingOptions, step: int) -> Told:
+    """What a step is trained on, made of nothing but the arguments."""
     rng = np.random.default_rng([options.seed, 4, step])
     width, height = options.size
-    device = next(network.parameters()).device
-    crops, told = [], []
-    for picture in (pictures[k] for k in rng.integers(len(pictures), size=options.batch)):
+    crops, at, scores = [], [], []
+    for number, picture in enumerate(pictures[k] for k in rng.integers(len(pictures), size=options.batch)):
         rows, columns = picture.pixels.shape
         top, left = rng.integers(0, rows - height + 1), rng.integers(0, columns - width + 1)
         crops.append(picture.pixels[top : top + height, left : left + width])
         score, enough = wanted(options.target, picture)
         xy = picture.xy - np.array([left, top], np.float32)
         seen = enough & (xy >= _EDGE_PX).all(axis=1) & (xy < np.array(options.size) - _EDGE_PX).all(axis=1)
-        told.append((np.rint(xy[seen]).astype(np.int64), score[seen]))
-    said = responses(network, torch.from_numpy(np.stack(crops)).to(device)[:, None].float() / 255.0)
-    of_crop: Int = np.repeat(np.arange(len(told)), [len(score) for _, score in told])
-    x, y = np.concatenate([xy for xy, _ in told]).T
-    score = torch.from_numpy(np.concatenate([score for _, score in told])).float().to(device)
-    loss = binary_cross_entropy_with_logits(said[of_crop, y, x], score) if len(score) else said.sum() * 0.0
+        x, y = np.rint(xy[seen]).astype(np.int64).T
+        at.append(np.stack([np.full_like(x, number), y, x], axis=1))
+        scores.append(score[seen].astype(np.float32))
+    arrays = np.stack(crops)[:, None], np.concatenate(at), np.concatenate(scores)
+    return Told(*map(torch.from_numpy, arrays))
+
+
+def followed_losses(network: KeypointNet, told: Told, precision: TrainingPrecision = "float32") -> dict[str, Tensor]:
+    """Cross entropy of what the network says of points from what became of them."""
+    with torch.autocast(told.crops.device.type, torch.bfloat16, enabled=precision == "bfloat16"):
+        said = responses(network, told.crops / 255.0)
+    loss = binary_cross_entropy_with_logits(said[tuple(told.at.T)], told.score) if len(told.at) else said.sum() * 0.0
     return {"followed": loss, "total": loss}
 
 

@@ -55,14 +55,14 @@ _NOISE_SIGMA = 0.05
 
 Array = NDArray[np.float32]
 View = Array
-"""(H, W) or (H, W, 3) in [0, 1]."""
+"""(H, W) in [0, 1]."""
 
 ArrayT = TypeVar("ArrayT", Array, Tensor)
 
 
 @dataclass(frozen=True, slots=True)
 class Picture:
-    """One image, (H, W) or (H, W, 3) RGB uint8, and the file or recording that it is from."""
+    """One grey image (H, W), as a detector is given them, and the file or recording that it is from."""
 
     name: str
     pixels: NDArray[np.uint8]
@@ -72,7 +72,7 @@ class Pair(NamedTuple, Generic[ArrayT]):
     """Two views of one image; of a batch, tensors with a row a pair."""
 
     source: ArrayT
-    """(C, H, W) in [0, 1]."""
+    """(1, H, W) in [0, 1]."""
     target: ArrayT
     homography: ArrayT
     """(3, 3) from pixels of the source to those of the target."""
@@ -81,8 +81,8 @@ class Pair(NamedTuple, Generic[ArrayT]):
     target_lesson: ArrayT
 
 
-def gather(sources: Sequence[Path], channels: int, frames_per_recording: int) -> list[Picture]:
-    """All images of ``sources`` in a settled order, with ``channels`` 1 (grey) or 3 (RGB).
+def gather(sources: Sequence[Path], frames_per_recording: int) -> list[Picture]:
+    """All images of ``sources`` in a settled order.
 
     A source is a folder of photographs (searched to its depths) or a recording that a reader opens. Raises
     :class:`ConfigError` for one that is neither, and :class:`DatasetError` for a damaged image.
@@ -96,11 +96,11 @@ def gather(sources: Sequence[Path], channels: int, frames_per_recording: int) ->
                 files = find_images(source)
             except DatasetError:
                 raise ConfigError(f"{source} holds neither photographs nor a recording: {error}") from error
-            pictures += (Picture(str(path), _with_channels(read_image(path), channels, str(path))) for path in files)
+            pictures += (Picture(str(path), to_gray8(read_image(path), 16, str(path))) for path in files)
         else:
             for number, frames in frames_of(dataset, frames_per_recording):
                 image = next(image for image in frames.images if image is not None)
-                pictures.append(Picture(f"{source}#{number}", _with_channels(image, channels, str(source))))
+                pictures.append(Picture(f"{source}#{number}", to_gray8(image, 16, str(source))))
     return [picture for picture in pictures if min(picture.pixels.shape[:2]) >= _SMALLEST_PX]
 
 
@@ -143,21 +143,6 @@ def split(pictures: Iterable[Picture], hold_out: Sequence[str]) -> tuple[list[Pi
     return train, held
 
 
-def _with_channels(pixels: NDArray[np.generic], channels: int, where: str) -> NDArray[np.uint8]:
-    """OpenCV's (H, W), BGR or BGRA -> grey or RGB."""
-    if channels == 3 and pixels.ndim == 3 and pixels.dtype == np.uint8:
-        return np.ascontiguousarray(pixels[..., 2::-1], np.uint8)
-    grey = to_gray8(pixels, 16, where)
-    return grey if channels == 1 else np.repeat(grey[..., None], 3, axis=2)
-
-
-def grey_of(pixels: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """(H, W) of the pixels of a :class:`Picture`."""
-    import cv2
-
-    return pixels if pixels.ndim == 2 else np.asarray(cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY), np.uint8)
-
-
 def batch(
     pictures: Sequence[Picture], options: TrainingOptions, step: int, *, corners_taught: bool = True
 ) -> Pair[Tensor]:
@@ -191,13 +176,13 @@ def pair(picture: Picture, options: TrainingOptions, number: int, *, corners_tau
     if rng.random() < 0.5:
         first, second = second, first
     between = second @ np.linalg.inv(first)
-    points = corners(grey_of(shrunk)) if corners_taught else np.empty((0, 3))
+    points = corners(shrunk) if corners_taught else np.empty((0, 3))
     source, target = (
         disturbed(_view(shrunk, H, options.size), rng, options.photometric_probability) for H in (first, second)
     )
     return Pair(
-        np.atleast_3d(source).transpose(2, 0, 1),
-        np.atleast_3d(target).transpose(2, 0, 1),
+        source[None],
+        target[None],
         (between / between[2, 2]).astype(np.float32),
         lesson(points, first, options.size),
         lesson(points, second, options.size),

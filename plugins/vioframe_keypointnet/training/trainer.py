@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, cast
 
@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 from torch.nn import Module
 from torch.optim import Adam
+from torch.utils.data import DataLoader, Dataset
 
 from vioframe.bench.detectors.images import random_homography
 from vioframe.bench.detectors.metrics import score_pair
@@ -25,11 +26,11 @@ from vioframe.types import TrainingJob, TrainingStep
 from vioframe_keypointnet import weights
 from vioframe_keypointnet.detector import KeypointNet as Detector
 from vioframe_keypointnet.network import KeypointNet, fill, of_weights
-from vioframe_keypointnet.options import KeypointNetOptions, TrainingOptions
+from vioframe_keypointnet.options import KeypointNetOptions, Runtime, TrainingOptions
 from vioframe_keypointnet.quantisation import measure_ranges
-from vioframe_keypointnet.training.followed import Followed, follow, followed_losses, rank_correlation
+from vioframe_keypointnet.training.followed import Followed, Told, follow, followed_losses, rank_correlation, told
 from vioframe_keypointnet.training.losses import InlierOutlierNet, losses, matching_loss, teach
-from vioframe_keypointnet.training.samples import Pair, Picture, batch, gather, grey_of, simulated_worlds, split
+from vioframe_keypointnet.training.samples import Pair, Picture, batch, gather, simulated_worlds, split
 
 CHECKPOINT, LOG, WEIGHTS = "checkpoint.pt", "log.csv", "keypointnet.safetensors"
 
@@ -41,7 +42,7 @@ _VALIDATION_SIZE, _VALIDATION_TOP = (320, 240), 300
 _DESCRIPTOR_WEIGHT = 2.0
 """As published; the other losses have weight one."""
 
-_FREE = frozenset({"epochs", "device", "threads"})
+_FREE = frozenset({"epochs", "device", "threads", "workers"})
 """What may be chosen anew when a training goes on."""
 
 
@@ -59,7 +60,7 @@ class KeypointNetTrainer:
         worlds = simulated_worlds(job.images)
         pictures: list[Picture]
         if options.target == "repeatability":
-            pictures = gather(job.images, options.architecture.image_channels, options.frames_per_recording)
+            pictures = gather(job.images, options.frames_per_recording)
         else:
             pictures = [followed for recording in job.images for followed in follow(recording)]
         train, held_out = split(pictures, job.hold_out)
@@ -171,34 +172,50 @@ class Training:
         self.judge.train()
         for part in self._frozen:
             part.eval()
-        while self.step < self.total_steps:
+        for made_ready in self._made_ready():
             epoch = self.step // self.epoch_steps
             rate = self.options.learning_rate * 0.5 ** sum(epoch >= e for e in self.options.halve_at)
             for group in self._optimiser.param_groups:
                 group["lr"] = rate
             # Dropout, too, depends on the number of the step alone.
             torch.manual_seed(int(np.random.default_rng([self.options.seed, 3, self.step]).integers(2**62)))
-            values = self._losses(taught=epoch < self.options.lesson_epochs)
+            values = self._losses(made_ready, taught=epoch < self.options.lesson_epochs)
             self._optimiser.zero_grad(set_to_none=True)
             values["total"].backward()  # type: ignore[no-untyped-call]
             self._optimiser.step()
             self.step += 1
             yield {name: float(value.detach()) for name, value in values.items()}
 
-    def _losses(self, *, taught: bool) -> Mapping[str, Tensor]:
-        """Those of the next step, ``total`` to be minimised."""
+    def _made_ready(self) -> Iterator[Any]:
+        """What each step to come is trained on; a step's depends on nothing but its number."""
+        samples = _Samples(self._pictures, self.options, self.epoch_steps)
+        to_come = range(self.step, self.total_steps)
+        return iter(
+            DataLoader(
+                samples,
+                batch_size=None,
+                sampler=to_come,
+                num_workers=self.options.workers,
+                # Forked, they would wait for threads of OpenCV's that are not there.
+                multiprocessing_context="spawn" if self.options.workers else None,
+                worker_init_fn=_on_one_thread,
+                pin_memory=self._device.type == "cuda",
+            )
+        )
+
+    def _losses(self, made_ready: Any, *, taught: bool) -> Mapping[str, Tensor]:
+        """Those of a step, ``total`` to be minimised."""
+        on_device = (tensor.to(self._device, non_blocking=True) for tensor in made_ready)
         if self.options.target != "repeatability":
-            return followed_losses(self.network, cast(Sequence[Followed], self._pictures), self.options, self.step)
-        corners_taught = taught and not self.options.descriptors_only
-        pairs = batch(self._pictures, self.options, self.step, corners_taught=corners_taught)
-        pairs = Pair(*(tensor.to(self._device) for tensor in pairs))
-        return step_losses(self.network, self.judge, self.options, pairs, taught=taught)
+            return followed_losses(self.network, Told(*on_device), self.options.precision)
+        return step_losses(self.network, self.judge, self.options, Pair(*on_device), taught=taught)
 
     def validate(self, held_out: Sequence[Picture]) -> dict[str, float]:
         """How good the network is by now on pictures not trained on."""
         made, target = self.weights(), self.options.target
         if target == "repeatability":
-            return validate(made, held_out, self.options.seed)
+            runtime: Runtime = "cuda" if self._device.type == "cuda" else "torch"
+            return validate(made, held_out, self.options.seed, runtime)
         return {"rank_correlation": rank_correlation(of_weights(made), cast(Sequence[Followed], held_out), target)}
 
     def save(self, path: Path, history: Sequence[Mapping[str, float]]) -> None:
@@ -254,9 +271,32 @@ class Training:
         Their card has the training, and what else is known ``about`` it.
         """
         made = self.weights()
-        ranges = measure_ranges(made, (grey_of(picture.pixels) for picture in sample))
+        ranges = measure_ranges(made, (picture.pixels for picture in sample))
         card = {**about, "simulated_worlds": self.worlds, "options": asdict(self.options), **made.card}
         weights.save(path, replace(made, card=card, activation_ranges=ranges))
+
+
+@dataclass(frozen=True, slots=True)
+class _Samples(Dataset[Any]):
+    """What each step of a training is trained on."""
+
+    pictures: Sequence[Picture]
+    options: TrainingOptions
+    epoch_steps: int
+
+    def __getitem__(self, step: int) -> Any:
+        options = self.options
+        if options.target != "repeatability":
+            return told(cast(Sequence[Followed], self.pictures), options, step)
+        taught = step // self.epoch_steps < options.lesson_epochs and not options.descriptors_only
+        return batch(self.pictures, options, step, corners_taught=taught)
+
+
+def _on_one_thread(_: int) -> None:
+    """Of several processes that each use all cores all are slow."""
+    import cv2
+
+    cv2.setNumThreads(1)
 
 
 def step_losses(
@@ -269,8 +309,7 @@ def step_losses(
 ) -> dict[str, Tensor]:
     """The losses of a batch of pairs, of the lessons where it is ``taught``; ``total`` is what is minimised."""
     with torch.autocast(pairs.source.device.type, torch.bfloat16, enabled=options.precision == "bfloat16"):
-        seen = [network(x.contiguous(memory_format=torch.channels_last)) for x in (pairs.source, pairs.target)]
-    a, b = (replace(d, descriptors=d.descriptors.float()) for d in seen)
+        a, b = (network(x.contiguous(memory_format=torch.channels_last)) for x in (pairs.source, pairs.target))
     if taught:
         values = {"matching": matching_loss(a, b, pairs.homography)}
         if not options.descriptors_only:
@@ -285,7 +324,9 @@ def step_losses(
     return values
 
 
-def validate(made: weights.Weights, pictures: Sequence[Picture], seed: int) -> dict[str, float]:
+def validate(
+    made: weights.Weights, pictures: Sequence[Picture], seed: int, runtime: Runtime = "torch"
+) -> dict[str, float]:
     """How well points are found again in images not trained on, under one synthetic homography each, at 320 x 240.
 
     ``repeatability`` is the share of the 300 strongest points of one view that have one of the other's within 3 px,
@@ -293,10 +334,10 @@ def validate(made: weights.Weights, pictures: Sequence[Picture], seed: int) -> d
     """
     import cv2
 
-    detector = Detector(made, KeypointNetOptions(runtime="torch", nms_px=4.0, min_contrast=0))
+    detector = Detector(made, KeypointNetOptions(runtime=runtime, precision="float32", nms_px=4.0, min_contrast=0))
     scores = []
     for k, picture in enumerate(pictures):
-        image = cv2.resize(grey_of(picture.pixels), _VALIDATION_SIZE, interpolation=cv2.INTER_AREA)
+        image = cv2.resize(picture.pixels, _VALIDATION_SIZE, interpolation=cv2.INTER_AREA)
         H_21 = random_homography(np.random.default_rng([seed, 2, k]), _VALIDATION_SIZE)
         moved = cv2.warpPerspective(image, H_21, _VALIDATION_SIZE, flags=cv2.INTER_LINEAR)
         # Some of the points of one view the other does not show.
