@@ -444,8 +444,17 @@ def push() -> str:
 
 def speed() -> str:
     """Every detector on each kind of images, the fastest first, and on which of them it is faster than the baseline."""
-    rows = recorded("detectors_speed.json").sort_values("fps", ascending=False)
-    kinds = list(dict.fromkeys(recorded("detectors_speed.json")["images"]))
+    return _speeds("detectors_speed.json")
+
+
+def speed_gpu() -> str:
+    """The same, of KeypointNet on a GPU."""
+    return _speeds("detectors_speed_gpu.json")
+
+
+def _speeds(name: str) -> str:
+    rows = recorded(name).sort_values("fps", ascending=False)
+    kinds = list(dict.fromkeys(recorded(name)["images"]))
     theirs = rows[rows["detector"] == BASELINE].set_index("images")["fps_high"]
     shown = []
     for detector, own in rows.groupby("detector", sort=False):
@@ -547,12 +556,11 @@ def tuning() -> str:
 
 
 def targets() -> str:
-    """How networks that were trained for each target order points that are followed, by what became of these."""
+    """How networks order points that are followed by what became of these: one for each target, and those that ship."""
     rows = recorded("targets.json")
-    names = rows["trained for"][1:]
+    names = rows.loc[rows["steps"] > 0, "trained for"]
     shown = [
-        {"trained for": f"{row['trained for']}" if row["steps"] else "as it ships (`compact`)"}
-        | {f"order by {name}": f"{row[f'order.{name}']:.2f}" for name in names}
+        {"trained for": row["trained for"]} | {f"order by {name}": f"{row[f'order.{name}']:.2f}" for name in names}
         for _, row in rows.iterrows()
     ]
     return markdown(shown) + source(rows)
@@ -608,6 +616,7 @@ FIGURES: dict[str, Callable[[], str]] = {
         ),
         *(
             speed,
+            speed_gpu,
             quality,
             clean,
             comparison,

@@ -1,4 +1,4 @@
-"""What a KeypointNet is trained for: the same network, on the same flights, once for each target.
+"""What a KeypointNet is trained for: the same network, on the same flights, once for each target, and what ships.
 
     python benchmarks/targets.py [--out targets] [--record]
     vioframe bench benchmarks/targets.yaml
@@ -14,6 +14,7 @@ import pickle
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, replace
+from itertools import chain
 from multiprocessing import get_context
 from pathlib import Path
 from typing import get_args
@@ -31,7 +32,7 @@ from vioframe.simulation.seeds import seed_for
 from vioframe_keypointnet import weights
 from vioframe_keypointnet.network import of_weights
 from vioframe_keypointnet.options import Target, TrainingOptions
-from vioframe_keypointnet.training.followed import follow, rank_correlation
+from vioframe_keypointnet.training.followed import Followed, follow, rank_correlation
 from vioframe_keypointnet.training.samples import simulated_worlds
 from vioframe_keypointnet.training.trainer import Training
 
@@ -50,6 +51,7 @@ DURATION_S = 20.0
 HELD_OUT = 4
 """The last of the flights, on which it is told how well a network orders points."""
 START = "compact"
+SHIPPED = ("compact", "tracks")
 CALIBRATED = 64
 """Images, about, on which the reach of each layer is measured for int8."""
 TARGETS: tuple[Target, ...] = get_args(Target)[1:]
@@ -66,11 +68,13 @@ COLUMNS = {"trained for": "", "steps": "d"} | {f"order.{target}": ".2f" for targ
 def main(out: Path, flights: int, keep: bool) -> None:
     """How well networks order points as each target does (rank correlation on flights held out), by what they saw."""
     out.mkdir(parents=True, exist_ok=True)
-    targets: list[Target] = ["repeatability", *TARGETS]
     settings = {"flights": flights, "held_out": HELD_OUT, "duration_s": DURATION_S, "options": asdict(OPTIONS)}
     with ProcessPoolExecutor(usable_cores(), mp_context=get_context("spawn")) as workers:
         kept = list(workers.map(followed, [out] * flights, range(flights)))
-        rows = workers.map(trained, targets, [out] * len(targets), [kept] * len(targets))
+        rows = chain(
+            workers.map(trained, TARGETS, [out] * len(TARGETS), [kept] * len(TARGETS)),
+            (ships(name, kept) for name in SHIPPED),
+        )
         present("targets", "Rank correlation with what became of points", rows, COLUMNS, settings, keep)
 
 
@@ -93,23 +97,30 @@ def followed(out: Path, number: int) -> Path:
 
 
 def trained(target: Target, out: Path, kept: Sequence[Path]) -> Row:
-    """The network for ``target``, or, for repeatability, that which all begin with: how it orders what is held out."""
-    shown, held_out = (
-        [picture for path in some for picture in pickle.loads(path.read_bytes())]
-        for some in (kept[:-HELD_OUT], kept[-HELD_OUT:])
-    )
-    options = replace(OPTIONS, target=target)
-    training = Training(options, shown)
+    """The network for ``target``: how it orders what is held out."""
+    shown = pictures(kept[:-HELD_OUT])
+    training = Training(replace(OPTIONS, target=target), shown)
     training.start_from(weights.load(START))
-    if target != "repeatability":
-        training.saw(simulated_worlds(path.with_suffix(".bag") for path in kept[:-HELD_OUT]))
-        for _ in training.steps():
-            pass
-        sample = shown[:: len(shown) // CALIBRATED]
-        training.write(out / f"{target}.safetensors", sample, {"started_from": START})
-    network = of_weights(training.weights())
-    order = {name: rank_correlation(network, held_out, name) for name in TARGETS}
-    return {"trained for": target, "steps": training.step, "order": order}
+    training.saw(simulated_worlds(path.with_suffix(".bag") for path in kept[:-HELD_OUT]))
+    for _ in training.steps():
+        pass
+    training.write(out / f"{target}.safetensors", shown[:: len(shown) // CALIBRATED], {"started_from": START})
+    return {"trained for": target, "steps": training.step, "order": order(training.weights(), kept)}
+
+
+def ships(name: str, kept: Sequence[Path]) -> Row:
+    """How the weights ``name`` that ship order what is held out."""
+    return {"trained for": f"ships as {name}", "steps": 0, "order": order(weights.load(name), kept)}
+
+
+def order(made: weights.Weights, kept: Sequence[Path]) -> dict[str, float]:
+    """How well they order the points of the flights held out as each target does."""
+    network, held_out = of_weights(made), pictures(kept[-HELD_OUT:])
+    return {target: rank_correlation(network, held_out, target) for target in TARGETS}
+
+
+def pictures(kept: Sequence[Path]) -> list[Followed]:
+    return [picture for path in kept for picture in pickle.loads(path.read_bytes())]
 
 
 if __name__ == "__main__":

@@ -107,6 +107,21 @@ def test_what_each_target_says_of_a_point(target, worth):
     assert enough.tolist() == [True] * 5 + [False]
 
 
+def test_points_are_where_the_crops_show_them():
+    """Mirrored or not: what is white in a picture is so in its crops."""
+    rng = np.random.default_rng(1)
+    xy = rng.integers(12, [180, 116], (60, 2))
+    image = np.zeros((128, 192), np.uint8)
+    image[xy[:, 1], xy[:, 0]] = 255
+    followed = Followed(
+        "", image, xy.astype(np.float32), np.zeros((60, IMAGES), np.float16), np.ones((60, IMAGES), bool)
+    )
+    steps = [told([followed], SMALL, step) for step in range(8)]
+    for made in steps:
+        assert len(made.at) > 5
+        assert (made.crops[made.at[:, 0], 0, made.at[:, 1], made.at[:, 2]] == 255).all()
+
+
 def scenes():
     """Images whose left half is textured finely and whose right half is not; points of the left stay, others slide."""
     rng = np.random.default_rng(0)

@@ -8,7 +8,7 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from keypointnet_helpers import ARCHITECTURES, COMPACT, NARROW, QUICK, network, texture, weights  # noqa: E402
+from keypointnet_helpers import ARCHITECTURES, COMPACT, FAR, NARROW, QUICK, network, texture, weights  # noqa: E402
 
 from vioframe.errors import ConfigError, PluginError  # noqa: E402
 from vioframe_keypointnet import runtimes  # noqa: E402
@@ -69,7 +69,7 @@ def test_one_runtime_takes_images_of_several_sizes(runtime):
         assert np.abs(heads - as_trained(net, image)[0][0]).max() < 1e-4
 
 
-@pytest.mark.parametrize("architecture", [COMPACT, QUICK, NARROW], ids=lambda a: a.name)
+@pytest.mark.parametrize("architecture", [COMPACT, QUICK, FAR, NARROW], ids=lambda a: a.name)
 def test_int8_is_near(architecture):
     pytest.importorskip("openvino")
     net = network(architecture)
@@ -82,7 +82,7 @@ def test_int8_is_near(architecture):
     assert max(errors) < INT8_ERROR[architecture.name]
 
 
-INT8_ERROR = {"compact": 0.13, "quick": 0.13, "full-x0.125": 0.22}
+INT8_ERROR = {"compact": 0.13, "quick": 0.13, "far": 0.13, "full-x0.125": 0.22}
 """The narrow network has twice as many layers that each add to the error, and half as many channels to average it."""
 
 
@@ -105,7 +105,7 @@ def test_places_are_those_of_the_trained_network():
     assert np.abs(np.stack(candidate_places(heads)) - found.xy[0].numpy()).max() < 1e-3
 
 
-@pytest.mark.parametrize("architecture", [COMPACT, QUICK], ids=lambda a: a.name)
+@pytest.mark.parametrize("architecture", [COMPACT, QUICK, FAR], ids=lambda a: a.name)
 def test_the_response_of_each_pixel_is_that_of_the_trained_network(architecture):
     (response, _), found = as_trained(network(architecture), texture())
     assert np.array_equal(by_pixels(response), torch.nn.functional.pixel_shuffle(found.response, 8)[0, 0].numpy())

@@ -5,7 +5,7 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from keypointnet_helpers import COMPACT, NARROW, PEAKS, texture  # noqa: E402
+from keypointnet_helpers import COMPACT, FAR, NARROW, PEAKS, texture  # noqa: E402
 
 from vioframe_keypointnet.network import locally_normalised  # noqa: E402
 from vioframe_keypointnet.seeing import CONTRAST_STEP, ZERO, Eye  # noqa: E402
@@ -22,7 +22,7 @@ def half_dark(shape, seed=0):
     return np.round(128 + (image - 128) * np.linspace(0.0, 2.0, shape[1])).clip(0, 255).astype(np.uint8)
 
 
-@pytest.mark.parametrize("architecture", [COMPACT, PEAKS], ids=lambda a: a.name)
+@pytest.mark.parametrize("architecture", [COMPACT, PEAKS, FAR], ids=lambda a: a.name)
 def test_local_contrast_is_that_of_training(architecture):
     eye = Eye(architecture, eight_bits=False)
     for shape in ((120, 160), (8, 8), (64, 24), (120, 160)):
@@ -33,12 +33,13 @@ def test_local_contrast_is_that_of_training(architecture):
         assert np.abs(found - expected).max() < 1e-4
 
 
-def test_eight_bits_are_the_nearest_step():
-    eye = Eye(COMPACT, eight_bits=True)
+@pytest.mark.parametrize("architecture", [COMPACT, FAR], ids=lambda a: a.name)
+def test_eight_bits_are_the_nearest_step(architecture):
+    eye = Eye(architecture, eight_bits=True)
     for shape in ((120, 160), (64, 24), (120, 160)):
         image = half_dark(shape, seed=1)
         image[4, 5] = 255  # farther out than 8 bits reach
-        expected = np.clip(in_training(COMPACT, image) / CONTRAST_STEP + ZERO, 0, 255)
+        expected = np.clip(in_training(architecture, image) / CONTRAST_STEP + ZERO, 0, 255)
         found = eye(image)
         assert found.dtype == np.uint8
         assert np.abs(found - expected).max() < 0.5 + 1e-3

@@ -140,7 +140,7 @@ def test_random_weights_come_by_explicit_wish_only_and_with_a_warning(caplog):
     assert "random weights" in caplog.text
     assert all(np.array_equal(first.tensors[name], second.tensors[name]) for name in COMPACT.shapes)
     assert set(first.activation_ranges) == set(COMPACT.ranged)
-    with pytest.raises(ConfigError, match=r"no network 'big'.*compact, full"):
+    with pytest.raises(ConfigError, match=r"no network 'big'.*compact, far, full"):
         weights_file.load("untrained:big")
 
 

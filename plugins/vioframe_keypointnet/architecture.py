@@ -49,8 +49,8 @@ class Architecture:
     """Channels of every layer.
 
     ``blocks`` are the encoder's four, at 1, 1/2, 1/4 and 1/8 of the resolution, each a tuple of the channels that its
-    3 x 3 convolutions give. A network of peaks has an empty first block: it folds 2 x 2 pixels into channels instead,
-    which loses nothing and saves the costliest layers. ``image_channels`` is 3 (RGB) or 1 (grey).
+    3 x 3 convolutions give. A network of peaks has an empty first block: it folds squares of pixels into channels
+    instead, which loses nothing and saves the costliest layers. ``image_channels`` is 3 (RGB) or 1 (grey).
     """
 
     name: str
@@ -60,6 +60,9 @@ class Architecture:
     descriptor: PositiveInt
     response_kernel: Literal[1, 3] = 3
     """Side of the kernel that gives the response of a network of peaks."""
+    folded_px: Literal[2, 4] = 2
+    """Side of the squares that a network of peaks folds: twice as large, its layers see twice as far at a quarter of
+    the cost."""
 
     def widened(self, factor: float) -> Architecture:
         """With ``factor`` times the channels in every layer."""
@@ -81,7 +84,11 @@ class Architecture:
     @property
     def fold(self) -> int:
         """Side of the squares of pixels that become channels of one place."""
-        return 2 if self.peaks else 1
+        return self.folded_px if self.peaks else 1
+
+    def halves(self, block: int) -> bool:
+        """Whether the resolution is halved before the ``block``; that of 4 x 4 pixels folded is as low already."""
+        return (block, self.fold) != (3, 4)
 
     @property
     def encoder(self) -> dict[int, tuple[Layer, ...]]:
@@ -141,4 +148,6 @@ FULL = Architecture("full", 3, ((32, 32), (64, 64), (128, 128), (256, 256)), 256
 """The published network (Tang et al., ICLR 2020)."""
 COMPACT = Architecture("compact", 1, ((), (16, 16, 16), (32,), (64,)), 64, 64)
 QUICK = Architecture("quick", 1, ((), (16, 16), (32,), (64,)), 64, 64, response_kernel=1)
-ARCHITECTURES = {architecture.name: architecture for architecture in (FULL, COMPACT, QUICK)}
+FAR = Architecture("far", 1, ((), (32,) * 6, (32,), (64,)), 64, 64, folded_px=4)
+"""Sees 28 px about a pixel, where ``compact`` sees 8: beyond the patch that is followed."""
+ARCHITECTURES = {architecture.name: architecture for architecture in (FULL, COMPACT, QUICK, FAR)}

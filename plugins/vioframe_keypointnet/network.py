@@ -73,7 +73,7 @@ class KeypointNet(nn.Module):
         """What is needed to choose keypoints of ``grey`` (B, 1, H, W) in [0, 1]; OpenVINO's graph gives the same.
 
         (B, 3, H/8, W/8), before sigmoid and tanh, the score, x and y of each cell; of a network of peaks
-        (B, H/2, W/2, 4), the response of 2 x 2 pixels, row by row. Then, if asked for, (B, D, H/4, W/4) descriptors,
+        (B, H/f, W/f, f^2), the response of f x f pixels, row by row. Then, if asked for, (B, D, H/4, W/4) descriptors,
         not normalised.
         """
         peaks = self.architecture.peaks
@@ -102,7 +102,7 @@ class KeypointNet(nn.Module):
         for number, layers in self.architecture.encoder.items():
             if number > blocks:
                 break
-            if after:
+            if after and self.architecture.halves(number):
                 x = self.pool(x)
             for layer in layers:
                 x = self.act(self._conv(layer.name, x))

@@ -44,8 +44,8 @@ class TrainingOptions:
     Raises :class:`ConfigError` where they do not fit together.
     """
 
-    network: Literal["full", "compact", "quick"] = "compact"
-    """full (as published), compact or quick."""
+    network: Literal["full", "compact", "quick", "far"] = "compact"
+    """full (as published), compact, quick, or far, which sees farther about a pixel."""
     width: PositiveFloat = 1.0
     """Factor on the channels of every layer."""
     target: Target = "repeatability"
@@ -92,7 +92,8 @@ class TrainingOptions:
         if self.target != "repeatability":
             if not self.architecture.peaks:
                 raise ConfigError(
-                    f"the network {self.network} says nothing of a pixel; target={self.target} needs compact or quick"
+                    f"the network {self.network} says nothing of a pixel; target={self.target} needs compact, quick or "
+                    "far"
                 )
             if self.lesson_epochs or self.descriptors_only:
                 raise ConfigError(

@@ -27,25 +27,27 @@ class Eye:
     """Sees images whose sides are multiples of 8; what it gives stays as it is until the next image.
 
     The grey levels themselves, (1, H, W); for a network of peaks the local contrast of
-    :func:`vioframe_keypointnet.network.locally_normalised`, 2 x 2 pixels folded, (4, H/2, W/2), or, in ``eight_bits``,
-    steps of :data:`CONTRAST_STEP` from :data:`ZERO`.
+    :func:`vioframe_keypointnet.network.locally_normalised`, f x f pixels folded, (f^2, H/f, W/f), or, in
+    ``eight_bits``, steps of :data:`CONTRAST_STEP` from :data:`ZERO`.
     """
 
     def __init__(self, architecture: Architecture, *, eight_bits: bool) -> None:
-        self._peaks, self._eight_bits = architecture.peaks, eight_bits
+        self._fold, self._eight_bits = architecture.fold, eight_bits
         self._make_room(0, 0)
 
     def _make_room(self, rows: int, columns: int) -> None:
         """Arrays for images of one size: as new ones each time they would take longer than what fills them."""
         self._contrast, self._steps = np.empty((rows, columns), np.float32), np.empty((rows, columns), np.uint8)
-        self._seen = np.empty((4, rows // 2, columns // 2), np.uint8 if self._eight_bits else np.float32)
+        f = self._fold
+        self._seen = np.empty((f * f, rows // f, columns // f), np.uint8 if self._eight_bits else np.float32)
         self._coarse, self._means = (np.empty((rows // COARSE_PX, columns // COARSE_PX), np.float32) for _ in range(2))
         self._around = np.empty((rows // COARSE_PX, columns), np.float32)
 
     def __call__(self, image: Image) -> Floats | Image:
-        if not self._peaks:
+        if self._fold == 1:
             return image[None]
         rows, columns = image.shape
+        f = self._fold
         if image.shape != self._contrast.shape:
             self._make_room(rows, columns)
         _means(image, self._coarse)
@@ -53,13 +55,13 @@ class Eye:
         _divide(self._contrast, self._smoothed(), _FAINT)
         if self._eight_bits:
             _round(self._contrast, np.float32(1.0) / CONTRAST_STEP, self._steps)
-            # The two pixels of a row that one place holds are one whole number, of which a cast takes the lower half.
-            pairs = self._steps.view("<u2").reshape(rows // 2, 2, columns // 2).swapaxes(0, 1)
-            self._seen[0::2] = pairs
-            np.right_shift(pairs, 8, out=self._seen[1::2], casting="unsafe")
+            # The pixels of a row that one place holds are one whole number, of which a cast takes the lowest.
+            places = self._steps.view(f"<u{f}").reshape(rows // f, f, columns // f).swapaxes(0, 1)
+            for k in range(f):
+                np.right_shift(places, 8 * k, out=self._seen[k::f], casting="unsafe")
         else:
-            by_place = self._contrast.reshape(rows // 2, 2, columns // 2, 2).transpose(1, 3, 0, 2)
-            self._seen.reshape(2, 2, rows // 2, columns // 2)[:] = by_place
+            by_place = self._contrast.reshape(rows // f, f, columns // f, f).transpose(1, 3, 0, 2)
+            self._seen.reshape(f, f, rows // f, columns // f)[:] = by_place
         return self._seen
 
     def _smoothed(self) -> Floats:

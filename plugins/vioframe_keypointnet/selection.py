@@ -6,7 +6,7 @@ keypoints (:func:`peaks`).
 
 from __future__ import annotations
 
-from math import ceil
+from math import ceil, isqrt
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,10 +21,13 @@ OFFSET_PX = 2.0 * (CELL_PX - 1) / 2
 
 _CONTRAST_REACH_PX = 8
 """Half the side of the window in which the image must vary for a keypoint to be there."""
-_PIXELS_A_POINT = 12
-"""So many of the highest pixels are looked at for each point that is wanted, before all are."""
+_PIXELS_A_POINT = (12, 60)
+"""So many of the highest pixels are looked at for each point that is wanted, then so many, before all are."""
 _EVERY = 7
 """Of rows and of columns, one in so many is looked at to find the bound that these exceed."""
+
+_ROW_OF = {2: np.float64, 4: np.complex128}
+"""Numbers as large as so many floats."""
 
 Array = NDArray[np.float32]
 
@@ -68,14 +71,14 @@ def candidate_places(heads: Array) -> tuple[Array, Array]:
 def peaks(
     found: Array, image: Image, shape: tuple[int, int], max_points: int, rules: KeypointNetOptions
 ) -> tuple[Array, Array]:
-    """``xy`` (N, 2) px and ``score`` (N,) in (0, 1), strongest first, of the peaks of ``found`` (H/2, W/2, 4).
+    """``xy`` (N, 2) px and ``score`` (N,) in (0, 1), strongest first, of the peaks of ``found`` (H/f, W/f, f^2).
 
     A peak is the highest of all pixels nearer than ``nms_px`` along both axes, of equals the first row by row; its
     place is that of the parabolas through it and its neighbours. Not taken: what :func:`select` leaves.
     """
     response, reach = by_pixels(found), max(ceil(rules.nms_px) - 1, 1)
     # The highest pixels nearly always hold enough peaks; to look at and to sort all takes several times as long.
-    for above in (_exceeded_by(response, _PIXELS_A_POINT * max_points), -np.inf):
+    for above in (*(_exceeded_by(response, pixels * max_points) for pixels in _PIXELS_A_POINT), -np.inf):
         at = _peaks(response, np.float32(above), reach)
         at = at[np.argsort(-response[at[:, 1], at[:, 0]], kind="stable")]
         at = at[_first_varied(image, at, shape[0], shape[1], rules.min_contrast, max_points)]
@@ -90,11 +93,12 @@ def peaks(
 
 
 def by_pixels(found: Array) -> Array:
-    """(H, W) of (H/2, W/2, 4), the values of 2 x 2 pixels, row by row."""
-    h, w, _ = found.shape
-    # Two of a row are moved as one: twice as fast.
-    pairs = np.ascontiguousarray(found).view(np.float64).swapaxes(1, 2)
-    return np.ascontiguousarray(pairs).reshape(2 * h, w).view(np.float32)
+    """(H, W) of (H/f, W/f, f^2), the values of f x f pixels, row by row; f is 2 or 4."""
+    h, w, values = found.shape
+    f = isqrt(values)
+    # The pixels of a row that one place holds are moved as one number, which is several times as fast.
+    rows = np.ascontiguousarray(found).view(_ROW_OF[f]).swapaxes(1, 2)
+    return np.ascontiguousarray(rows).reshape(f * h, w).view(np.float32)
 
 
 def describe(descriptors: Array, xy: Array) -> Array:

@@ -185,7 +185,8 @@ assert {*_TARGETS, "repeatability"} == {*get_args(Target)}
 
 def responses(network: KeypointNet, images: Tensor) -> Tensor:
     """(B, H, W) the response of a network of peaks to each pixel of ``images`` (B, 1, H, W) in [0, 1]."""
-    return pixel_shuffle(network.found(images, descriptors=False)[0].permute(0, 3, 1, 2), 2)[:, 0]
+    response = network.found(images, descriptors=False)[0].permute(0, 3, 1, 2)
+    return pixel_shuffle(response, network.architecture.fold)[:, 0]
 
 
 class Told(NamedTuple):
@@ -207,11 +208,17 @@ def told(pictures: Sequence[Followed], options: TrainingOptions, step: int) -> T
     for number, picture in enumerate(pictures[k] for k in rng.integers(len(pictures), size=options.batch)):
         rows, columns = picture.pixels.shape
         top, left = rng.integers(0, rows - height + 1), rng.integers(0, columns - width + 1)
-        crops.append(picture.pixels[top : top + height, left : left + width])
+        crop = picture.pixels[top : top + height, left : left + width]
         score, enough = wanted(options.target, picture)
         xy = picture.xy - np.array([left, top], np.float32)
         seen = enough & (xy >= _EDGE_PX).all(axis=1) & (xy < np.array(options.size) - _EDGE_PX).all(axis=1)
         x, y = np.rint(xy[seen]).astype(np.int64).T
+        # What becomes of a patch does not depend on its being mirrored.
+        if rng.random() < 0.5:
+            crop, x = crop[:, ::-1], width - 1 - x
+        if rng.random() < 0.5:
+            crop, y = crop[::-1], height - 1 - y
+        crops.append(crop)
         at.append(np.stack([np.full_like(x, number), y, x], axis=1))
         scores.append(score[seen].astype(np.float32))
     arrays = np.stack(crops)[:, None], np.concatenate(at), np.concatenate(scores)
