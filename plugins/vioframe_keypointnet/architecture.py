@@ -87,8 +87,8 @@ class Architecture:
         return self.folded_px if self.peaks else 1
 
     def halves(self, block: int) -> bool:
-        """Whether the resolution is halved before the ``block``; that of 4 x 4 pixels folded is as low already."""
-        return (block, self.fold) != (3, 4)
+        """Whether the resolution is halved before the ``block``, or folding has made it as low already."""
+        return 2 ** (block - 1) > self.fold
 
     @property
     def encoder(self) -> dict[int, tuple[Layer, ...]]:

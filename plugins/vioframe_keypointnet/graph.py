@@ -68,7 +68,7 @@ def model(weights: Weights, shape: tuple[int, int], *, descriptors: bool = False
     for number, layers in architecture.encoder.items():
         if number > 2 and architecture.peaks and not descriptors:
             break
-        if after and architecture.halves(number):
+        if architecture.halves(number):
             x = x._replace(node=ops.max_pool(x.node, [2, 2], [1, 1], [0, 0], [0, 0], [2, 2]).output(0))
         for k, layer in enumerate(layers):
             convolution = _convolution(tensors, layer.name)

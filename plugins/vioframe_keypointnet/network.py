@@ -102,7 +102,7 @@ class KeypointNet(nn.Module):
         for number, layers in self.architecture.encoder.items():
             if number > blocks:
                 break
-            if after and self.architecture.halves(number):
+            if self.architecture.halves(number):
                 x = self.pool(x)
             for layer in layers:
                 x = self.act(self._conv(layer.name, x))

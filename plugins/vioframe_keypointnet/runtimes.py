@@ -129,8 +129,8 @@ def _by_cuda(weights: Weights, descriptors: bool, half: bool) -> Run:
             return [output[0].contiguous() for output in network.found(grey, descriptors=descriptors)]
 
         aside, graph = torch.cuda.Stream(), torch.cuda.CUDAGraph()
-        # In full precision TF32 would round to ten bits; the quickest of cuDNN's algorithms is found by trying them.
-        with torch.inference_mode(), torch.backends.cudnn.flags(enabled=True, benchmark=True, allow_tf32=half):
+        # In full precision TF32 would round to ten bits. To try cuDNN's algorithms one after the other gains nothing.
+        with torch.inference_mode(), torch.backends.cudnn.flags(enabled=True, allow_tf32=half):
             with torch.cuda.stream(aside):
                 for _ in range(3):
                     warm = work()

@@ -225,11 +225,12 @@ def told(pictures: Sequence[Followed], options: TrainingOptions, step: int) -> T
     return Told(*map(torch.from_numpy, arrays))
 
 
-def followed_losses(network: KeypointNet, told: Told, precision: TrainingPrecision = "float32") -> dict[str, Tensor]:
+def followed_losses(network: KeypointNet, batch: Told, precision: TrainingPrecision = "float32") -> dict[str, Tensor]:
     """Cross entropy of what the network says of points from what became of them."""
-    with torch.autocast(told.crops.device.type, torch.bfloat16, enabled=precision == "bfloat16"):
-        said = responses(network, told.crops / 255.0)
-    loss = binary_cross_entropy_with_logits(said[tuple(told.at.T)], told.score) if len(told.at) else said.sum() * 0.0
+    with torch.autocast(batch.crops.device.type, torch.bfloat16, enabled=precision == "bfloat16"):
+        said = responses(network, batch.crops / 255.0)
+    at, score = tuple(batch.at.T), batch.score
+    loss = binary_cross_entropy_with_logits(said[at], score) if len(score) else said.sum() * 0.0
     return {"followed": loss, "total": loss}
 
 

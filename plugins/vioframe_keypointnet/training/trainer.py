@@ -179,20 +179,23 @@ class Training:
                 group["lr"] = rate
             # Dropout, too, depends on the number of the step alone.
             torch.manual_seed(int(np.random.default_rng([self.options.seed, 3, self.step]).integers(2**62)))
-            values = self._losses(made_ready, taught=epoch < self.options.lesson_epochs)
+            values = self._losses(made_ready, taught=self._taught(self.step))
             self._optimiser.zero_grad(set_to_none=True)
             values["total"].backward()  # type: ignore[no-untyped-call]
             self._optimiser.step()
             self.step += 1
             yield {name: float(value.detach()) for name, value in values.items()}
 
+    def _taught(self, step: int) -> bool:
+        """Whether it belongs to the lessons."""
+        return step // self.epoch_steps < self.options.lesson_epochs
+
     def _made_ready(self) -> Iterator[Any]:
         """What each step to come is trained on; a step's depends on nothing but its number."""
-        samples = _Samples(self._pictures, self.options, self.epoch_steps)
-        to_come = range(self.step, self.total_steps)
+        to_come = ((step, self._taught(step)) for step in range(self.step, self.total_steps))
         return iter(
             DataLoader(
-                samples,
+                _Samples(self._pictures, self.options),
                 batch_size=None,
                 sampler=to_come,
                 num_workers=self.options.workers,
@@ -282,14 +285,13 @@ class _Samples(Dataset[Any]):
 
     pictures: Sequence[Picture]
     options: TrainingOptions
-    epoch_steps: int
 
-    def __getitem__(self, step: int) -> Any:
-        options = self.options
-        if options.target != "repeatability":
-            return told(cast(Sequence[Followed], self.pictures), options, step)
-        taught = step // self.epoch_steps < options.lesson_epochs and not options.descriptors_only
-        return batch(self.pictures, options, step, corners_taught=taught)
+    def __getitem__(self, key: tuple[int, bool]) -> Any:
+        """Of the step with a number, and whether it belongs to the lessons."""
+        step, taught = key
+        if self.options.target != "repeatability":
+            return told(cast(Sequence[Followed], self.pictures), self.options, step)
+        return batch(self.pictures, self.options, step, corners_taught=taught and not self.options.descriptors_only)
 
 
 def _on_one_thread(_: int) -> None:
