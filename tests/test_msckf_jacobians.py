@@ -5,11 +5,19 @@ import copy
 import numpy as np
 import pytest
 from msckf_helpers import CALIBRATION, STEREO, random_covariance, seeing_state, sighting_rows
+from scipy.linalg import null_space
 from scipy.stats import chi2
 
 from vioframe.geometry import so3
 from vioframe.geometry.cameras import Camera, intrinsics_of
-from vioframe_msckf.measurement import Window, landmark_blocks, mahalanobis, observations, reduce_landmark, track_rows
+from vioframe_msckf.measurement import (
+    Window,
+    distance_and_variances,
+    landmark_blocks,
+    observations,
+    reduce_landmark,
+    track_rows,
+)
 from vioframe_msckf.options import MsckfOptions
 from vioframe_msckf.state import IMU, OFFSET, READOUT
 from vioframe_msckf.updates import PointNoise, promote_tracks
@@ -150,26 +158,46 @@ def test_reduction_is_orthogonal_and_frees_the_rows_below_the_third(views):
     assert np.abs(np.diag(H_f)).min() > 0.1
 
 
-def test_mahalanobis_distance():
+def test_distance_of_a_track_is_that_of_what_is_free_of_the_landmark():
     rng = np.random.default_rng(1)
-    H, P, residual = rng.normal(size=(7, 12)), random_covariance(rng, 12), rng.normal(size=7)
-    expected = residual @ np.linalg.inv(H @ P @ H.T + 0.3 * np.eye(7)) @ residual
-    assert mahalanobis(H, residual, P, 0.3) == pytest.approx(expected, rel=1e-12)
+    S, H_f, residual = random_covariance(rng, 10), rng.normal(size=(10, 3)), rng.normal(size=10)
+    free = null_space(H_f.T)
+    expected = residual @ free @ np.linalg.inv(free.T @ (S + 0.3 * np.eye(10)) @ free) @ free.T @ residual
+    assert distance_and_variances(S, H_f, residual, 0.3, 1.0)[0] == pytest.approx(expected, rel=1e-9)
 
 
-def test_delayed_initialisation_is_the_joint_update_with_nothing_known_of_the_landmark():
+def test_sightings_that_do_not_fit_get_cauchys_variance():
+    rng = np.random.default_rng(2)
+    S, H_f, residual = random_covariance(rng, 10), rng.normal(size=(10, 3)), rng.normal(size=10)
+    residual[4:6] += 20.0
+    free = null_space(H_f.T)
+    left, expected = free @ free.T @ residual, free @ free.T @ (S + 0.3 * np.eye(10)) @ free @ free.T
+    squared = (left.reshape(5, 2) ** 2).sum(axis=1) / np.diag(expected).reshape(5, 2).mean(axis=1)
+    for cauchy in (0.5, 2.0):
+        _, variances = distance_and_variances(S, H_f, residual, 0.3, cauchy)
+        np.testing.assert_allclose(variances, 0.3 * (1.0 + squared / cauchy**2), rtol=1e-9)
+    assert variances.argmax() == 2
+    # Moving the landmark is no misfit.
+    moved = residual + H_f @ np.array([50.0, -20.0, 30.0])
+    np.testing.assert_allclose(distance_and_variances(S, H_f, moved, 0.3, 2.0)[1], variances, rtol=1e-6)
+
+
+@pytest.mark.parametrize("cauchy", [0.5, 1e6])
+def test_delayed_initialisation_is_the_joint_update_with_nothing_known_of_the_landmark(cauchy):
     state, table = seeing_state()
-    options, noise = MsckfOptions(), PointNoise(0.5, 1.4)
+    options, noise = MsckfOptions(cauchy_sigmas=cauchy), PointNoise(0.5, 1.4)
     row = np.flatnonzero(table.seen.all(axis=1))[0]
     _, p_WF, H, H_f, residual = rows_of(table, row, Window.of(state, True), noise.px)
     # In information form the landmark's prior is exactly nothing.
     n = len(state.cov)
     joint = np.zeros((len(residual), n + 3))
     joint[:, IMU:n], joint[:, n:] = H, H_f
-    information = joint.T @ joint / noise.px**2
+    S = H @ state.cov[IMU:, IMU:] @ H.T
+    variances = np.repeat(distance_and_variances(S, H_f, residual, noise.px**2, cauchy)[1], 2)
+    information = joint.T @ (joint / variances[:, None])
     information[:n, :n] += np.linalg.inv(state.cov)
     cov = np.linalg.inv(information)
-    dx = cov @ joint.T @ residual / noise.px**2
+    dx = cov @ joint.T @ (residual / variances)
 
     before = copy.deepcopy(state)
     gate = chi2.ppf(0.999999, np.arange(1, 40))

@@ -49,13 +49,14 @@ class Recorder:
     def attach(self, monkeypatch: pytest.MonkeyPatch) -> None:
         for name in ("propagate", "augment_clone", "add_landmark", "update", "innovation", "_delete"):
             monkeypatch.setattr(FilterState, name, self._wrapped(name, getattr(FilterState, name)))
-        reduce_landmark = updates.reduce_landmark
+        reduced_track = updates.reduced_track
 
-        def reduce(H: Float, H_f: Float, residual: Float) -> None:
-            reduce_landmark(H, H_f, residual)
-            self._reduced = H.copy(), H_f.copy()
+        def reduced(*arguments):
+            ok, p_WF, H, H_f, residual, distance = reduced_track(*arguments)
+            self._reduced = H, H_f
+            return ok, p_WF, H, H_f, residual, distance
 
-        monkeypatch.setattr(updates, "reduce_landmark", reduce)
+        monkeypatch.setattr(updates, "reduced_track", reduced)
 
     def _wrapped(self, name, original):
         before = getattr(self, f"_{name.strip('_')}")

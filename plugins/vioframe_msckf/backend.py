@@ -26,7 +26,7 @@ from vioframe_msckf.updates import (
 )
 
 # Times that the noise of points is taken for larger than it is at least, until tracks tell.
-_NOISE_AT_FIRST = 1.4
+_NOISE_AT_FIRST = 3.5
 
 
 class Msckf:

@@ -198,16 +198,56 @@ def reduce_landmark(H, H_f, residual):
 
 
 @kernel
-def mahalanobis(H, residual, P, variance):
-    """residual^T (H P H^T + variance I)^-1 residual."""
-    S = H @ P @ H.T
-    for i in range(len(S)):
+def distance_and_variances(S, H_f, residual, variance, cauchy):
+    """Of M sightings of one landmark the squared Mahalanobis distance from agreeing, and (M,) variances to use, px^2.
+
+    ``S`` (2 M, 2 M) is the covariance of ``residual`` (2 M,) by that of the state, to which come ``variance`` on the
+    diagonal, and anything along ``H_f`` (2 M, 3), as nothing is known of the landmark. A sighting that is off by e
+    standard deviations, of what is left when the landmark is where all agree best, gets 1 + (e / ``cauchy``)^2 times
+    the ``variance``: Cauchy's loss.
+    """
+    m = len(residual)
+    S = S.copy()
+    for i in range(m):
         S[i, i] += variance
-    return residual @ np.linalg.solve(S, residual)
+    rows = np.column_stack((H_f, residual))
+    information = rows.T @ np.linalg.solve(S, rows)
+    along = information[3, :3]
+    distance = information[3, 3] - along @ np.linalg.solve(information[:3, :3], along)
+    # The landmark taken out by least squares.
+    rest = np.eye(m) - H_f @ np.linalg.solve(H_f.T @ H_f, np.ascontiguousarray(H_f.T))
+    left, expected = rest @ residual, ((rest @ S) * rest).sum(axis=1)
+    variances = np.empty(m // 2)
+    for i in range(m // 2):
+        x, y = left[2 * i], left[2 * i + 1]
+        squared = 2.0 * (x * x + y * y) / (expected[2 * i] + expected[2 * i + 1])
+        variances[i] = variance * (1.0 + squared / (cauchy * cauchy))
+    return distance, variances
 
 
 @kernel
-def msckf_rows(w, xy, xy_normalised, seen, P, pixel_sigma, gate):
+def reduced_track(w, xy, xy_normalised, seen, P, pixel_sigma, cauchy):
+    """One track (C,): whether it was triangulated, p_WF, H, H_f, residual, and its squared Mahalanobis distance.
+
+    Below the third row there is no landmark. ``P`` is the covariance of the columns of H, [cameras, clones]; the noise
+    of all rows is white with ``pixel_sigma``, to which those of sightings that do not fit are scaled.
+    """
+    ok, p_WF, H, H_f, residual = track_rows(w, xy, xy_normalised, seen, pixel_sigma)
+    distance = 0.0
+    if ok:
+        distance, variances = distance_and_variances(H @ P @ H.T, H_f, residual, pixel_sigma**2, cauchy)
+        for i in range(len(variances)):
+            scale = pixel_sigma / np.sqrt(variances[i])
+            for row in range(2 * i, 2 * i + 2):
+                H[row] *= scale
+                H_f[row] *= scale
+                residual[row] *= scale
+        reduce_landmark(H, H_f, residual)
+    return ok, p_WF, H, H_f, residual, distance
+
+
+@kernel
+def msckf_rows(w, xy, xy_normalised, seen, P, pixel_sigma, cauchy, gate):
     """Triangulate (F, C) tracks, linearise them, project out the landmarks, and gate each at ``gate[dof]``.
 
     The stacked H and residual over [cameras, clones], whose covariance is ``P``; p_WF (F, 3); each one's Mahalanobis
@@ -221,13 +261,13 @@ def msckf_rows(w, xy, xy_normalised, seen, P, pixel_sigma, gate):
     verdict = np.empty(F, dtype=np.int64)
     rows = 0
     for f in range(F):
-        ok, p_WF[f], H, H_f, residual = track_rows(w, xy[f], xy_normalised[f], seen[f], pixel_sigma)
+        ok, p_WF[f], H, _, residual, distances[f] = reduced_track(
+            w, xy[f], xy_normalised[f], seen[f], P, pixel_sigma, cauchy
+        )
         if not ok:
             verdict[f] = NOT_TRIANGULATED
             continue
-        reduce_landmark(H, H_f, residual)
         H, residual = H[3:], residual[3:]
-        distances[f] = mahalanobis(H, residual, P, pixel_sigma**2)
         if distances[f] > gate[len(residual)]:
             verdict[f] = GATED
             continue

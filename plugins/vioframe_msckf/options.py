@@ -20,8 +20,10 @@ class MsckfOptions:
     """Long-lived landmarks kept in the state; 0 makes this a pure MSCKF."""
     landmark_drift_px: NonNegativeFloat = 0.1
     """How far a followed point slides off its landmark from one frame to the next, px; 0 where noise is white."""
-    pixel_sigma: PositiveFloat = 0.7
+    pixel_sigma: PositiveFloat = 0.3
     """Standard deviation of a tracked feature's position, px, at least; more is found where tracks fit worse."""
+    cauchy_sigmas: PositiveFloat = 1.0
+    """Where Cauchy's robust loss begins to discount an observation, standard deviations."""
     gate_quantile: Annotated[float, Field(gt=0.0, lt=1.0)] = 0.95
     """Quantile of the chi2 distribution below which a feature's residual is accepted."""
     first_estimate_jacobians: bool = True

@@ -16,10 +16,8 @@ from vioframe_msckf.measurement import (
     ACCEPTED,
     Window,
     landmark_blocks,
-    mahalanobis,
     msckf_rows,
-    reduce_landmark,
-    track_rows,
+    reduced_track,
 )
 from vioframe_msckf.options import MsckfOptions
 from vioframe_msckf.state import IMU, FilterState, compress
@@ -91,6 +89,7 @@ def update_from_tracks(
         observations.seen[rows],
         np.ascontiguousarray(state.cov[columns, columns]),
         point_noise.px,
+        options.cauchy_sigmas,
         gate,
     )
     if len(residual):
@@ -153,8 +152,12 @@ def update_from_landmarks(
     blocks, residual = landmark_blocks(
         state, newest, landmarks, cameras, tracks.xy[rows], options.first_estimate_jacobians
     )
-    HP, S = state.innovation(newest, landmarks, cameras, blocks, point_noise.px**2)
-    accepted = distances(S, residual) < gate[2]
+    variance = point_noise.px**2
+    HP, S = state.innovation(newest, landmarks, cameras, blocks, variance)
+    squares = distances(S, residual)
+    accepted = squares < gate[2]
+    # Cauchy's loss, as for tracks.
+    S[np.diag_indices(len(S))] += np.repeat(variance / options.cauchy_sigmas**2 * squares, 2)
     if accepted.any():
         use = np.repeat(accepted, 2)
         state.update_by(HP[use], S[np.ix_(use, use)], residual[use])
@@ -183,15 +186,20 @@ def promote_tracks(
     for row in rows:
         # Every promotion updates the state, so each is linearised at the estimate the last one left.
         window = Window.of(state, options.first_estimate_jacobians)
-        ok, p_WF, H, H_f, residual = track_rows(
-            window, observations.xy[row], observations.xy_normalised[row], observations.seen[row], point_noise.px
+        columns = slice(IMU, state.landmarks_begin)
+        P = np.ascontiguousarray(state.cov[columns, columns])
+        ok, p_WF, H, H_f, residual, distance = reduced_track(
+            window,
+            observations.xy[row],
+            observations.xy_normalised[row],
+            observations.seen[row],
+            P,
+            point_noise.px,
+            options.cauchy_sigmas,
         )
         if not ok:
             continue
-        reduce_landmark(H, H_f, residual)
-        columns = slice(IMU, state.landmarks_begin)
-        P = np.ascontiguousarray(state.cov[columns, columns])
-        if mahalanobis(H[3:], residual[3:], P, variance) > gate[len(residual) - 3]:
+        if distance > gate[len(residual) - 3]:
             used.append(row)
             continue
         T_inverse = np.linalg.inv(H_f[:3])
