@@ -67,7 +67,7 @@ def run(folder: Path, text: str, data: Path | None, *, out: str = "results", **h
             progress.append(label)
             costs.append(cost_s)
 
-        sweep.run(on_progress=on_progress, **{"workers": 2, **how})
+        sweep.run(on_progress=on_progress, **{"workers": 1, **how})
     assert sum(costs) == pytest.approx(cost_s)
     return sweep, progress, store.path
 
@@ -91,7 +91,7 @@ def unreliable(folder: Path, how: str, times: int) -> str:
 @pytest.mark.usefixtures("parts")
 class TestSweep:
     def test_every_task_leaves_what_the_report_needs(self, tmp_path, toy):
-        outcome, progress, path = run(tmp_path, GRID, toy)
+        outcome, progress, path = run(tmp_path, GRID, toy, workers=2)
         assert (outcome.done, outcome.reused, outcome.failed) == (4, 0, {})
         assert len(progress) == 4
         results = load_results(path)
@@ -166,7 +166,7 @@ class TestSweep:
         assert run(tmp_path, unreliable(tmp_path, "fail", 9), toy)[0].reused == 2
 
     def test_a_worker_that_is_killed_loses_nothing(self, tmp_path, toy):
-        outcome, _, path = run(tmp_path, unreliable(tmp_path, "die", 1), toy)
+        outcome, _, path = run(tmp_path, unreliable(tmp_path, "die", 1), toy, workers=2)
         assert (outcome.done, outcome.failed) == (4, {})
         assert sorted(row["attempts"] for row in found(path)) == [1, 1, 1, 2]
         undisturbed = run(tmp_path, unreliable(tmp_path, "die", 1), toy, out="again")[2]
@@ -199,7 +199,7 @@ class TestSweep:
 @pytest.mark.usefixtures("parts")
 def test_a_simulated_recording_is_made_once_and_goes_when_it_is_no_longer_needed(tmp_path):
     text = GRID.replace("TOY", "{name: hover, duration_s: 0.5}") + "conditions: {noise: [0.5]}\n"
-    outcome, progress, path = run(tmp_path, text, tmp_path)
+    outcome, progress, path = run(tmp_path, text, tmp_path, workers=2)
     assert (outcome.done, outcome.failed) == (8, {})
     assert sum(label.endswith(" simulated") for label in progress) == 2
     assert not (path / "recordings").exists()
@@ -272,7 +272,7 @@ def test_detectors_are_timed_in_turns_in_this_process(tmp_path, toy):
 @pytest.mark.usefixtures("parts")
 def test_interrupted_by_ctrl_c_and_called_again_it_gives_what_it_would_have_given(tmp_path, toy):
     file = tmp_path / "toy.yaml"
-    file.write_text(GRID.replace("seeds: 2", "seeds: 4").replace("fast]", "fast, orb, akaze]"))
+    file.write_text(GRID.replace("seeds: 2", "seeds: 4"))
     command = [sys.executable, "-m", "vioframe", "bench", str(file), "--data", str(toy), "--no-report", "--quiet"]
     command += ["--workers", "1", "--out", str(tmp_path / "results")]
     process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, start_new_session=True)
@@ -284,9 +284,9 @@ def test_interrupted_by_ctrl_c_and_called_again_it_gives_what_it_would_have_give
     assert process.returncode == 130, stderr
     assert stderr.strip().splitlines() == ["vioframe: interrupted"]
     kept = len(read_rows(results))
-    assert 2 <= kept < 16
+    assert 2 <= kept < 8
     command.remove("--quiet")
     finished = subprocess.run(command, capture_output=True, text=True, check=True)
-    assert f"{16 - kept} tasks done, {kept} done before" in finished.stdout
+    assert f"{8 - kept} tasks done, {kept} done before" in finished.stdout
     whole = run(tmp_path, file.read_text(), toy, out="whole")[2]
     assert estimates(results) == estimates(whole)

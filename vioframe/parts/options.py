@@ -13,7 +13,7 @@ import textwrap
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from difflib import get_close_matches
-from functools import wraps
+from functools import cache, wraps
 from itertools import pairwise
 from typing import Annotated, Any, TypeVar, get_args, get_origin
 
@@ -53,7 +53,8 @@ class Option:
 def options_of(factory: Callable[..., Any], given: int = 0) -> list[Option]:
     """The options of ``factory``: its named parameters after the first ``given`` ones, which the framework fills in."""
     signature = inspect.signature(factory)
-    docs = _attribute_docs(getattr(factory, "options_type", factory))
+    owner = getattr(factory, "options_type", factory)
+    docs = _attribute_docs(owner) if isinstance(owner, type) else {}
     named = [p for p in signature.parameters.values() if p.kind in (p.POSITIONAL_OR_KEYWORD, p.KEYWORD_ONLY)]
     options = []
     for parameter in named[given:]:
@@ -71,23 +72,26 @@ def validate_options(
     Raises :class:`ConfigError`, showing the options there are, for an unknown, missing or unsuitable one.
     """
     table = {option.name: option for option in options_of(factory, given)}
-    offered = f"its options: {', '.join(map(str, table.values()))}" if table else "it has no options"
+
+    def offered() -> str:
+        return f"its options: {', '.join(map(str, table.values()))}" if table else "it has no options"
+
     for name in values:
         if name not in table:
-            raise ConfigError(f"{owner} has no option {shown(name)}{did_you_mean(name, table)}; {offered}")
+            raise ConfigError(f"{owner} has no option {shown(name)}{did_you_mean(name, table)}; {offered()}")
     complete = {}
     for name, option in table.items():
         if name not in values:
             if option.default is REQUIRED:
                 meaning = f" ({option.doc})" if option.doc else ""
-                raise ConfigError(f"{owner} needs the option {name!r}{meaning}: pass -o {name}=...; {offered}")
+                raise ConfigError(f"{owner} needs the option {name!r}{meaning}: pass -o {name}=...; {offered()}")
             complete[name] = option.default
             continue
         try:
             complete[name] = option.coerce(values[name])
         except ValidationError as error:
             reason = error.errors()[0]["msg"]
-            raise ConfigError(f"{owner}: {name}={shown(values[name])}: {reason}; {offered}") from error
+            raise ConfigError(f"{owner}: {name}={shown(values[name])}: {reason}; {offered()}") from error
     options_type = getattr(factory, "options_type", None)
     if options_type is not None:
         try:
@@ -152,11 +156,10 @@ def _annotated_doc(annotation: Any) -> str:
     return ""
 
 
-def _attribute_docs(owner: Any) -> dict[str, str]:
+@cache
+def _attribute_docs(owner: type) -> Mapping[str, str]:
     """The strings that follow the annotated attributes of a class, by attribute: Python itself does not keep them."""
     docs: dict[str, str] = {}
-    if not inspect.isclass(owner):
-        return docs
     for cls in reversed(owner.__mro__[:-1]):
         try:
             (definition,) = ast.parse(textwrap.dedent(inspect.getsource(cls))).body
