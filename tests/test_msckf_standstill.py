@@ -17,6 +17,7 @@ from vioframe.simulation import simulated_sequence
 from vioframe.simulation.flights import ShapedFlight, levelled
 from vioframe.types import DBA, DBG, DTHETA, DV, Estimate, FrameTracks, ImuNoise, ImuSegment, Status, g_W
 from vioframe_msckf.backend import Msckf
+from vioframe_msckf.options import MsckfOptions
 from vioframe_msckf.state import IMU
 from vioframe_msckf.updates import hold_still
 
@@ -32,6 +33,19 @@ def frame(t_s: float, xy, ids=None) -> FrameTracks:
     xy = np.asarray(xy, dtype=np.float64)
     ids = np.arange(len(xy)) if ids is None else np.asarray(ids)
     return FrameTracks(round(t_s * 1e9), ids, np.zeros(len(xy), np.int64), xy, 0.001 * xy)
+
+
+def test_what_noise_points_have_is_found_anew_after_a_standstill():
+    sequence = simulated_sequence("stop_and_go", pixel_sigma=0.1, duration_s=12.0)
+    backend = Msckf()
+    life = LifeCycle(backend, sequence.calibration)
+    least_px, px = MsckfOptions().pixel_sigma, {True: [], False: []}
+    for packet in sequence.packets:
+        estimate = life.process(*packet)
+        if estimate.state is not None:
+            px[held(estimate)].append(backend.point_noise.px)
+    assert min(px[True]) > 3.0 * least_px
+    assert min(px[False]) == least_px
 
 
 def test_standstill_does_not_drift_and_nothing_grows():

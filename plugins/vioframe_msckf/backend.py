@@ -60,6 +60,7 @@ class Msckf:
         options, state, observations, watch = self._options, self.state, self._observations, Stopwatch()
         point_noise, gate = self.point_noise, self._gate
         if still and hold_still(state, imu, self._noise_at_rest, options.first_estimate_jacobians):
+            point_noise.begin()
             watch.lap("standstill")
             return Estimate(
                 Status.TRACKING,

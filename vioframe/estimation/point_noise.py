@@ -18,7 +18,12 @@ class PointNoise:
     """
 
     def __init__(self, least_px: float, at_first: float) -> None:
-        self._least_px, self.px = least_px, at_first * least_px
+        self._least_px, self._at_first = least_px, at_first
+        self.begin()
+
+    def begin(self) -> None:
+        """Forget what was found; of a body at rest it says little about the flight to come."""
+        self.px = self._at_first * self._least_px
 
     def add(self, squares: Float, views: Int) -> None:
         """Go by what (N,) tracks are off by, seen by ``views`` (N,): sums of squares, in standard deviations.
