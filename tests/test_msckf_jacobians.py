@@ -10,6 +10,7 @@ from scipy.stats import chi2
 
 from vioframe.geometry import so3
 from vioframe.geometry.cameras import Camera, intrinsics_of
+from vioframe.types import FrameTracks
 from vioframe_msckf.measurement import (
     Window,
     distance_and_variances,
@@ -20,7 +21,7 @@ from vioframe_msckf.measurement import (
 )
 from vioframe_msckf.options import MsckfOptions
 from vioframe_msckf.state import IMU, OFFSET, READOUT
-from vioframe_msckf.updates import PointNoise, promote_tracks
+from vioframe_msckf.updates import PointNoise, promote_tracks, update_from_landmarks
 
 NOISE = PointNoise(0.7, 1.4)
 CAMERAS = {
@@ -209,6 +210,47 @@ def test_delayed_initialisation_is_the_joint_update_with_nothing_known_of_the_la
     np.testing.assert_allclose(so3.log(before.R_WB.T @ state.R_WB), dx[:3], atol=1e-9)
     np.testing.assert_allclose(state.clones.p_WB, before.clones.p_WB + dx[30:n].reshape(-1, 6)[:, 3:], atol=1e-9)
     assert state.landmark_ids.tolist() == [table.ids[row]]
+
+
+@pytest.mark.parametrize("cauchy", [0.5, 1e6])
+def test_a_landmark_that_does_not_fit_is_discounted_and_gated_as_it_is(cauchy):
+    """Of four landmarks one is off by two standard deviations, and one by four, more than the gate lets pass."""
+    state, table = seeing_state()
+    full = np.flatnonzero(table.seen.all(axis=1))[:4]
+    for row in full:
+        _, p_WF, *_ = rows_of(table, row, Window.of(state, True), 1.0)
+        state.add_landmark(int(table.ids[row]), p_WF, p_WF, np.zeros((3, len(state.cov))), 0.01**2 * np.eye(3))
+    options, noise = MsckfOptions(cauchy_sigmas=cauchy, landmark_drift_px=0.0), PointNoise(0.5, 1.0)
+    index, first, newest = np.arange(4), np.zeros(4, np.int64), len(state.clones) - 1
+    xy = table.xy[full, -1].copy()
+
+    def measured():
+        blocks, residual = landmark_blocks(state, newest, index, first, xy, True)
+        H = sighting_rows(state, newest, index, first, blocks)
+        S = H @ state.cov @ H.T + noise.px**2 * np.eye(8)
+        pairs = S.reshape(4, 2, 4, 2)[index, :, index]
+        return (
+            H,
+            residual,
+            np.einsum("ia,iab,ib->i", residual.reshape(4, 2), np.linalg.inv(pairs), residual.reshape(4, 2)),
+        )
+
+    H, residual, _ = measured()
+    xy -= residual.reshape(4, 2)
+    spread = np.sqrt(np.einsum("ij,jk,ik->i", H, state.cov, H) + noise.px**2)
+    xy[1, 0], xy[3, 1] = xy[1, 0] + 2.0 * spread[2], xy[3, 1] + 4.0 * spread[7]
+    H, residual, squares = measured()
+    fits = np.repeat([True, True, True, False], 2)
+    H, residual, R = H[fits], residual[fits], np.repeat(noise.px**2 * (1.0 + squares / cauchy**2), 2)[fits]
+    gain = state.cov @ H.T @ np.linalg.inv(H @ state.cov @ H.T + np.diag(R))
+    cov, p_WB = state.cov - gain @ H @ state.cov, state.p_WB + (gain @ residual)[3:6]
+
+    seen = FrameTracks(0, table.ids[full], first, xy, xy)
+    gate = np.r_[0.0, chi2.ppf(0.95, np.arange(1, 40))]
+    assert update_from_landmarks(state, seen, seen.ids, options, noise, gate) == 3
+    assert state.landmark_ids.tolist() == table.ids[full[:3]].tolist()
+    np.testing.assert_allclose(state.cov, cov[: len(state.cov), : len(state.cov)], atol=1e-9 * np.abs(cov).max())
+    np.testing.assert_allclose(state.p_WB, p_WB, atol=1e-9)
 
 
 def test_delayed_initialisation_is_gated_by_two_rows_a_view_but_for_the_three_of_the_landmark():

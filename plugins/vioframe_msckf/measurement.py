@@ -199,12 +199,11 @@ def reduce_landmark(H, H_f, residual):
 
 @kernel
 def distance_and_variances(S, H_f, residual, variance, cauchy):
-    """Of M sightings of one landmark the squared Mahalanobis distance from agreeing, and (M,) variances to use, px^2.
+    """Of M sightings of one landmark their squared Mahalanobis distance, and (M,) variances to take them with, px^2.
 
-    ``S`` (2 M, 2 M) is the covariance of ``residual`` (2 M,) by that of the state, to which come ``variance`` on the
-    diagonal, and anything along ``H_f`` (2 M, 3), as nothing is known of the landmark. A sighting that is off by e
-    standard deviations, of what is left when the landmark is where all agree best, gets 1 + (e / ``cauchy``)^2 times
-    the ``variance``: Cauchy's loss.
+    Of their ``residual`` (2 M,) the state leaves ``S`` (2 M, 2 M) unsure, the landmark anything along ``H_f`` (2 M, 3),
+    and ``variance`` is that of the noise. What is left when the landmark is where all agree best may be off by e of its
+    standard deviations; a sighting then has 1 + (e / ``cauchy``)^2 times the ``variance``: Cauchy's loss.
     """
     m = len(residual)
     S = S.copy()
