@@ -36,7 +36,8 @@ def frame(t_s: float, xy, ids=None) -> FrameTracks:
 
 
 def test_what_noise_points_have_is_found_anew_after_a_standstill():
-    sequence = simulated_sequence("stop_and_go", pixel_sigma=0.1, duration_s=12.0)
+    """It sets off at 4 s and stands again at 13 s."""
+    sequence = simulated_sequence("stop_and_go", pixel_sigma=0.1, duration_s=14.0)
     backend = Msckf()
     life = LifeCycle(backend, sequence.calibration)
     least_px, px = MsckfOptions().pixel_sigma, {True: [], False: []}
