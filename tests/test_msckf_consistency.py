@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -14,7 +15,7 @@ from vioframe.bench import BackendRun, run_backend
 from vioframe.estimation.options import EstimationOptions
 from vioframe.geometry import so3
 from vioframe.simulation import TrackSequence, simulated_sequence
-from vioframe.types import Calibration, CameraOnBody, Float
+from vioframe.types import Calibration, CameraOnBody, Float, FrameTracks
 from vioframe_msckf import backend as backend_module
 from vioframe_msckf import updates
 from vioframe_msckf.backend import Msckf
@@ -75,15 +76,24 @@ def fly(
     return run_backend(since(sequence, 1), Msckf(options), estimation, start)
 
 
+def moved(sequence: TrackSequence, by: Callable[[FrameTracks], Float]) -> TrackSequence:
+    """Each frame's observations moved ``by`` (M, 2) px."""
+    (camera,) = sequence.calibration.cameras
+    packets = [(imu, replace(t, xy=t.xy + by(t)).undistorted(camera.model)) for imu, t in sequence.packets]
+    return replace(sequence, packets=tuple(packets))
+
+
 def spoilt(sequence: TrackSequence, ratio: float, seed: int) -> tuple[TrackSequence, frozenset[tuple[float, float]]]:
     """Observations moved by 15 px in a random direction, and which."""
-    rng, wrong, packets = np.random.default_rng(seed), set(), []
-    for imu, tracks in sequence.packets:
+    rng, wrong = np.random.default_rng(seed), set[tuple[float, float]]()
+
+    def astray(tracks: FrameTracks) -> Float:
         bad, angle = rng.random(len(tracks.ids)) < ratio, rng.uniform(0.0, 2.0 * np.pi, len(tracks.ids))
-        xy = tracks.xy + bad[:, None] * 15.0 * np.column_stack([np.cos(angle), np.sin(angle)])
-        wrong |= set(map(tuple, xy[bad].tolist()))
-        packets.append((imu, replace(tracks, xy=xy, xy_normalised=sequence.calibration.cameras[0].model.undistort(xy))))
-    return replace(sequence, packets=tuple(packets)), frozenset(wrong)
+        off = bad[:, None] * 15.0 * np.column_stack([np.cos(angle), np.sin(angle)])
+        wrong.update(map(tuple, (tracks.xy + off)[bad].tolist()))
+        return off
+
+    return moved(sequence, astray), frozenset(wrong)
 
 
 @pytest.mark.parametrize(
@@ -135,12 +145,8 @@ def test_outliers_are_rejected_and_do_no_harm(monkeypatch):
 
 def jumping(sequence: TrackSequence, ratio: float, px: float, seed: int) -> TrackSequence:
     """Points of which some, others in each frame, are off by ``px`` more than the rest on either axis."""
-    rng, packets = np.random.default_rng(seed), []
-    for imu, tracks in sequence.packets:
-        jumps = (rng.random(len(tracks.ids)) < ratio)[:, None]
-        xy = tracks.xy + jumps * px * rng.normal(size=tracks.xy.shape)
-        packets.append((imu, replace(tracks, xy=xy, xy_normalised=sequence.calibration.cameras[0].model.undistort(xy))))
-    return replace(sequence, packets=tuple(packets))
+    rng = np.random.default_rng(seed)
+    return moved(sequence, lambda t: (rng.random(len(t.ids)) < ratio)[:, None] * px * rng.normal(size=t.xy.shape))
 
 
 def test_points_that_jump_do_less_harm_by_a_robust_loss():
@@ -157,13 +163,14 @@ def test_points_that_jump_do_less_harm_by_a_robust_loss():
 
 def sliding(sequence: TrackSequence, drift_px: float, seed: int) -> TrackSequence:
     """Points that walk off their landmarks by ``drift_px`` a frame on either axis."""
-    rng, off, packets = np.random.default_rng(seed), dict[int, Float](), []
-    for imu, tracks in sequence.packets:
+    rng, off = np.random.default_rng(seed), dict[int, Float]()
+
+    def walked(tracks: FrameTracks) -> Float:
         for track in tracks.ids.tolist():
             off[track] = off.get(track, np.zeros(2)) + drift_px * rng.normal(size=2)
-        xy = tracks.xy + np.array([off[track] for track in tracks.ids.tolist()])
-        packets.append((imu, replace(tracks, xy=xy, xy_normalised=sequence.calibration.cameras[0].model.undistort(xy))))
-    return replace(sequence, packets=tuple(packets))
+        return np.array([off[track] for track in tracks.ids.tolist()])
+
+    return moved(sequence, walked)
 
 
 def test_landmarks_that_points_slide_off_are_not_believed_for_long():

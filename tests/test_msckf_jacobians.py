@@ -228,12 +228,8 @@ def test_a_landmark_that_does_not_fit_is_discounted_and_gated_as_it_is(cauchy):
         blocks, residual = landmark_blocks(state, newest, index, first, xy, True)
         H = sighting_rows(state, newest, index, first, blocks)
         S = H @ state.cov @ H.T + noise.px**2 * np.eye(8)
-        pairs = S.reshape(4, 2, 4, 2)[index, :, index]
-        return (
-            H,
-            residual,
-            np.einsum("ia,iab,ib->i", residual.reshape(4, 2), np.linalg.inv(pairs), residual.reshape(4, 2)),
-        )
+        blocks_of_S, pairs = S.reshape(4, 2, 4, 2)[index, :, index], residual.reshape(4, 2)
+        return H, residual, np.einsum("ia,iab,ib->i", pairs, np.linalg.inv(blocks_of_S), pairs)
 
     H, residual, _ = measured()
     xy -= residual.reshape(4, 2)

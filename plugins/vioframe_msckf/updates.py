@@ -12,13 +12,7 @@ from vioframe.estimation.point_noise import PointNoise
 from vioframe.estimation.standstill import Standstill
 from vioframe.types import DP, Float, FrameTracks, ImuNoise, ImuSegment, Int
 from vioframe_msckf.covariance import distances
-from vioframe_msckf.measurement import (
-    ACCEPTED,
-    Window,
-    landmark_blocks,
-    msckf_rows,
-    reduced_track,
-)
+from vioframe_msckf.measurement import ACCEPTED, Window, landmark_blocks, msckf_rows, reduced_track
 from vioframe_msckf.options import MsckfOptions
 from vioframe_msckf.state import IMU, FilterState, compress
 
