@@ -14,6 +14,7 @@ from vioframe.errors import ConfigError, PluginError  # noqa: E402
 from vioframe_keypointnet import runtimes  # noqa: E402
 from vioframe_keypointnet.graph import model  # noqa: E402
 from vioframe_keypointnet.network import describe as describe_in_torch  # noqa: E402
+from vioframe_keypointnet.options import KeypointNetOptions  # noqa: E402
 from vioframe_keypointnet.quantisation import measure_ranges  # noqa: E402
 from vioframe_keypointnet.selection import by_pixels, candidate_places, describe  # noqa: E402
 
@@ -39,7 +40,7 @@ def as_trained(net, image):
 
 def run_by(runtime, precision, made, image):
     """The same by a runtime."""
-    return runtimes.start(runtime, precision, made, descriptors=True, threads=1)(image)
+    return runtimes.start(runtime, precision, made, KeypointNetOptions(descriptors=True, threads=1))(image)
 
 
 def relative_error(found, expected):
@@ -62,7 +63,7 @@ def test_folding_and_runtime_change_nothing(architecture, runtime):
 def test_one_runtime_takes_images_of_several_sizes(runtime):
     pytest.importorskip(runtime)
     net = network(ARCHITECTURES["tiny"])
-    run = runtimes.start(runtime, "float32", weights(net), descriptors=False, threads=1)
+    run = runtimes.start(runtime, "float32", weights(net), KeypointNetOptions(threads=1))
     for shape in ((48, 64), (64, 48), (8, 8), (48, 64)):
         image = texture(shape, seed=5)
         (heads,) = run(image)
@@ -182,4 +183,4 @@ def test_a_library_that_is_absent_is_named_with_its_extra(runtime, monkeypatch):
     monkeypatch.setitem(sys.modules, runtime, None)
     extra = "keypointnet" if runtime == "torch" else runtime
     with pytest.raises(PluginError, match=rf"{runtime}.*pip install 'vioframe\[{extra}\]'"):
-        runtimes.start(runtime, "float32", made, descriptors=False, threads=1)
+        runtimes.start(runtime, "float32", made, KeypointNetOptions(threads=1))

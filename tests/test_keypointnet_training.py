@@ -24,7 +24,7 @@ from vioframe_keypointnet import (  # noqa: E402
     vioframe_trainers,
     weights,
 )
-from vioframe_keypointnet.options import TrainingOptions  # noqa: E402
+from vioframe_keypointnet.options import KeypointNetOptions, TrainingOptions  # noqa: E402
 from vioframe_keypointnet.selection import padded_to_cells  # noqa: E402
 from vioframe_keypointnet.training import samples, trainer  # noqa: E402
 from vioframe_keypointnet.training.samples import Picture, batch, disturbed, gather, pair, split  # noqa: E402
@@ -105,7 +105,8 @@ def test_descriptors_alone_are_trained_beside_a_detector_left_as_it_is(pictures,
     assert len(totals) == 4
     assert np.isfinite(totals).all()
     image = padded_to_cells(pictures[0].pixels)
-    found = [runtimes.start("torch", "float32", w, descriptors=True, threads=1)(image) for w in (before, after)]
+    asked = KeypointNetOptions(descriptors=True, threads=1)
+    found = [runtimes.start("torch", "float32", w, asked)(image) for w in (before, after)]
     np.testing.assert_array_equal(found[0][0], found[1][0])
     assert np.abs(found[0][1] - found[1][1]).max() > 1e-4
 

@@ -57,6 +57,27 @@ def official(tmp_path, monkeypatch):
     return write
 
 
+def test_in_eight_bits_convolutions_are_off_by_half_a_step_at_most(saved):
+    path, made = saved
+    rounded = path.with_name("rounded.safetensors")
+    result = CliRunner().invoke(convert, [str(path), str(rounded), "--eight-bits"])
+    assert result.exit_code == 0, result.output
+    found = weights_file.load(rounded)
+    assert found.card == {"epochs": 3}
+    for name, values in made.tensors.items():
+        step = np.abs(values).max(axis=(1, 2, 3), keepdims=True) / 127.0 if values.ndim == 4 else 0.0
+        assert (np.abs(found.tensors[name] - values) <= 0.501 * step).all()
+    kernels = sum(values.size for values in made.tensors.values() if values.ndim == 4)
+    assert path.stat().st_size - rounded.stat().st_size > 2.5 * kernels
+
+
+def test_steps_of_a_tensor_that_is_not_there_are_refused(saved):
+    path, _ = saved
+    safetensors.save_file({"conv2a.0.weight.steps": np.ones(4, np.float32)}, path)
+    with pytest.raises(ConfigError, match="damaged"):
+        weights_file.load(path)
+
+
 @pytest.mark.parametrize("architecture", [*ARCHITECTURES.values(), FULL], ids=lambda a: a.name)
 def test_the_table_of_shapes_is_that_of_the_network(architecture):
     state = KeypointNet(architecture).state_dict()

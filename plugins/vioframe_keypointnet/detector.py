@@ -11,7 +11,7 @@ from vioframe.errors import ConfigError
 from vioframe.types import Image, Keypoints
 from vioframe_keypointnet import runtimes
 from vioframe_keypointnet.options import KeypointNetOptions
-from vioframe_keypointnet.selection import describe, padded_to_cells, peaks, select
+from vioframe_keypointnet.selection import describe, first_varied, padded_to_cells, peaks, select
 from vioframe_keypointnet.weights import Weights
 
 _LOG = logging.getLogger(__name__)
@@ -33,10 +33,9 @@ class KeypointNet:
         calibrated = weights.activation_ranges is not None
         self._runtime, self.precision = runtimes.choose(options.runtime, options.precision, calibrated)
         _LOG.info("KeypointNet %s runs by %s in %s", weights.architecture.name, self._runtime, self.precision)
-        self._run = runtimes.start(
-            self._runtime, self.precision, weights, descriptors=options.descriptors, threads=options.threads
-        )
-        self._choose = peaks if weights.architecture.peaks else select
+        self._run = runtimes.start(self._runtime, self.precision, weights, options)
+        of_cells = first_varied if self._runtime == "cuda" else select
+        self._choose = peaks if weights.architecture.peaks else of_cells
         self._options = options
         self.best_first = weights.target != "repeatability"
 

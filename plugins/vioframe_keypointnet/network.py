@@ -12,10 +12,9 @@ from torch.nn.functional import avg_pool2d, grid_sample, interpolate, normalize,
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from vioframe_keypointnet.architecture import CELL_PX, FAINT, Architecture
+from vioframe_keypointnet.selection import OFFSET_PX, reach_cells
 from vioframe_keypointnet.weights import Weights
 
-_CROSS_RATIO = 2.0
-"""How far a regressed keypoint may lie from its cell's centre, in half cells: neighbours reach into each other."""
 _PEAK_REACH_PX = 2
 """How far along either axis, and in the same cell, pixels count towards the place of a peak."""
 
@@ -64,7 +63,7 @@ class KeypointNet(nn.Module):
             score = score + torch.logsumexp(response, dim=1)
             place = peak_places(response)
         else:
-            place = _CROSS_RATIO * (CELL_PX - 1) / 2 * torch.tanh(self._regress("P", after[4]))
+            place = offsets(self._regress("P", after[4]))
         # The outermost ring of cells scores 0.
         score = pad(torch.sigmoid(score)[:, 1:-1, 1:-1], (1, 1, 1, 1))
         return Detection(score, keypoint_places(place), self._describe(after), response)
@@ -168,13 +167,40 @@ def peak_places(response: Tensor) -> Tensor:
     return torch.stack([(weights * axis).sum(dim=1) for axis in (columns, rows)], dim=1) - (CELL_PX - 1) / 2
 
 
+def offsets(place: Tensor) -> Tensor:
+    """(B, 2, h, w) px from the centres of the cells, of the ``place`` that a network regresses."""
+    return OFFSET_PX * torch.tanh(place)
+
+
 def keypoint_places(place: Tensor) -> Tensor:
     """(B, 2, h, w) px in the image, and within it, of (B, 2, h, w) px from the centres of the cells."""
     h, w = place.shape[-2:]
-    rows, columns = torch.meshgrid(torch.arange(h), torch.arange(w), indexing="ij")
-    centre = torch.stack([columns, rows]).to(place) * CELL_PX + (CELL_PX - 1) / 2
-    limit = place.new_tensor([w * CELL_PX - 1.0, h * CELL_PX - 1.0])[:, None, None]
-    return torch.minimum((centre + place).clamp(min=0.0), limit)
+    x, y = (torch.arange(n, device=place.device) * CELL_PX + (CELL_PX - 1) / 2 for n in (w, h))
+    columns = (place[:, 0] + x).clamp(0.0, w * CELL_PX - 1.0)
+    rows = (place[:, 1] + y[:, None]).clamp(0.0, h * CELL_PX - 1.0)
+    return torch.stack([columns, rows], dim=1)
+
+
+def strongest(heads: Tensor, nms_px: float) -> Tensor:
+    """(h w, 3) x, y and score before the sigmoid, strongest first, of the candidates ``heads`` (3, h, w).
+
+    Those that :func:`vioframe_keypointnet.selection.strongest` leaves out come last, with a score of -inf: what a CUDA
+    graph gives is always of one size.
+    """
+    x, y = keypoint_places(offsets(heads[None, 1:]))[0]
+    inner = pad(heads[:1, 1:-1, 1:-1], (1, 1, 1, 1), value=-torch.inf)
+    score = torch.where(inner.isfinite(), inner, -torch.inf)[0]
+    reach = reach_cells(nms_px)
+    around = pad(torch.stack([x, y, score]), (reach,) * 4, value=-torch.inf)
+    side = 2 * reach + 1
+    x_near, y_near, score_near = around.unfold(1, side, 1).unfold(2, side, 1).flatten(3)
+    # Of equals the first row by row is the stronger.
+    earlier = torch.arange(side**2, device=heads.device) < side**2 // 2
+    higher = (score_near > score[..., None]) | ((score_near == score[..., None]) & earlier)
+    near = (x_near - x[..., None]).square() + (y_near - y[..., None]).square() <= nms_px**2
+    score = score.masked_fill((near & higher).any(dim=-1), -torch.inf).flatten()
+    order = score.argsort(descending=True, stable=True)
+    return torch.stack([x.flatten(), y.flatten(), score], dim=1)[order]
 
 
 def describe(descriptors: Tensor, xy: Tensor) -> Tensor:

@@ -29,6 +29,8 @@ class KeypointNetOptions:
     """Auto: float16 by CUDA; by OpenVINO int8 where the weights know their ranges; else float32."""
     threads: NonNegativeInt = 0
     """Threads on a CPU; 0 leaves the library's choice."""
+    compiled: bool = False
+    """By CUDA: have torch.compile fuse what lies between the convolutions, which takes a C compiler and a minute."""
     nms_px: NonNegativeFloat = 4.0
     """A keypoint goes where a stronger one is nearer than this."""
     min_contrast: NonNegativeInt = 4

@@ -2,7 +2,8 @@
 
 A runtime takes a grey image whose sides are multiples of 8 to what
 :meth:`vioframe_keypointnet.network.KeypointNet.found` gives, without the batch's axis, in float32; it stays as it is
-until the next call.
+until the next call. By CUDA what the published network gives are its candidates,
+:func:`vioframe_keypointnet.network.strongest`.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from numpy.typing import NDArray
 from vioframe.errors import ConfigError, needs
 from vioframe.types import Image
 from vioframe_keypointnet.graph import model
-from vioframe_keypointnet.options import Precision, Runtime
+from vioframe_keypointnet.options import KeypointNetOptions, Precision, Runtime
 from vioframe_keypointnet.seeing import Eye
 from vioframe_keypointnet.weights import Weights
 
@@ -52,13 +53,15 @@ def choose(runtime: Runtime, precision: Precision, calibrated: bool) -> tuple[st
     return chosen, precision
 
 
-def start(runtime: str, precision: str, weights: Weights, *, descriptors: bool, threads: int) -> Run:
-    """The network of ``weights`` in ``runtime``, with so many ``threads``, or as many as the library likes if 0."""
+def start(runtime: str, precision: str, weights: Weights, options: KeypointNetOptions) -> Run:
+    """The network of ``weights`` in ``runtime``. Raises :class:`ConfigError` where that is not to be had."""
+    if options.compiled and runtime != "cuda":
+        raise ConfigError(f"-o compiled is of runtime=cuda, and the network runs by {runtime}; leave it out")
     if runtime == "openvino":
-        return _by_openvino(weights, descriptors, precision == "int8", threads)
+        return _by_openvino(weights, options.descriptors, precision == "int8", options.threads)
     if runtime == "cuda":
-        return _by_cuda(weights, descriptors, precision == "float16")
-    return _by_torch(weights, descriptors, threads)
+        return _by_cuda(weights, precision == "float16", options)
+    return _by_torch(weights, options.descriptors, options.threads)
 
 
 def _by_openvino(weights: Weights, descriptors: bool, int8: bool, threads: int) -> Run:
@@ -105,16 +108,17 @@ def _by_torch(weights: Weights, descriptors: bool, threads: int) -> Run:
     return run
 
 
-def _by_cuda(weights: Weights, descriptors: bool, half: bool) -> Run:
+def _by_cuda(weights: Weights, half: bool, options: KeypointNetOptions) -> Run:
     """The same on a GPU, from the image in to the outputs back one CUDA graph, captured for each size of image when the
     first comes: to launch it costs the same however many layers there are.
 
-    With ``half`` the convolutions have half precision, and nothing else.
+    With ``half`` the convolutions have half precision, and nothing else. Raises :class:`ConfigError` where it should be
+    compiled and cannot be.
     """
     with needs("torch", "keypointnet", user="KeypointNet by PyTorch"):
         import torch
 
-        from vioframe_keypointnet.network import of_weights
+        from vioframe_keypointnet.network import of_weights, strongest
     if not torch.cuda.is_available():
         raise ConfigError("torch finds no CUDA device; leave -o runtime out, or install torch with CUDA")
     network = of_weights(weights).to("cuda", torch.float16 if half else torch.float32)
@@ -124,16 +128,31 @@ def _by_cuda(weights: Weights, descriptors: bool, half: bool) -> Run:
         """The graph, the array that it takes the image from, and those it leaves the outputs in."""
         image = torch.empty(shape, dtype=torch.uint8, pin_memory=True)
 
+        def found(grey: torch.Tensor) -> list[torch.Tensor]:
+            first, *more = (output[0] for output in network.found(grey, descriptors=options.descriptors))
+            if not weights.architecture.peaks:
+                first = strongest(first, options.nms_px)
+            return [output.contiguous() for output in (first, *more)]
+
         def work() -> list[torch.Tensor]:
-            grey = image.to("cuda", non_blocking=True)[None, None] / 255.0
-            return [output[0].contiguous() for output in network.found(grey, descriptors=descriptors)]
+            return find(image.to("cuda", non_blocking=True)[None, None] / 255.0)
+
+        find = torch.compile(found, dynamic=False) if options.compiled else found
 
         aside, graph = torch.cuda.Stream(), torch.cuda.CUDAGraph()
         # In full precision TF32 would round to ten bits. To try cuDNN's algorithms one after the other gains nothing.
         with torch.inference_mode(), torch.backends.cudnn.flags(enabled=True, allow_tf32=half):
             with torch.cuda.stream(aside):
-                for _ in range(3):
-                    warm = work()
+                try:
+                    for _ in range(3):
+                        warm = work()
+                except RuntimeError as error:
+                    if not options.compiled:
+                        raise
+                    first = str(error).strip().partition("\n")[0]
+                    raise ConfigError(
+                        f"torch.compile failed ({first}); it needs a C compiler, as gcc; or leave -o compiled out"
+                    ) from error
             aside.synchronize()
             outputs = [torch.empty(output.shape, pin_memory=True) for output in warm]
             with torch.cuda.graph(graph, stream=aside, capture_error_mode="thread_local"):

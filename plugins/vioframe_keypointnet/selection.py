@@ -17,7 +17,8 @@ from vioframe_keypointnet.architecture import CELL_PX
 from vioframe_keypointnet.options import KeypointNetOptions
 
 OFFSET_PX = 2.0 * (CELL_PX - 1) / 2
-"""How far a keypoint may lie from its cell's centre: the network's cross ratio of 2 times half a cell."""
+"""How far a regressed keypoint may lie from its cell's centre along either axis: 2 half cells, the published cross
+ratio, so that neighbours reach into each other."""
 
 _CONTRAST_REACH_PX = 8
 """Half the side of the window in which the image must vary for a keypoint to be there."""
@@ -50,13 +51,30 @@ def select(
     (8 h, 8 w) is what it saw. Not taken: the outermost ring of cells, which sees less than it should, what lies outside
     the image's first ``shape`` (H, W) pixels, which are not padding, and what is near a stronger candidate.
     """
-    score, (x, y) = heads[0], candidate_places(heads)
-    reach = int((2.0 * OFFSET_PX + rules.nms_px) / CELL_PX)
-    found = _strongest(score, x, y, np.float32(rules.nms_px), reach, shape[0], shape[1])
-    found = found[np.argsort(-found[:, 2])]
-    xy, score = found[:, :2], found[:, 2]
-    kept = _first_varied(image, np.rint(xy).astype(np.int64), shape[0], shape[1], rules.min_contrast, max_points)
-    return xy[kept], _sigmoid(score[kept])
+    return first_varied(strongest(heads, rules.nms_px), image, shape, max_points, rules)
+
+
+def strongest(heads: Array, nms_px: float) -> Array:
+    """(N, 3) x, y and score before the sigmoid, strongest first, of the candidates ``heads`` (3, h, w) that are off the
+    border and have no stronger one within ``nms_px``; :func:`vioframe_keypointnet.network.strongest` does it in torch.
+    """
+    x, y = candidate_places(heads)
+    found = _strongest(heads[0], x, y, np.float32(nms_px), reach_cells(nms_px))
+    return found[np.argsort(-found[:, 2])]
+
+
+def reach_cells(nms_px: float) -> int:
+    """How many cells apart candidates within ``nms_px`` of each other may be, along either axis."""
+    return int((2.0 * OFFSET_PX + nms_px) / CELL_PX)
+
+
+def first_varied(
+    found: Array, image: Image, shape: tuple[int, int], max_points: int, rules: KeypointNetOptions
+) -> tuple[Array, Array]:
+    """Of what :func:`strongest` found, the first that are within ``shape`` and about which the image varies."""
+    found = found[: np.count_nonzero(found[:, 2] > -np.inf)]
+    kept = found[_first_varied(image, found, shape[0], shape[1], rules.min_contrast, max_points)]
+    return kept[:, :2], _sigmoid(kept[:, 2])
 
 
 def candidate_places(heads: Array) -> tuple[Array, Array]:
@@ -142,8 +160,8 @@ def _summits(before: Array, here: Array, after: Array) -> NDArray[np.float64]:
 
 
 @kernel
-def _strongest(score: Array, x: Array, y: Array, nms_px: np.float32, reach: int, height: int, width: int) -> Array:
-    """(N, 3) x, y and score of the candidates within the image and off the border, none stronger within ``nms_px``.
+def _strongest(score: Array, x: Array, y: Array, nms_px: np.float32, reach: int) -> Array:
+    """(N, 3) x, y and score of the candidates off the border with none stronger within ``nms_px``, row by row.
 
     Candidates so near each other are at most ``reach`` cells apart; of equals the first row by row is the stronger.
     """
@@ -163,8 +181,7 @@ def _strongest(score: Array, x: Array, y: Array, nms_px: np.float32, reach: int,
     count = 0
     for row in range(1, rows - 1):
         for column in range(1, columns - 1):
-            inside = x[row, column] <= width - 1 and y[row, column] <= height - 1
-            if inside and not beaten[row, column] and np.isfinite(score[row, column]):
+            if not beaten[row, column] and np.isfinite(score[row, column]):
                 found[count] = x[row, column], y[row, column], score[row, column]
                 count += 1
     return found[:count]
@@ -205,15 +222,17 @@ def _is_peak(response: Array, row: int, column: int, reach: int) -> bool:
 
 
 @kernel
-def _first_varied(image: Image, at: Int, height: int, width: int, min_contrast: int, most: int) -> Int:
-    """Which of the pixels ``at`` (N, 2) are the first ``most`` in the image around which it varies."""
-    kept = np.empty(len(at), np.int64)
+def _first_varied(image: Image, at: Int | Array, height: int, width: int, min_contrast: int, most: int) -> Int:
+    """Which of ``at``, (N, 2) px or more columns, are the first ``most`` in the image around which it varies."""
+    kept = np.empty(min(most, len(at)), np.int64)
     count = 0
     for k in range(len(at)):
         if count == most:
             break
-        x, y = at[k]
-        if x < width and y < height and _varies(image, x, y, height, width, min_contrast):
+        x, y = at[k, 0], at[k, 1]
+        if not (x <= width - 1 and y <= height - 1):
+            continue
+        if _varies(image, np.int64(np.rint(x)), np.int64(np.rint(y)), height, width, min_contrast):
             kept[count] = k
             count += 1
     return kept[:count]

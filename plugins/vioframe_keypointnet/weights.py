@@ -21,6 +21,7 @@ from pickle import UnpicklingError
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from vioframe.errors import ConfigError, needs
 from vioframe.parts.options import did_you_mean
@@ -31,6 +32,8 @@ _LOG = logging.getLogger(__name__)
 _SHIPPED = Path(__file__).parent / "data"
 _PREFIX, _SUFFIX = "keypointnet-", ".safetensors"
 _UNTRAINED = "untrained:"
+_STEPS = ".steps"
+"""Behind the name of a tensor of int8: how much one is worth, a channel."""
 _REMEDY = (
     "train some with `vioframe train keypointnet --images DIR`, or name an official checkpoint: -o weights=v4.ckpt"
 )
@@ -60,10 +63,11 @@ class Weights:
         return bool(self.card.get("descriptors", True))
 
 
-def save(path: Path, weights: Weights) -> None:
+def save(path: Path, weights: Weights, *, eight_bits: bool = False) -> None:
     """Write ``weights`` as a file that :func:`load` reads, but for counters of batches.
 
-    Raises :class:`ConfigError` where the tensors are not those of the architecture.
+    In ``eight_bits`` convolutions are rounded to 127 steps either way, one size of step for each channel that they
+    give: a quarter of the size. Raises :class:`ConfigError` where the tensors are not those of the architecture.
     """
     with needs("safetensors", "openvino", user="KeypointNet"):
         from safetensors.numpy import save_file
@@ -72,7 +76,7 @@ def save(path: Path, weights: Weights) -> None:
     metadata = {"architecture": weights.architecture.to_json(), "card": json.dumps(dict(weights.card))}
     if weights.activation_ranges is not None:
         metadata["activation_ranges"] = json.dumps(dict(weights.activation_ranges))
-    save_file(dict(checked), path, metadata)
+    save_file(dict(_rounded(checked) if eight_bits else checked), path, metadata)
 
 
 def load(source: str | Path) -> Weights:
@@ -107,8 +111,8 @@ def _read(path: Path) -> Weights:
     try:
         with safe_open(path, framework="np") as file:
             metadata = file.metadata() or {}
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118, it is no mapping
-    except (SafetensorError, OSError, ValueError) as error:
+            tensors = _whole({name: file.get_tensor(name) for name in file.keys()})  # noqa: SIM118, it is no mapping
+    except (SafetensorError, OSError, ValueError, LookupError) as error:
         raise ConfigError(f"{path} is damaged or no safetensors file ({error}); {_REMEDY}") from error
     try:
         architecture = Architecture.from_json(metadata["architecture"])
@@ -121,6 +125,24 @@ def _read(path: Path) -> Weights:
             f"`python -m vioframe_keypointnet IN.ckpt OUT.safetensors`, or {_REMEDY}"
         ) from error
     return Weights(architecture, _checked(tensors, architecture, str(path)), card, ranges)
+
+
+def _rounded(tensors: Tensors) -> dict[str, NDArray[Any]]:
+    """Convolutions as int8, and the step of each channel beside them."""
+    rounded: dict[str, NDArray[Any]] = dict(tensors)
+    for name, values in tensors.items():
+        if values.ndim == 4:
+            steps = np.maximum(np.abs(values).max(axis=(1, 2, 3)) / 127.0, np.finfo(np.float32).tiny)
+            rounded[name] = np.round(values / steps[:, None, None, None]).astype(np.int8)
+            rounded[name + _STEPS] = steps.astype(np.float32)
+    return rounded
+
+
+def _whole(tensors: dict[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
+    """The same in float32 again; other ``tensors`` as they are."""
+    for name in [name for name in tensors if name.endswith(_STEPS)]:
+        tensors[name.removesuffix(_STEPS)] = tensors[name.removesuffix(_STEPS)] * tensors.pop(name)[:, None, None, None]
+    return tensors
 
 
 def _read_checkpoint(path: Path) -> Weights:
