@@ -257,7 +257,9 @@ def test_weights_that_ship_conform_and_say_what_they_are(name):
     shipped = weights_file.load(name)
     assert shipped.card
     # Regressed places are too fine for 8 bits: those of the full network would be off by 1.6 px in place of 0.7.
-    assert set(shipped.activation_ranges or ()) == set(shipped.architecture.ranged if shipped.architecture.peaks else ())
+    assert set(shipped.activation_ranges or ()) == set(
+        shipped.architecture.ranged if shipped.architecture.peaks else ()
+    )
     check_detector(FACTORY, weights=name, threads=1)
 
 

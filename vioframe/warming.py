@@ -14,7 +14,7 @@ from dataclasses import replace
 import numpy as np
 
 from vioframe import jit
-from vioframe.cores import usable_cores
+from vioframe.cores import limited_threads, usable_cores
 from vioframe.errors import DivergedError
 from vioframe.estimation import initialization
 from vioframe.frontend.warming import load_kernels
@@ -43,9 +43,10 @@ def warm_up(backend: Backend, calibration: Calibration) -> None:
     """
     if not calibration.cameras[0].rotation_known:
         calibration = calibration.with_camera(0, R_BC=np.eye(3), rotation_known=True)
-    with suppress(DivergedError, np.linalg.LinAlgError):
-        _fly_along_a_wall(backend, calibration)
-    initialization.warm_up(calibration)
+    with limited_threads():
+        with suppress(DivergedError, np.linalg.LinAlgError):
+            _fly_along_a_wall(backend, calibration)
+        initialization.warm_up(calibration)
 
 
 @contextmanager

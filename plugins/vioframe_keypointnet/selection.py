@@ -22,10 +22,8 @@ ratio, so that neighbours reach into each other."""
 
 _CONTRAST_REACH_PX = 8
 """Half the side of the window in which the image must vary for a keypoint to be there."""
-_PIXELS_A_POINT = (12, 60)
-"""So many of the highest pixels are looked at for each point that is wanted, then so many, before all are."""
-_EVERY = 7
-"""Of rows and of columns, one in so many is looked at to find the bound that these exceed."""
+_PEAKS_A_POINT = 2
+"""So many of the highest peaks are looked at for each point that is wanted, before all are."""
 
 _ROW_OF = {2: np.float64, 4: np.complex128}
 """Numbers as large as so many floats."""
@@ -95,10 +93,12 @@ def peaks(
     place is that of the parabolas through it and its neighbours. Not taken: what :func:`select` leaves.
     """
     response, reach = by_pixels(found), max(ceil(rules.nms_px) - 1, 1)
-    # The highest pixels nearly always hold enough peaks; to look at and to sort all takes several times as long.
-    for above in (*(_exceeded_by(response, pixels * max_points) for pixels in _PIXELS_A_POINT), -np.inf):
-        at = _peaks(response, np.float32(above), reach)
-        at = at[np.argsort(-response[at[:, 1], at[:, 0]], kind="stable")]
+    everywhere = _peaks(response, reach)
+    height = response[everywhere[:, 1], everywhere[:, 0]]
+    # The highest nearly always suffice; to sort all takes several times as long.
+    for most in (_PEAKS_A_POINT * max_points, len(height)):
+        highest = np.argpartition(-height, most)[:most] if most < len(height) else np.arange(len(height))
+        at = everywhere[highest[np.lexsort((highest, -height[highest]))]]
         at = at[_first_varied(image, at, shape[0], shape[1], rules.min_contrast, max_points)]
         if len(at) == max_points:
             break
@@ -146,13 +146,6 @@ def _sigmoid(x: Array) -> Array:
     return y
 
 
-def _exceeded_by(values: Array, count: int) -> float:
-    """A bound that about ``count`` of ``values`` (H, W) exceed, from a sample."""
-    sample = values[::_EVERY, ::_EVERY].ravel()
-    rank = int(len(sample) * (1.0 - count / values.size))
-    return float(np.partition(sample, rank)[rank]) if 0 <= rank < len(sample) else -np.inf
-
-
 def _summits(before: Array, here: Array, after: Array) -> NDArray[np.float64]:
     """Where the parabolas through three values, a pixel apart, are highest: at most half a pixel from the middle."""
     bend = 2.0 * here.astype(np.float64) - before - after
@@ -188,22 +181,37 @@ def _strongest(score: Array, x: Array, y: Array, nms_px: np.float32, reach: int)
 
 
 @kernel
-def _peaks(response: Array, above: np.float32, reach: int) -> Int:
-    """(N, 2) columns and rows of the peaks ``above`` a bound that are off the border, two rows after the other."""
-    found = np.empty((response.size // 4, 2), np.int64)
-    highest = np.empty(response.shape[1], np.float32)
-    count = 0
-    # Of 2 x 2 px one at most is a peak, and few hold anything above the bound.
-    for top in range(CELL_PX, response.shape[0] - CELL_PX, 2):
-        for column in range(len(highest)):
-            highest[column] = max(response[top, column], response[top + 1, column])
-        for left in range(CELL_PX, response.shape[1] - CELL_PX, 2):
-            if max(highest[left], highest[left + 1]) <= above:
+def _peaks(response: Array, reach: int) -> Int:
+    """(N, 2) columns and rows of the peaks that are off the border, two rows after the other."""
+    rows, columns = response.shape[0] // 2, response.shape[1] // 2
+    found = np.empty((rows * columns, 2), np.int64)
+    above, around = np.empty(2 * columns, np.float32), np.empty(columns, np.float32)
+    # Of each 2 x 2 px the highest value, one of which at most is a peak, and of three such squares beside each other.
+    square, three = np.full((3, columns), -np.inf, np.float32), np.full((3, columns), -np.inf, np.float32)
+    count, border = 0, CELL_PX // 2
+    for below in range(border - 1, rows - border + 1):
+        new = below % 3
+        for column in range(2 * columns):
+            above[column] = max(response[2 * below, column], response[2 * below + 1, column])
+        for column in range(columns):
+            square[new, column] = max(above[2 * column], above[2 * column + 1])
+        for column in range(1, columns - 1):
+            three[new, column] = max(square[new, column - 1], square[new, column], square[new, column + 1])
+        row = below - 1
+        if row < border:
+            continue
+        middle, before = row % 3, (row - 1) % 3
+        for left in range(columns):
+            around[left] = max(three[before, left], three[middle, left], three[new, left])
+        for left in range(border, columns - border):
+            highest = square[middle, left]
+            # All of the squares around are within 3 px.
+            if reach >= 3 and around[left] > highest:
                 continue
-            for row in range(top, top + 2):
-                for column in range(left, left + 2):
-                    if response[row, column] > above and _is_peak(response, row, column, reach):
-                        found[count] = column, row
+            for y in range(2 * row, 2 * row + 2):
+                for x in range(2 * left, 2 * left + 2):
+                    if response[y, x] == highest and _is_peak(response, y, x, reach):
+                        found[count] = x, y
                         count += 1
     return found[:count]
 
@@ -211,8 +219,6 @@ def _peaks(response: Array, above: np.float32, reach: int) -> Int:
 @kernel
 def _is_peak(response: Array, row: int, column: int, reach: int) -> bool:
     here = response[row, column]
-    if response[row, column - 1] > here or response[row, column + 1] > here:
-        return False  # as of most pixels, at little cost
     for r in range(max(row - reach, 0), min(row + reach + 1, response.shape[0])):
         for c in range(max(column - reach, 0), min(column + reach + 1, response.shape[1])):
             there = response[r, c]
