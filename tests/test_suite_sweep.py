@@ -1,6 +1,7 @@
 """Sweeps: whatever happens to a worker or to the sweep, what is done is kept, and all of it is done in the end."""
 
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -47,8 +48,27 @@ def toy(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def parts(tmp_path, monkeypatch):
-    install_parts(tmp_path / "parts", monkeypatch)
+    set_up(tmp_path, monkeypatch)
+
+
+def set_up(folder, monkeypatch):
+    install_parts(folder / "parts", monkeypatch)
     monkeypatch.setenv("OMP_NUM_THREADS", "1")
+
+
+@pytest.fixture(scope="module")
+def flown(tmp_path_factory, toy) -> tuple[Sweep, list[str], Path]:
+    """The grid once through: the sweep, what it told, and the results, to be looked at and copied."""
+    folder = tmp_path_factory.mktemp("flown")
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        set_up(folder, monkeypatch)
+        return run(folder, GRID, toy, workers=2)
+
+
+@pytest.fixture
+def results(flown, tmp_path) -> Path:
+    """A copy of these where :func:`run` finds it."""
+    return Path(shutil.copytree(flown[2], tmp_path / "results"))
 
 
 def run(folder: Path, text: str, data: Path | None, *, out: str = "results", **how) -> tuple[Sweep, list[str], Path]:
@@ -90,8 +110,8 @@ def unreliable(folder: Path, how: str, times: int) -> str:
 
 @pytest.mark.usefixtures("parts")
 class TestSweep:
-    def test_every_task_leaves_what_the_report_needs(self, tmp_path, toy):
-        outcome, progress, path = run(tmp_path, GRID, toy, workers=2)
+    def test_every_task_leaves_what_the_report_needs(self, flown):
+        outcome, progress, path = flown
         assert (outcome.done, outcome.reused, outcome.failed) == (4, 0, {})
         assert len(progress) == 4
         results = load_results(path)
@@ -112,38 +132,35 @@ class TestSweep:
             assert RunFolder.open(path / flight["folder"]).summary["start_s"] == flight["start_s"]
         assert {row["detector"] for row in results.rows} == {"shi_tomasi", "fast"}
 
-    def test_what_is_done_is_not_done_again_unless_something_changed(self, tmp_path, toy):
-        _, _, path = run(tmp_path, GRID, toy)
-        table = (path / "results.jsonl").read_bytes()
+    def test_what_is_done_is_not_done_again_unless_something_changed(self, tmp_path, toy, results):
+        table = (results / "results.jsonl").read_bytes()
         outcome, progress, _ = run(tmp_path, GRID, toy)
         assert (outcome.done, outcome.reused, progress) == (0, 4, [])
-        assert (path / "results.jsonl").read_bytes() == table
+        assert (results / "results.jsonl").read_bytes() == table
         # A result that does not say what it was made of is not trusted.
-        rows = read_rows(path)
+        rows = read_rows(results)
         victim = next(iter(rows))
-        write_rows(path, {**rows, victim: [{**rows[victim][0], "code": "another"}]})
+        write_rows(results, {**rows, victim: [{**rows[victim][0], "code": "another"}]})
         assert run(tmp_path, GRID, toy)[0].done == 1
 
-    def test_another_suite_does_not_get_the_folder(self, tmp_path, toy):
-        path = run(tmp_path, GRID, toy)[2]
+    def test_another_suite_does_not_get_the_folder(self, tmp_path, toy, results):
         with pytest.raises(RunError, match="another suite's results, which differs in frontend"):
             run(tmp_path, GRID + "frontend: {max_points: 50}\n", toy)
-        theirs = [path / "notes.txt", next((path / "runs").iterdir()) / "notes.txt"]
+        theirs = [results / "notes.txt", next((results / "runs").iterdir()) / "notes.txt"]
         for note in theirs:
             note.write_text("precious")
-        stale = set(path.rglob("*.tum"))
+        stale = set(results.rglob("*.tum"))
         assert run(tmp_path, GRID + "frontend: {max_points: 50}\n", toy, overwrite=True)[0].done == 4
         assert [note.read_text() for note in theirs] == ["precious"] * 2
-        assert set(path.rglob("*.tum")) == stale
+        assert set(results.rglob("*.tum")) == stale
         (tmp_path / "mine").mkdir()
         (tmp_path / "mine" / "thesis.tex").touch()
         with pytest.raises(RunError, match="is no results folder"):
             run(tmp_path, GRID, toy, out="mine", overwrite=True)
         assert (tmp_path / "mine" / "thesis.tex").exists()
 
-    def test_two_sweeps_keep_out_of_each_others_folder(self, tmp_path, toy):
-        _, _, path = run(tmp_path, GRID, toy)
-        with Store.at(path).alone(), pytest.raises(RunError, match="another sweep is at work"):
+    def test_two_sweeps_keep_out_of_each_others_folder(self, tmp_path, toy, results):
+        with Store.at(results).alone(), pytest.raises(RunError, match="another sweep is at work"):
             run(tmp_path, GRID, toy)
         assert run(tmp_path, GRID, toy)[0].reused == 4
 
@@ -178,7 +195,7 @@ class TestSweep:
         assert len(outcome.failed) == 2
         assert {row["error"] for row in found(path)} == {None, "its worker died, killed or short of memory"}
 
-    def test_workers_of_a_scheduler_elsewhere_do_it_as_well(self, tmp_path, toy, monkeypatch):
+    def test_workers_of_a_scheduler_elsewhere_do_it_as_well(self, tmp_path, toy, flown, monkeypatch):
         from distributed import LocalCluster
 
         with LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=None, memory_limit=0) as cluster:
@@ -188,7 +205,7 @@ class TestSweep:
             with pytest.raises(RunError, match="has other code, plug-ins or versions"):
                 run(tmp_path, GRID, toy, scheduler=cluster.scheduler_address, out="again")
         assert outcome.done == 4
-        assert estimates(path) == estimates(run(tmp_path, GRID, toy, out="local")[2])
+        assert estimates(path) == estimates(flown[2])
 
     def test_a_scheduler_that_is_not_there_is_an_error_in_a_line(self, tmp_path, toy, monkeypatch):
         monkeypatch.setattr("vioframe.bench.suites.sweep.CONNECT_S", 1.0)
