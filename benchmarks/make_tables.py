@@ -27,6 +27,7 @@ BLOCK = re.compile(r"(<!-- figures: (\w+) -->\n).*?(<!-- end -->)", re.DOTALL)
 _MAY = (ROOT / "README.md", HERE / "README.md", *sorted(_DOCS.rglob("*.md")))
 PAGES = tuple(path for path in _MAY if BLOCK.search(path.read_text(encoding="utf-8")))
 _RENDERED = "MH_05_difficult"
+_NEES = "NEES an axis of orientation, position (ideal 1)"
 
 
 def headline() -> str:
@@ -146,7 +147,7 @@ def rendered() -> str:
             "completion": f"{100.0 * own['completion'].min():.1f} %",
             "resets": f"{own['resets'].sum()}",
             "ATE": _ate(_in_m(own)),
-            "NEES of orientation, position (ideal 3)": _parts(own, "nees", ".1f"),
+            _NEES: _parts(own, "nees", ".2f", axes=3),
             "within the 95 % ellipsoid": _parts(own, "held_95", ".0%"),
         }
         for (clip, backend, detector), own in rows[rows["options"] == ""].groupby(["clip", "backend", "detector"])
@@ -198,7 +199,7 @@ def error_budget() -> str:
                     "case": str(case),
                     **{name: _ate(each) for name, each in of.groupby("sequence")},
                     "of as flown": f"{geometric_mean(ratios):.2f} (n = {len(ratios)})",
-                    "NEES of orientation, position (ideal 3)": _parts(of, "nees", ".1f"),
+                    _NEES: _parts(of, "nees", ".2f", axes=3),
                 }
             )
     return markdown(shown) + source(rows)
@@ -216,7 +217,7 @@ def take_off() -> str:
                 "the demo's world": length(1e-3 * demo["after_take_off_mm"].iloc[0]),
                 "other worlds": _spread(1e-3 * others["after_take_off_mm"]),
                 "ATE, all": _ate(_in_m(own)),
-                "NEES of orientation, position (ideal 3)": _parts(own, "nees", ".1f"),
+                _NEES: _parts(own, "nees", ".2f", axes=3),
                 "resets": f"{own['resets'].sum()}",
             }
         )
@@ -699,9 +700,9 @@ def _spread(ate_m: Iterable[float]) -> str:
     return f"{length(values.mean(), values.std())}{of_many}"
 
 
-def _parts(rows: pd.DataFrame, what: str, spec: str) -> str:
-    """The median of a figure of orientation, and of one of position."""
-    return ", ".join(format(rows[f"{what}.{part}"].median(), spec) for part in ("orientation", "position"))
+def _parts(rows: pd.DataFrame, what: str, spec: str, *, axes: int = 1) -> str:
+    """The median of a figure of orientation, and of one of position, over the number of ``axes`` that it sums."""
+    return ", ".join(format(rows[f"{what}.{part}"].median() / axes, spec) for part in ("orientation", "position"))
 
 
 def _range(values: pd.Series, spec: str, unit: str) -> str:
