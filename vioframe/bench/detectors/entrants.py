@@ -15,17 +15,11 @@ from vioframe.parts.registry import DETECTOR, Registry, describe
 from vioframe.types import Image, Keypoints
 
 _DESCRIPTORS = "descriptors"
-_QUICK = "keypointnet:weights=quick"
+_QUICK, _TRACKS, _FULL = (f"keypointnet:weights={name}" for name in ("quick", "tracks", "full"))
 _VARIANTS: Mapping[str, Mapping[str, Sequence[str]]] = {
-    # Speed does not depend on what the weights are: the published size is timed also where there are none for it.
-    "speed": {
-        "keypointnet": (
-            _QUICK,
-            *(f"keypointnet:weights=untrained:full{how}" for how in ("", ",precision=float32")),
-        )
-    },
+    "speed": {"keypointnet": (_QUICK, _TRACKS, _FULL)},
     # 10 px between corners, the default, suits tracking; it leaves out many that could be found again.
-    "quality": {"shi_tomasi": ("shi_tomasi:min_distance_px=4",), "keypointnet": (_QUICK,)},
+    "quality": {"shi_tomasi": ("shi_tomasi:min_distance_px=4",), "keypointnet": (_QUICK, _FULL)},
 }
 
 
