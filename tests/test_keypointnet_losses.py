@@ -108,13 +108,14 @@ def test_score_loss_by_hand():
     assert float(value) == pytest.approx((-0.7 + 0.3) / 2 + 0.04)
 
 
-def test_descriptor_loss_takes_the_hardest_negative_outside_the_box():
+@pytest.mark.parametrize("outside", [[30.0, 10.0], [10.0, 30.0], [13.9, 5.9]])
+def test_descriptor_loss_takes_the_hardest_negative_outside_the_box(outside):
     def unit(degrees):
         return [math.cos(math.radians(degrees)), math.sin(math.radians(degrees))]
 
     anchors, positives = exact(unit(0.0))[None], exact(unit(20.0))[None]
     others = exact(unit(5.0), unit(30.0), unit(90.0))[None]
-    xy = exact([12.0, 10.0], [30.0, 10.0], [50.0, 50.0])[None]
+    xy = exact([13.9, 6.1], outside, [50.0, 50.0])[None]
     loss = losses.descriptor_loss(anchors, positives, others, exact([10.0, 10.0])[None], xy, torch.tensor([[True]]))
     # The first is the most alike, but within 4 px: it may be the very point.
     apart = [2.0 * math.sin(math.radians(angle / 2)) for angle in (20.0, 30.0)]
