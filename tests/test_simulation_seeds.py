@@ -67,6 +67,12 @@ def test_a_suite_that_ships_flies_in_worlds_for_reporting_but_for_the_one_to_cho
     assert len(seeds) == (suite.seeds if suite.seeds_vary == "recording" else 1)
 
 
+def test_options_are_chosen_along_other_motions_than_those_reported_under_hard_conditions():
+    chosen, reported = ({each.name for each in suites.read(suites.find(n)).sequences} for n in ("tuning", "stress"))
+    assert chosen
+    assert not chosen & reported
+
+
 TOY = "title: toy\ndetectors: [fast]\nbackends: [msckf]\nsequences: [hover]\nseeds: 2\nseeds_vary: recording\n"
 
 
