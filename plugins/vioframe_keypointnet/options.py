@@ -30,7 +30,8 @@ class KeypointNetOptions:
     threads: NonNegativeInt = 0
     """Threads on a CPU; 0 leaves the library's choice."""
     compiled: bool = False
-    """By CUDA: have torch.compile fuse what lies between the convolutions, which takes a C compiler and a minute."""
+    """By CUDA: have torch.compile fuse what lies between the convolutions; it needs a C compiler, and some seconds for
+    the first image."""
     nms_px: NonNegativeFloat = 4.0
     """A keypoint goes where a stronger one is nearer than this."""
     min_contrast: NonNegativeInt = 4
