@@ -3,6 +3,7 @@
 from pathlib import Path
 from shutil import copytree, move, rmtree
 
+import click
 import numpy as np
 import pytest
 from click.testing import CliRunner
@@ -14,6 +15,7 @@ from vioframe.bench.suites.plan import plan
 from vioframe.bench.suites.sources import EUROC
 from vioframe.bench.suites.suite import Suite
 from vioframe.cli import main
+from vioframe.cli.bench import bench
 from vioframe.errors import ConfigError, DatasetError, VioframeError
 from vioframe.io.convert import convert
 from vioframe.parts import registry
@@ -51,6 +53,7 @@ class TestFiles:
             "tuning",
         }
         for name, path in suites.shipped().items():
+            assert isinstance(bench.get_command(click.Context(bench), name), click.Command)
             suite = suites.read(path)
             assert suite.name == name
             assert suite.description

@@ -20,6 +20,7 @@ _COMMANDS = {
     "mh05_comparison": "Suite: KeypointNet and Shi-Tomasi on MH_05_difficult.",
     "euroc": "Suite: all eleven sequences, beside what is published.",
     "stress": "Suite: detectors and back-ends under hard conditions.",
+    "tuning": "Suite: options of detectors, chosen where nothing is reported.",
     "consistency": "Suite: NEES of the back-ends.",
     "speed": "Suite: milliseconds a frame by stage.",
 }
