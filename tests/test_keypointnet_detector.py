@@ -87,8 +87,10 @@ def test_selection_is_as_defined(select, nms_px):
     xy, score = select(heads, image, (117, 155), 1000, rules)
     expected = by_definition(heads, image, (117, 155), rules)
     assert len(expected) > (20 if nms_px < 10.0 else 5)
+    if select is chosen:
+        assert np.array_equal(xy, expected)
     assert xy.shape == expected.shape
-    assert np.abs(xy - expected).max() < 1e-4
+    assert np.abs(xy - expected).max() < 1e-4  # torch's tanh differs in the last bit
     assert (np.diff(score) <= 0.0).all()
     first, _ = select(heads, image, (117, 155), 7, rules)
     assert np.array_equal(first, xy[:7])

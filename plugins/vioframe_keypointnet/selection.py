@@ -100,7 +100,7 @@ def peaks(
         highest = np.argpartition(-height, most)[:most] if most < len(height) else np.arange(len(height))
         at = everywhere[highest[np.lexsort((highest, -height[highest]))]]
         at = at[_first_varied(image, at, shape[0], shape[1], rules.min_contrast, max_points)]
-        if len(at) == max_points:
+        if len(at) == max_points or len(height) <= most:
             break
     x, y = at.T
     here = response[y, x]
@@ -236,9 +236,8 @@ def _first_varied(image: Image, at: Int | Array, height: int, width: int, min_co
         if count == most:
             break
         x, y = at[k, 0], at[k, 1]
-        if not (x <= width - 1 and y <= height - 1):
-            continue
-        if _varies(image, np.int64(np.rint(x)), np.int64(np.rint(y)), height, width, min_contrast):
+        column, row = np.int64(np.rint(x)), np.int64(np.rint(y))
+        if x <= width - 1 and y <= height - 1 and _varies(image, column, row, height, width, min_contrast):
             kept[count] = k
             count += 1
     return kept[:count]
