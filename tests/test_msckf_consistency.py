@@ -118,7 +118,7 @@ def test_the_gate_follows_its_quantile(monkeypatch):
     np.testing.assert_allclose(counts.rates, 0.7, atol=0.08)
 
 
-@pytest.mark.parametrize(("flown_px", "found_px"), [(0.1, 0.3), (0.7, 0.7), (1.5, 1.5)])
+@pytest.mark.parametrize(("flown_px", "found_px"), [(0.1, 0.2), (0.7, 0.7), (1.5, 1.5)])
 def test_noise_of_points_is_found_where_it_is_larger_than_was_taken_for_granted(flown_px, found_px, monkeypatch):
     counts, filters, begin = GateCounts(monkeypatch), [], Msckf.begin
     monkeypatch.setattr(Msckf, "begin", lambda self, start: filters.append(self) or begin(self, start))

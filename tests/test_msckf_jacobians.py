@@ -23,7 +23,7 @@ from vioframe_msckf.options import MsckfOptions
 from vioframe_msckf.state import IMU, OFFSET, READOUT
 from vioframe_msckf.updates import PointNoise, promote_tracks, update_from_landmarks
 
-NOISE = PointNoise(0.7, 1.4)
+NOISE = PointNoise(0.2)
 CAMERAS = {
     "radtan": Camera(458.654, 457.296, 367.215, 248.375, (-0.283, 0.0740, 0.00019, 1.76e-05), (752, 480), "radtan"),
     "equidistant": Camera(380.0, 379.0, 367.0, 248.0, (0.01, -0.02, 0.005, -0.001), (752, 480), "equidistant"),
@@ -186,7 +186,7 @@ def test_sightings_that_do_not_fit_get_cauchys_variance():
 @pytest.mark.parametrize("cauchy", [0.5, 1e6])
 def test_delayed_initialisation_is_the_joint_update_with_nothing_known_of_the_landmark(cauchy):
     state, table = seeing_state()
-    options, noise = MsckfOptions(cauchy_sigmas=cauchy), PointNoise(0.5, 1.4)
+    options, noise = MsckfOptions(cauchy_sigmas=cauchy), PointNoise(0.14)
     row = np.flatnonzero(table.seen.all(axis=1))[0]
     _, p_WF, H, H_f, residual = rows_of(table, row, Window.of(state, True), noise.px)
     # In information form the landmark's prior is exactly nothing.
@@ -220,7 +220,7 @@ def test_a_landmark_that_does_not_fit_is_discounted_and_gated_as_it_is(cauchy):
     for row in full:
         _, p_WF, *_ = rows_of(table, row, Window.of(state, True), 1.0)
         state.add_landmark(int(table.ids[row]), p_WF, p_WF, np.zeros((3, len(state.cov))), 0.01**2 * np.eye(3))
-    options, noise = MsckfOptions(cauchy_sigmas=cauchy, landmark_drift_px=0.0), PointNoise(10.0, 1.0)
+    options, noise = MsckfOptions(cauchy_sigmas=cauchy, landmark_drift_px=0.0), PointNoise(2.0)
     index, first, newest = np.arange(4), np.zeros(4, np.int64), len(state.clones) - 1
     xy = table.xy[full, -1].copy()
 
@@ -278,7 +278,7 @@ def test_a_track_waits_until_its_distance_is_known():
     state, table = seeing_state()
     rows = np.flatnonzero(table.seen.all(axis=1))[:1]
     cov, gate = state.cov.copy(), np.full(40, np.inf)
-    assert not len(promote_tracks(state, table, rows, MsckfOptions(), PointNoise(20.0, 1.4), gate))
+    assert not len(promote_tracks(state, table, rows, MsckfOptions(), PointNoise(5.6), gate))
     assert not len(state.landmark_ids)
     np.testing.assert_array_equal(state.cov, cov)
-    assert promote_tracks(state, table, rows, MsckfOptions(), PointNoise(0.5, 1.4), gate).tolist() == rows.tolist()
+    assert promote_tracks(state, table, rows, MsckfOptions(), PointNoise(0.14), gate).tolist() == rows.tolist()

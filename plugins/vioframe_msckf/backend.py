@@ -25,9 +25,6 @@ from vioframe_msckf.updates import (
     update_from_tracks,
 )
 
-# Times that the noise of points is taken for larger than it is at least, until tracks tell.
-_NOISE_AT_FIRST = 3.5
-
 
 class Msckf:
     """One frame at a time; settings in :class:`MsckfOptions`."""
@@ -49,7 +46,7 @@ class Msckf:
             readout=options.calibrate_readout,
         )
         self._imu_noise, self._noise_at_rest = start.calibration.calibration.imu, start.noise_at_rest
-        self.point_noise = PointNoise(options.pixel_sigma, _NOISE_AT_FIRST)
+        self.point_noise = PointNoise(options.pixel_sigma)
         cameras = len(start.calibration.calibration.cameras)
         self._observations, self._turns = TrackTable(cameras), Turns(cameras)
         dof = np.arange(1, 2 * cameras * options.max_clones + 3)

@@ -20,7 +20,7 @@ class MsckfOptions:
     """Long-lived landmarks kept in the state; 0 makes this a pure MSCKF."""
     landmark_drift_px: NonNegativeFloat = 0.1
     """How far a followed point slides off its landmark from one frame to the next, px; 0 where noise is white."""
-    pixel_sigma: PositiveFloat = 0.3
+    pixel_sigma: PositiveFloat = 0.2
     """Standard deviation of a tracked feature's position, px, at least; more is found where tracks fit worse."""
     cauchy_sigmas: PositiveFloat = 1.0
     """Where Cauchy's robust loss begins to discount an observation, standard deviations."""

@@ -24,7 +24,7 @@ class SlidingWindowOptions:
     """Frames that must have seen a landmark before it is used."""
     residual: Literal["plane", "sphere"] = "plane"
     """Where reprojection errors are measured: on the normalised image plane, or on the unit sphere."""
-    pixel_sigma: PositiveFloat = 0.25
+    pixel_sigma: PositiveFloat = 0.16
     """Standard deviation of a tracked feature's position, px, at least; more is found where tracks fit worse."""
     cauchy_sigmas: PositiveFloat = 1.0
     """Where Cauchy's robust loss begins to discount an observation, standard deviations."""

@@ -68,9 +68,6 @@ from vioframe_sliding_window.options import SlidingWindowOptions
 # What a step must lower the cost by for another to follow: 4 is sqrt(8) standard deviations of all unknowns together,
 # and the next frame begins where this one ended.
 _DECREASE = 4.0
-# Times that the noise of points is taken for larger than it is at least, until landmarks tell: with a loss as robust as
-# that, a calibration that is off would not be found.
-_NOISE_AT_FIRST = 4.0
 # Biases that moved farther from those the readings were integrated with have them integrated anew, rad/s and m/s^2.
 _REPROPAGATE_GYRO, _REPROPAGATE_ACCEL = 0.01, 0.1
 
@@ -87,7 +84,7 @@ class Window:
         self._noise_at_rest, self._noise = start.noise_at_rest, calibration.imu
         self._options = options
         self._focal_px = np.array([camera.model.focal_px for camera in calibration.cameras])
-        self.point_noise = PointNoise(options.pixel_sigma, _NOISE_AT_FIRST)
+        self.point_noise = PointNoise(options.pixel_sigma)
         self._t_ns = [state.t_ns]
         self._states = StateArrays.stack([state])
         self._gyro_B = start.imu.gyro_B[-1:]

@@ -11,7 +11,7 @@ from vioframe.errors import ConfigError
 class EstimationOptions:
     """What every back-end's estimate has in common; raises :class:`ConfigError` on a value out of range."""
 
-    imu_noise_factor: float = 4.0
+    imu_noise_factor: float = 2.5
     """How many times the calibration's white IMU noise is assumed at most, where vibration adds to the sensor's own;
     how much it adds is told from the readings."""
     zero_velocity_update: bool = True

@@ -6,24 +6,27 @@ import numpy as np
 
 from vioframe.arrays import Float, Int
 
-# How much larger noise is taken for than it is at least, and how many tracks it is found by.
-_AT_MOST, _REMEMBERED = 8.0, 100
+# Times that noise is taken for larger than it is at least: until tracks tell, and at most. With one as small as that a
+# filter that was too sure of its first second stays so, and a robust loss would not find a calibration that is off.
+_AT_FIRST, _AT_MOST = 5.0, 12.0
+# How many tracks it is found by.
+_REMEMBERED = 100
 
 
 class PointNoise:
     """The standard deviation of a tracked point, px: at least what the options say, and more where tracks fit worse.
 
     A gate or a robust loss that takes noise for smaller than it is turns good tracks away, the long ones first; what is
-    too large for a while does less harm, and so it begins: ``at_first`` times as large.
+    too large for a while does less harm, and so it begins.
     """
 
-    def __init__(self, least_px: float, at_first: float) -> None:
-        self._least_px, self._at_first = least_px, at_first
+    def __init__(self, least_px: float) -> None:
+        self._least_px = least_px
         self.begin()
 
     def begin(self) -> None:
         """Forget what was found; of a body at rest it says little about the flight to come."""
-        self.px = self._at_first * self._least_px
+        self.px = _AT_FIRST * self._least_px
 
     def add(self, squares: Float, views: Int) -> None:
         """Go by what (N,) tracks are off by, seen by ``views`` (N,): sums of squares, in standard deviations.

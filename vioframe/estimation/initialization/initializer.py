@@ -49,7 +49,7 @@ _SOON_S, _LATER_S, _LATEST_S = 0.1, 0.05, 0.6
 # Times ``imu_noise_factor`` in the dynamic method, which has no later readings to correct what vibration, scale and
 # alignment errors do over its seconds: with 8 in all its squared errors on EuRoC's flights are as its covariance says.
 # Readings that are smoother than their calibration has it count as such: this many times what they jump by.
-_IN_MOTION, _JUMPS = 2.0, 2.5
+_IN_MOTION, _JUMPS = 3.2, 2.5
 # What a calibration may be off by before a start has borne it out, beyond how well it is known: rad, s and relative.
 # What contradicts it is taken over so many times in one attempt.
 _DOUBT_ROTATION, _DOUBT_OFFSET_S, _DOUBT_FOCAL, _DOUBT_READOUT_S = 0.05, 0.02, 0.06, 0.015
@@ -72,7 +72,7 @@ class Initializer:
     ``vioframe.estimation.initialization``.
     """
 
-    def __init__(self, calibration: Calibration, imu_noise_factor: float = 4.0) -> None:
+    def __init__(self, calibration: Calibration, imu_noise_factor: float = 2.5) -> None:
         self._factor = _IN_MOTION * imu_noise_factor
         self._given = calibration
         self._calibration = calibration.only(0)
