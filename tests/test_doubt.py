@@ -209,7 +209,7 @@ class TestNoise:
     @pytest.mark.parametrize(("times", "expected"), [(0.1, 1.0), (1.0, 1.0), (2.0, 3.0), (10.0, 4.0)])
     def test_between_rest_and_flight(self, times: float, expected: float):
         """Noise of the sensor's own is what its calibration says; vibration counts twice what is rougher than that."""
-        rest, flight = EUROC.imu, EUROC.imu.in_flight(4.0)
+        rest, flight = EUROC.imu, EUROC.imu.times(4.0, 4.0)
         noise = noise_over(self.readings(times), rest, flight)
         assert noise.gyro_density == pytest.approx(expected * rest.gyro_density, rel=0.15)
         assert noise.accel_density == pytest.approx(expected * rest.accel_density, rel=0.15)
@@ -220,7 +220,7 @@ class TestNoise:
         """The readings of a frame are few, and rough by chance, too: in the mean they are taken for what they are."""
         sequence = simulated_sequence(flight, duration_s=20.0)
         own = sequence.calibration.imu
-        found = [noise_over(imu, own, own.in_flight(4.0)) for imu, _ in sequence.packets]
+        found = [noise_over(imu, own, own.times(4.0, 4.0)) for imu, _ in sequence.packets]
         assert np.mean([n.gyro_density for n in found]) == pytest.approx(own.gyro_density, rel=0.1)
         assert np.mean([n.accel_density for n in found]) == pytest.approx(own.accel_density, rel=0.1)
 
@@ -231,12 +231,12 @@ class TestNoise:
         assert told == pytest.approx((times, times), rel=0.1)
 
     def test_what_is_asked_for_is_the_most(self):
-        noise = noise_over(self.readings(10.0), EUROC.imu, EUROC.imu.in_flight(0.5))
+        noise = noise_over(self.readings(10.0), EUROC.imu, EUROC.imu.times(0.5, 0.5))
         assert noise.gyro_density == 0.5 * EUROC.imu.gyro_density
 
     def test_gaps(self):
         """A turn of 0.5 rad/s and an acceleration of 2 m/s^2, unseen for 0.1 s, are as white noise turns and moves."""
-        rest, flight = EUROC.imu, EUROC.imu.in_flight(4.0)
+        rest, flight = EUROC.imu, EUROC.imu.times(4.0, 4.0)
         without, short, across = (noise_over(self.readings(1.0, gap_s), rest, flight) for gap_s in (0.0, 0.02, 0.1))
         assert short == without
         assert (across.gyro_density - without.gyro_density) * 0.1**0.5 == pytest.approx(0.5 * 0.1)

@@ -22,7 +22,7 @@ from vioframe_msckf.backend import Msckf
 from vioframe_msckf.measurement import ACCEPTED, GATED
 from vioframe_msckf.options import MsckfOptions
 
-EXACT = EstimationOptions(imu_noise_factor=1.0)
+EXACT = EstimationOptions(gyro_noise_factor=1.0, accel_noise_factor=1.0)
 """Readings are as noisy as stated, and no more."""
 WHITE = MsckfOptions(landmark_drift_px=0.0)
 """Points that are simulated stay on their landmarks."""

@@ -20,7 +20,7 @@ from vioframe_sliding_window.backend import SlidingWindow
 from vioframe_sliding_window.options import SlidingWindowOptions
 
 READOUT_S = 0.03
-EXACT = EstimationOptions(imu_noise_factor=1.0)
+EXACT = EstimationOptions(gyro_noise_factor=1.0, accel_noise_factor=1.0)
 
 
 def msckf(calibrate: bool) -> Backend:

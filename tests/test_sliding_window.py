@@ -33,7 +33,7 @@ from vioframe_sliding_window.window import parallax
 
 UP = np.array([0.0, 0.0, 1.0])
 CALIBRATED = Options(calibrate_extrinsics=False, calibrate_time_offset=False)
-EXACT = EstimationOptions(imu_noise_factor=1.0)
+EXACT = EstimationOptions(gyro_noise_factor=1.0, accel_noise_factor=1.0)
 """Readings are as noisy as stated, and no more."""
 
 
@@ -341,10 +341,9 @@ def test_min_observations_delays_landmarks():
 
 def test_noisier_readings_are_trusted_less():
     """Readings that jump six times as much as the calibration has it."""
-    sequence = simulated_sequence("figure_eight", CALIBRATION.imu.in_flight(6.0), seed=1, duration_s=4.0)
-    once, often = (
-        sigmas(fly(sequence, seed=1, estimation=EstimationOptions(imu_noise_factor=factor))) for factor in (1.0, 8.0)
-    )
+    sequence = simulated_sequence("figure_eight", CALIBRATION.imu.times(6.0, 6.0), seed=1, duration_s=4.0)
+    factors = EXACT, EstimationOptions(gyro_noise_factor=8.0, accel_noise_factor=8.0)
+    once, often = (sigmas(fly(sequence, seed=1, estimation=each)) for each in factors)
     assert (often[-1, :9] > 1.1 * once[-1, :9]).all()
     loose = sigmas(fly(sequence, Options(pixel_sigma=2.0), 1, estimation=EXACT))
     assert loose[-1, :9].sum() > 1.1 * once[-1, :9].sum()

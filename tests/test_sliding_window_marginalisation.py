@@ -235,7 +235,7 @@ def fly(
     calibration = CALIBRATION.with_camera(0, readout_s=readout_s)
     sequence = simulated_sequence(flight, seed=1, duration_s=10.0, calibration=calibration)
     # The less is believed of the readings, the less rounding leaves of the large in the small.
-    sequence = replace(sequence, calibration=replace(calibration, imu=calibration.imu.in_flight(4.0)))
+    sequence = replace(sequence, calibration=replace(calibration, imu=calibration.imu.times(4.0, 4.0)))
     start = start_in_the_dark(sequence.true_states[1], 1, position_m, yaw_rad)
     run = run_backend(since(sequence, 1), SlidingWindow(options), initial_state=start)
     assert run.completion == 1.0

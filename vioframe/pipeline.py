@@ -148,7 +148,7 @@ def prepare(
     config = config.model_copy(update={"dataset": config.dataset.model_copy(update={"options": options})})
     loop_closure = config.loop_closure
     if live:
-        imu = dataset.calibration.imu.in_flight(config.estimation_options.imu_noise_factor)
+        imu = config.estimation_options.in_flight(dataset.calibration.imu)
         dataset = Live(cast(Source, dataset), Ahead(imu))
         if isinstance(pipelined, FrontendProcess):
             pipelined.close()

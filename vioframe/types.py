@@ -170,9 +170,9 @@ class ImuNoise:
     """Diffusion of the accelerometer's bias, m/s^3/sqrt(Hz)."""
     rate_hz: float = 200.0
 
-    def in_flight(self, factor: float) -> ImuNoise:
-        """With ``factor`` times the white noise: in flight, vibration adds to the sensor's own."""
-        return replace(self, gyro_density=factor * self.gyro_density, accel_density=factor * self.accel_density)
+    def times(self, gyro: float, accel: float) -> ImuNoise:
+        """With so many times the white noise of either sensor."""
+        return replace(self, gyro_density=gyro * self.gyro_density, accel_density=accel * self.accel_density)
 
 
 @dataclass(frozen=True, slots=True)

@@ -56,7 +56,7 @@ class LifeCycle:
             unknown = next(camera.name for camera in calibration.cameras if not camera.rotation_known)
             raise ConfigError(f"of a rig every camera's rotation on the body must be known, that of {unknown} is not")
         self._given = calibration
-        self._initializer = Initializer(calibration, self._options.imu_noise_factor)
+        self._initializer = Initializer(calibration)
         self._standstill = StandstillDetector(self._options.standstill_disparity_px)
         self._initial_state = initial_state
         self._following = False
@@ -110,7 +110,7 @@ class LifeCycle:
             estimate = self._follow(*self._waiting.pop(0))
             if estimate.status is not Status.TRACKING:
                 return estimate
-        state, noise = self._settled.state, self.calibration.imu.in_flight(self._options.imu_noise_factor)
+        state, noise = self._settled.state, self._options.in_flight(self.calibration.imu)
         assert state is not None
         since = join_segments([readings for readings, _, _ in self._waiting])
         self._last = preintegrate(since, state.bias_gyro_B, state.bias_accel_B, noise).predict(state)
@@ -172,7 +172,7 @@ class LifeCycle:
         calibration = self.calibration
         # It may have been found at this very frame.
         tracks = tracks.undistorted(*calibration.lenses).finite()
-        flying = replace(calibration, imu=calibration.imu.in_flight(self._options.imu_noise_factor))
+        flying = replace(calibration, imu=self._options.in_flight(calibration.imu))
         sigma = (self._initializer.camera_sigma, *(GIVEN for _ in calibration.cameras[1:]))
         prior = CalibrationEstimate(flying, sigma)
         return Start(state, prior, calibration.imu, imu, tracks)

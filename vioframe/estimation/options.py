@@ -5,15 +5,18 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from vioframe.errors import ConfigError
+from vioframe.types import ImuNoise
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EstimationOptions:
     """What every back-end's estimate has in common; raises :class:`ConfigError` on a value out of range."""
 
-    imu_noise_factor: float = 2.5
-    """How many times the calibration's white IMU noise is assumed at most, where vibration adds to the sensor's own;
-    how much it adds is told from the readings."""
+    gyro_noise_factor: float = 4.0
+    """How many times the calibration's white noise of the gyroscope is assumed at most, where vibration adds to the
+    sensor's own; how much it adds is told from the readings."""
+    accel_noise_factor: float = 2.0
+    """Likewise for the accelerometer."""
     zero_velocity_update: bool = True
     """Recognise standstill and use it."""
     standstill_disparity_px: float = 0.7
@@ -21,8 +24,12 @@ class EstimationOptions:
     max_blind_s: float = 4.0
     """Seconds in which nothing seen corrects the estimate, after which it is given up and begun anew."""
 
+    def in_flight(self, imu: ImuNoise) -> ImuNoise:
+        """At most what the readings of ``imu`` are off by in flight: vibration adds to the sensor's own white noise."""
+        return imu.times(self.gyro_noise_factor, self.accel_noise_factor)
+
     def __post_init__(self) -> None:
-        for name in ("imu_noise_factor", "max_blind_s"):
+        for name in ("gyro_noise_factor", "accel_noise_factor", "max_blind_s"):
             if not getattr(self, name) > 0.0:
                 raise ConfigError(f"estimation option {name} must be more than zero, got {getattr(self, name)!r}")
         if not self.standstill_disparity_px >= 0.0:

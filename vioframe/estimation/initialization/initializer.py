@@ -46,10 +46,10 @@ _SHORTEST_STEREO_S, _LONGEST_STEREO_S = 0.44, 1.5
 _SHORTEST_WINDOW_S, _USUAL_WINDOW_S, _LONGEST_WINDOW_S, _LONGER = 1.5, 3.0, 10.0, 1.2
 # Each attempt that is refused puts the next off by so much more, up to a longest wait.
 _SOON_S, _LATER_S, _LATEST_S = 0.1, 0.05, 0.6
-# Times ``imu_noise_factor`` in the dynamic method, which has no later readings to correct what vibration, scale and
-# alignment errors do over its seconds: with 8 in all its squared errors on EuRoC's flights are as its covariance says.
+# Times the white noise given in the dynamic method, which has no later readings to correct what vibration, scale and
+# alignment errors do over its seconds: with 8 its squared errors on EuRoC's flights are as its covariance says.
 # Readings that are smoother than their calibration has it count as such: this many times what they jump by.
-_IN_MOTION, _JUMPS = 3.2, 2.5
+_IN_MOTION, _JUMPS = 8.0, 2.5
 # What a calibration may be off by before a start has borne it out, beyond how well it is known: rad, s and relative.
 # What contradicts it is taken over so many times in one attempt.
 _DOUBT_ROTATION, _DOUBT_OFFSET_S, _DOUBT_FOCAL, _DOUBT_READOUT_S = 0.05, 0.02, 0.06, 0.015
@@ -68,12 +68,10 @@ class Initializer:
     Ahead of the dynamic method time offset, the camera's rotation on the body, its focal length and readout are held
     against what turns of camera and gyroscope say, and others found in their place where they do not fit, or are not
     known. With a rig whose cameras overlap a start by stereo comes ahead of it; all else looks at the first camera.
-    ``imu_noise_factor`` is that of :meth:`~vioframe.types.ImuNoise.in_flight`. Every attempt is logged to
-    ``vioframe.estimation.initialization``.
+    Every attempt is logged to ``vioframe.estimation.initialization``.
     """
 
-    def __init__(self, calibration: Calibration, imu_noise_factor: float = 2.5) -> None:
-        self._factor = _IN_MOTION * imu_noise_factor
+    def __init__(self, calibration: Calibration) -> None:
         self._given = calibration
         self._calibration = calibration.only(0)
         self._sensors = SensorCheck()
@@ -291,8 +289,8 @@ class Initializer:
         )
         return replace(
             given,
-            gyro_density=min(gyro, self._factor * given.gyro_density),
-            accel_density=min(accel, self._factor * given.accel_density),
+            gyro_density=min(gyro, _IN_MOTION * given.gyro_density),
+            accel_density=min(accel, _IN_MOTION * given.accel_density),
         )
 
     def _take_over(self, found: Found) -> None:
