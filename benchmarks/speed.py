@@ -21,6 +21,7 @@ from collections import defaultdict
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
+from shutil import rmtree
 from statistics import median
 from tempfile import TemporaryDirectory
 from time import monotonic, sleep
@@ -114,11 +115,11 @@ def _run(data: Path, run: str, checkout: Path | None, cores: int, out: Path) -> 
     """One run of the command line, by the code of ``checkout``."""
     detector, backend = run.split("+")
     command = [sys.executable, "-m", "vioframe", "run", str(data), "--detector", detector, "--backend", backend]
-    command += ["-o", "cameras=cam0", "--quiet", "--overwrite", "--out", str(out)]
+    command += ["-o", "cameras=cam0", "--quiet", "--out", str(out)]
     code = {}
     if checkout is not None:  # its own, though another vioframe may lie in the folder that this was begun in
         code = {"PYTHONPATH": f"{checkout}{os.pathsep}{checkout / 'plugins'}", "PYTHONSAFEPATH": "1"}
-    (out / "timings.csv").unlink(missing_ok=True)
+    rmtree(out, ignore_errors=True)
     begin_s = monotonic()
     process = _on_cores(command, cores, code)
     while process.poll() is None and _lines(out / "timings.csv") < 2:

@@ -17,6 +17,7 @@ from ruamel.yaml import YAML
 
 import vioframe.cli
 import vioframe.cli.run as cli_run
+from vioframe import pipeline
 from vioframe.cli import main
 from vioframe.frontend_process import FrontendProcess
 from vioframe.parts import config
@@ -261,6 +262,23 @@ def test_ground_truth_is_kept_with_the_run_and_compared(toy):
     result = run_toy(toy, *moving, "--ground-truth", "truth.tum", "--out", "a")
     assert "ATE 0.0 mm (position and yaw aligned) over 20.0 m" in result.stdout
     assert len(RunFolder.open("a").ground_truth()) == 60
+
+
+def test_no_frame_waits_for_the_ground_truth(toy, monkeypatch):
+    rows = []
+
+    def read(experiment):
+        rows.append(len(Path("a/timings.csv").read_text().splitlines()))
+        raise vioframe.errors.DatasetError("this recording is damaged")
+
+    monkeypatch.setattr(pipeline.Experiment, "ground_truth", property(read))
+    assert "this recording is damaged" in error_line("run", toy, "--backend", "still", "--quiet", "--out", "a")
+    assert rows == [61]
+    # Where it ended before, that is what is told.
+    broken = "-o", "broken_at=40"
+    line = error_line("run", toy, "--backend", "still", *broken, "--quiet", "--out", "a", "--overwrite")
+    assert "ends in the middle of a message" in line
+    assert rows[1] < 61
 
 
 def test_runs_never_overwrite_one_another_unless_asked(toy):

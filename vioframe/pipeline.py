@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
@@ -16,7 +16,7 @@ from typing import Any, cast
 from vioframe.cores import limited_threads
 from vioframe.diagnosis import HOPELESS, Certainty, Diagnosis, Gatherer, diagnose, gather
 from vioframe.diagnosis.stamps import span_s
-from vioframe.errors import DatasetError, RunError
+from vioframe.errors import DatasetError, RunError, VioframeError
 from vioframe.frontend_process import FrontendProcess
 from vioframe.geometry.trajectory import Trajectory
 from vioframe.incidents import Incidents
@@ -134,7 +134,7 @@ def prepare(
 ) -> Experiment:
     """Check the whole of ``config``, then open the data set and create the parts.
 
-    ``warm``, the back-end has flown once: it begins later, but one that fails does so before anything is replaced. A
+    ``warm``, the back-end has flown once: it begins later, but one that fails does so before a run is replaced. A
     live source, which waits for nobody, always finds it so; all that is used of it is written to ``tape``.
 
     ``pipelined`` as of :class:`~vioframe.odometry.Odometry`, but for a live source: there a frame that was read ahead
@@ -256,10 +256,11 @@ def _write(
     (folder / "config.yaml").write_text(configuration.render(config, registry), encoding="utf-8")
     write_json(folder / "machine.json", machine.describe())
     write_calibration(experiment.dataset.calibration, folder / "calibration")
-    if (truth := experiment.ground_truth) is not None:
-        write_tum(truth, folder / "ground_truth.tum")
-    # The clock stood still meanwhile: no frame was under way.
-    with Recorder(folder, _about(experiment), experiment.incidents, working_s() - taken_s) as recorder:
+    begin_s = working_s() - taken_s  # the clock stood still meanwhile: no frame was under way
+    with (
+        _truth_at_the_end(experiment, folder),
+        Recorder(folder, _about(experiment), experiment.incidents, begin_s) as recorder,
+    ):
         try:
             for step in steps:
                 between = () if live is None else live.estimated(step)
@@ -277,6 +278,23 @@ def _write(
             error.add_note(f"what was estimated until then is in {folder}")
             raise
     return recorder.summary
+
+
+@contextmanager
+def _truth_at_the_end(experiment: Experiment, folder: Path) -> Iterator[None]:
+    """Write the ground truth, however a run ends: a bag is gone through for it, which no frame is to wait for."""
+
+    def write_truth() -> None:
+        if (truth := experiment.ground_truth) is not None:
+            write_tum(truth, folder / "ground_truth.tum")
+
+    try:
+        yield
+    except BaseException:
+        with suppress(VioframeError, OSError):  # a recording that is damaged may have none; why it ended counts
+            write_truth()
+        raise
+    write_truth()
 
 
 def _about(experiment: Experiment) -> dict[str, Any]:

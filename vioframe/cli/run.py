@@ -102,10 +102,11 @@ def run(
 
         if out is not None:
             check_run_folder(out, overwrite=overwrite)
+        replaces = overwrite and out is not None and out.exists()
         installed = registry.load()
         config = _configure(installed, **choices)
         with Bar(None, quiet=quiet, late=True) as bar, helped(config.backend.name):
-            experiment = prepare(config, installed, warm=overwrite, tape=tape, pipelined=pipelined)
+            experiment = prepare(config, installed, warm=replaces, tape=tape, pipelined=pipelined)
             folder = out or free_run_folder(Path("runs"), experiment.name)
             told = _watched(bar, experiment)
             with _ended_by_signals(experiment.live), _viewer(experiment, view, save_view) as shown:

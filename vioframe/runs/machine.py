@@ -6,7 +6,8 @@ import os
 import platform
 import re
 import subprocess
-from importlib.metadata import distribution, requires, version
+from contextlib import suppress
+from importlib.metadata import PackageNotFoundError, metadata, requires, version
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +29,13 @@ def describe() -> dict[str, Any]:
 
 def versions() -> dict[str, str]:
     """Of what vioframe is built on, as far as it is installed."""
-    return {name: version(name) for name in _dependencies("vioframe")}
+    found = {}
+    for requirement in requires("vioframe") or []:
+        dependency = re.split(r"[^\w.-]", requirement, maxsplit=1)[0]
+        with suppress(PackageNotFoundError):  # of an extra
+            facts = metadata(dependency)  # each look at them reads a file
+            found[facts["Name"]] = facts["Version"]
+    return dict(sorted(found.items()))
 
 
 def commit(folder: Path) -> str | None:
@@ -70,15 +77,3 @@ def threads() -> dict[str, int]:
 
     pools = {Path(pool["filepath"]).name: pool["num_threads"] for pool in threadpool_info()}
     return {"opencv": cv2.getNumThreads(), **dict(sorted(pools.items()))}
-
-
-def _dependencies(name: str) -> list[str]:
-    """The distributions that ``name`` needs in every installation, and those of its extras that are installed."""
-    found = set()
-    for requirement in requires(name) or []:
-        dependency = re.split(r"[^\w.-]", requirement, maxsplit=1)[0]
-        try:
-            found.add(distribution(dependency).name)
-        except ModuleNotFoundError:
-            continue
-    return sorted(found - {name})
