@@ -6,8 +6,8 @@ import numpy as np
 
 from vioframe.arrays import Float, Int
 
-# Times that noise is taken for larger than it is at least: until tracks tell, and at most. With one as small as that a
-# filter that was too sure of its first second stays so, and a robust loss would not find a calibration that is off.
+# Times the least noise that is begun with and that is counted with at most. With little at first, a filter that was too
+# sure of its first second stays so, and a robust loss does not find that a calibration is off.
 _AT_FIRST, _AT_MOST = 5.0, 12.0
 # How many tracks it is found by.
 _REMEMBERED = 100
