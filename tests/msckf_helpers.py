@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from vioframe.estimation.factors.tracks import TrackTable
+from vioframe.estimation.options import EstimationOptions
 from vioframe.geometry import so3
 from vioframe.io.calibration import packaged_calibration
 from vioframe.simulation import TrackSequence, simulated_sequence
@@ -16,6 +17,8 @@ from vioframe_msckf.state import IMU, FilterState
 
 CALIBRATION = packaged_calibration("euroc", cameras=["cam0"])
 STEREO = packaged_calibration("euroc")
+EXACT = EstimationOptions(gyro_noise_factor=1.0, accel_noise_factor=1.0)
+"""Readings are as noisy as stated, and no more."""
 START_COV = np.diag(np.repeat([0.005, 0.001, 0.02, 0.005, 0.05], 3) ** 2)
 """How well a drawn start is known: rad, m, m/s, rad/s, m/s^2."""
 

@@ -5,7 +5,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from msckf_helpers import drawn_start, pose_nees
+from msckf_helpers import EXACT, drawn_start, pose_nees
 from threadpoolctl import threadpool_limits
 
 from vioframe.bench import BackendRun, run_backend
@@ -200,7 +200,7 @@ def test_the_covariance_is_of_the_size_of_the_errors(seed):
     """Poses of one odometry hang together, which the filter does not know: the bounds are wide, and on both sides."""
     sequence = simulated_sequence("figure_eight", duration_s=15.0, seed=seed)
     start = drawn_start(sequence, 0, seed)
-    run = run_backend(sequence, LooseEkf(), EstimationOptions(gyro_noise_factor=1.0, accel_noise_factor=1.0), start)
+    run = run_backend(sequence, LooseEkf(), EXACT, start)
     truth = {state.t_ns: state for state in sequence.true_states}
     orientation, position = pose_nees(run.states, truth)
     assert 0.75 < orientation < 6.0

@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from msckf_helpers import CALIBRATION, STEREO, drawn_start, pose_nees, since
+from msckf_helpers import CALIBRATION, EXACT, STEREO, drawn_start, pose_nees, since
 from scipy.stats import chi2
 
 from vioframe.bench import BackendRun, run_backend
@@ -22,8 +22,6 @@ from vioframe_msckf.backend import Msckf
 from vioframe_msckf.measurement import ACCEPTED, GATED
 from vioframe_msckf.options import MsckfOptions
 
-EXACT = EstimationOptions(gyro_noise_factor=1.0, accel_noise_factor=1.0)
-"""Readings are as noisy as stated, and no more."""
 WHITE = MsckfOptions(landmark_drift_px=0.0)
 """Points that are simulated stay on their landmarks."""
 CALIBRATED = replace(WHITE, calibrate_extrinsics=False, calibrate_time_offset=False, calibrate_intrinsics=False)

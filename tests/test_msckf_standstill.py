@@ -5,11 +5,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from msckf_helpers import CALIBRATION, drawn_start, random_covariance, random_state, since
+from msckf_helpers import CALIBRATION, EXACT, drawn_start, random_covariance, random_state, since
 
 from vioframe.bench import run_backend
 from vioframe.estimation.lifecycle import LifeCycle
-from vioframe.estimation.options import EstimationOptions
 from vioframe.estimation.standstill import Standstill, StandstillDetector, common_motion_px
 from vioframe.geometry import so3
 from vioframe.parts import registry
@@ -115,9 +114,7 @@ def test_take_off_is_followed_from_where_it_begins(name, most):
     sequence = simulated_sequence("inspection", pixel_sigma=0.1, duration_s=5.0, seed=1)
     backend = registry.load().create_backend(name)
     start = drawn_start(sequence, 1, 0)
-    run = run_backend(
-        since(sequence, 1), backend, EstimationOptions(gyro_noise_factor=1.0, accel_noise_factor=1.0), start
-    )
+    run = run_backend(since(sequence, 1), backend, EXACT, start)
     errors = np.array([s.p_WB - t.p_WB for s, t in zip(run.states, sequence.true_states[1:], strict=True)])
     assert np.linalg.norm(errors, axis=1)[: 3 * 20].max() < 0.035
     nees = [e @ np.linalg.solve(s.cov[3:6, 3:6], e) for s, e in zip(run.states, errors, strict=True)]

@@ -6,10 +6,9 @@ from functools import cache
 
 import numpy as np
 import pytest
-from msckf_helpers import CALIBRATION, drawn_start, since
+from msckf_helpers import CALIBRATION, EXACT, drawn_start, since
 
 from vioframe.bench import BackendRun, run_backend
-from vioframe.estimation.options import EstimationOptions
 from vioframe.evaluation import evaluate
 from vioframe.geometry.trajectory import Trajectory
 from vioframe.interfaces import Backend
@@ -20,7 +19,6 @@ from vioframe_sliding_window.backend import SlidingWindow
 from vioframe_sliding_window.options import SlidingWindowOptions
 
 READOUT_S = 0.03
-EXACT = EstimationOptions(gyro_noise_factor=1.0, accel_noise_factor=1.0)
 
 
 def msckf(calibrate: bool) -> Backend:

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from msckf_helpers import CALIBRATION, STEREO, drawn_start, pose_nees, since
+from msckf_helpers import CALIBRATION, EXACT, STEREO, drawn_start, pose_nees, since
 from scipy.stats import chi2
 from threadpoolctl import threadpool_limits
 
@@ -33,8 +33,6 @@ from vioframe_sliding_window.window import parallax
 
 UP = np.array([0.0, 0.0, 1.0])
 CALIBRATED = Options(calibrate_extrinsics=False, calibrate_time_offset=False)
-EXACT = EstimationOptions(gyro_noise_factor=1.0, accel_noise_factor=1.0)
-"""Readings are as noisy as stated, and no more."""
 
 
 @pytest.fixture(autouse=True)

@@ -100,9 +100,7 @@ def run(
         from vioframe.runs.recorder import check_run_folder, free_run_folder
         from vioframe.warming import helped
 
-        if out is not None:
-            check_run_folder(out, overwrite=overwrite)
-        replaces = overwrite and out is not None and out.exists()
+        replaces = out is not None and check_run_folder(out, overwrite=overwrite)
         installed = registry.load()
         config = _configure(installed, **choices)
         with Bar(None, quiet=quiet, late=True) as bar, helped(config.backend.name):

@@ -24,10 +24,6 @@ class EstimationOptions:
     max_blind_s: float = 4.0
     """Seconds in which nothing seen corrects the estimate, after which it is given up and begun anew."""
 
-    def in_flight(self, imu: ImuNoise) -> ImuNoise:
-        """At most what the readings of ``imu`` are off by in flight: vibration adds to the sensor's own white noise."""
-        return imu.times(self.gyro_noise_factor, self.accel_noise_factor)
-
     def __post_init__(self) -> None:
         for name in ("gyro_noise_factor", "accel_noise_factor", "max_blind_s"):
             if not getattr(self, name) > 0.0:
@@ -36,3 +32,7 @@ class EstimationOptions:
             raise ConfigError(
                 f"estimation option standstill_disparity_px must be zero or more, got {self.standstill_disparity_px!r}"
             )
+
+    def in_flight(self, imu: ImuNoise) -> ImuNoise:
+        """At most what the readings of ``imu`` are off by in flight: vibration adds to the sensor's own white noise."""
+        return imu.times(self.gyro_noise_factor, self.accel_noise_factor)

@@ -83,17 +83,20 @@ _NUMBER = re.compile(r"-?\d+(\.\d+)?")
 _RECENT_LANDMARKS = 5000
 
 
-def check_run_folder(path: Path, *, overwrite: bool = False, marker: str = "summary.json") -> None:
-    """Raise :class:`RunError` where no run may be written to ``path``: only a run is ever replaced, and on request.
+def check_run_folder(path: Path, *, overwrite: bool = False, marker: str = "summary.json") -> bool:
+    """Whether there is a run at ``path`` to be replaced.
+
+    Raises :class:`RunError` where no run may be written there: only a run is ever replaced, and on request.
 
     ``marker`` is the file by which a folder of that kind is known.
     """
     if not path.exists() or (path.is_dir() and not any(path.iterdir())):
-        return
+        return False
     if not overwrite:
         raise RunError(f"{path} exists already; choose another --out or pass --overwrite")
     if not (path / marker).is_file():
         raise RunError(f"{path} holds no {marker}, is not a run folder and is not overwritten; choose another --out")
+    return True
 
 
 def new_run_folder(
