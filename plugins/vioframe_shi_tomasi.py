@@ -80,19 +80,21 @@ def _peaks(eigenvalue: NDArray[np.float32], least: float) -> NDArray[np.int64]:
     """Places in the flattened image that are higher than ``least``, and than none of the eight about them is."""
     height, width = np.uint64(eigenvalue.shape[0]), np.uint64(eigenvalue.shape[1])
     one, two = np.uint64(1), np.uint64(2)
-    out, n = np.empty(eigenvalue.size // 4 + 1, np.int64), 0
-    is_peak = np.zeros(width, np.uint8)
+    out, n = np.empty(eigenvalue.size // 4 + 1, np.int64), np.uint64(0)
+    highest, is_peak = np.empty(width, np.float32), np.zeros(width, np.uint8)
+    # Loops without branches: several pixels at once, and none guessed wrong.
     for r in range(one, height - one):
         above, here, below = eigenvalue[r - one], eigenvalue[r], eigenvalue[r + one]
-        for c in range(width - two):  # without a branch: several at once
-            highest = max(least, max(above[c], above[c + one], above[c + two]))
-            highest = max(highest, here[c], here[c + two], below[c], below[c + one], below[c + two])
+        for c in range(width):
+            of_two = above[c] if above[c] > below[c] else below[c]
+            highest[c] = of_two if of_two > here[c] else here[c]
+        for c in range(width - two):
+            of_two = highest[c] if highest[c] > highest[c + two] else highest[c + two]
             v = here[c + one]
-            is_peak[c + one] = (v >= highest) & (v > least)
+            is_peak[c + one] = (v >= of_two) & (v >= highest[c + one]) & (v > least)
         for c in range(one, width - one):
-            if is_peak[c]:
-                out[n] = r * width + c
-                n += 1
+            out[n] = r * width + c
+            n += np.uint64(is_peak[c])
     return out[:n]
 
 

@@ -67,12 +67,15 @@ def random_state(
         state.R_WB, state.p_WB = state.R_WB @ so3.exp(0.1 * rng.normal(size=3)), state.p_WB + 0.3 * rng.normal(size=3)
         state.augment_clone(rng.normal(size=3))
     for k in range(landmarks):
-        n = len(state.cov)
-        p_WF = 5.0 * rng.normal(size=3)
-        state.add_landmark(10 + k, p_WF, p_WF, np.zeros((3, n)), np.eye(3))
+        add_independent(state, 10 + k, 5.0 * rng.normal(size=3), np.eye(3))
     if calibrate:
         state.cov = scale**2 * random_covariance(rng, len(state.cov))
     return state
+
+
+def add_independent(state: FilterState, landmark_id: int, p_WF: Float, cov: Float) -> None:
+    """A landmark (3,) of covariance (3, 3) that nothing else has to do with."""
+    state.add_landmarks(np.array([landmark_id]), p_WF[None], p_WF[None], np.zeros((1, 3, 0)), slice(0, 0), cov[None])
 
 
 def seeing_state(

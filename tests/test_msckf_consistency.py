@@ -34,15 +34,15 @@ class GateCounts:
         self.tracks: Counter[int] = Counter()
         self.wrong_tracks: Counter[int] = Counter()
         self.landmarks, self.promoted = np.zeros(2, int), np.zeros(2, int)
-        self.wrong = wrong
-        measure, update, promote = updates.msckf_rows, updates.update_from_landmarks, updates.promote_tracks
+        self.wrong, self._finished = wrong, 0
+        measure, update, use = updates.msckf_rows, updates.update_from_landmarks, updates.update_from_tracks
 
         def measured(window, xy, xy_normalised, seen, *arguments):
-            *rows, verdicts = measure(window, xy, xy_normalised, seen, *arguments)
-            for points, mask, verdict in zip(xy, seen, verdicts.tolist(), strict=True):
+            found = measure(window, xy, xy_normalised, seen, *arguments)
+            for points, mask, verdict in zip(xy, seen, found.verdict[: self._finished].tolist(), strict=False):
                 spoilt = any(tuple(point) in self.wrong for point in points[mask].tolist())
                 (self.wrong_tracks if spoilt else self.tracks)[verdict] += 1
-            return *rows, verdicts
+            return found
 
         def updated(state, tracks, *arguments):
             offered = int(np.isin(tracks.ids, state.landmark_ids).sum())
@@ -50,15 +50,15 @@ class GateCounts:
             self.landmarks += used, offered
             return used
 
-        def promoted(state, *arguments):
-            before = len(state.landmark_ids)
-            used_up = promote(state, *arguments)
-            self.promoted += len(state.landmark_ids) - before, len(used_up)
-            return used_up
+        def used(state, observations, selection, *arguments):
+            before, self._finished = len(state.landmark_ids), len(selection.finished)
+            gone, *found = use(state, observations, selection, *arguments)
+            self.promoted += len(state.landmark_ids) - before, np.isin(gone, selection.promoted).sum()
+            return gone, *found
 
         monkeypatch.setattr(updates, "msckf_rows", measured)
         monkeypatch.setattr(backend_module, "update_from_landmarks", updated)
-        monkeypatch.setattr(backend_module, "promote_tracks", promoted)
+        monkeypatch.setattr(backend_module, "update_from_tracks", used)
 
     @property
     def rates(self) -> Float:
@@ -231,9 +231,9 @@ def test_a_camera_may_be_read_later_than_the_other(options, told_ms):
 
 
 def test_without_first_estimates_the_covariance_is_too_small():
-    sure, _ = mean_nees("figure_eight", 2, 20.0, replace(WHITE, first_estimate_jacobians=False))
-    honest, _ = mean_nees("figure_eight", 2, 20.0, WHITE)
-    assert honest < chi2.ppf(0.975, 6) / 2
+    sure, _ = mean_nees("figure_eight", 3, 20.0, replace(WHITE, first_estimate_jacobians=False))
+    honest, _ = mean_nees("figure_eight", 3, 20.0, WHITE)
+    assert honest < chi2.ppf(0.975, 9) / 3
     assert sure > 1.5 * honest
 
 

@@ -4,7 +4,7 @@ import copy
 
 import numpy as np
 import pytest
-from msckf_helpers import CALIBRATION, STEREO, random_covariance, seeing_state, sighting_rows
+from msckf_helpers import CALIBRATION, STEREO, add_independent, random_covariance, seeing_state, sighting_rows
 from scipy.linalg import null_space
 from scipy.stats import chi2
 
@@ -21,7 +21,7 @@ from vioframe_msckf.measurement import (
 )
 from vioframe_msckf.options import MsckfOptions
 from vioframe_msckf.state import IMU, OFFSET, READOUT
-from vioframe_msckf.updates import PointNoise, promote_tracks, update_from_landmarks
+from vioframe_msckf.updates import PointNoise, Selection, update_from_landmarks, update_from_tracks
 
 NOISE = PointNoise(0.2)
 CAMERAS = {
@@ -75,6 +75,12 @@ def rows_of(table, row, window, pixel_sigma):
     return track_rows(window, table.xy[row], table.xy_normalised[row], table.seen[row], pixel_sigma)
 
 
+def promote(state, table, rows, options, point_noise, gate):
+    """The rows used up of those offered as landmarks."""
+    selection = Selection(np.empty(0, np.intp), rows)
+    return update_from_tracks(state, table, selection, options, point_noise, gate)[0]
+
+
 @pytest.mark.parametrize("calibration", [CALIBRATION, STEREO], ids=["mono", "stereo"])
 @pytest.mark.parametrize("readout_s", [0.0, 0.03], ids=["global", "rolling"])
 def test_rows_of_landmarks_predict_how_residuals_change_with_the_state(readout_s, calibration):
@@ -86,7 +92,7 @@ def test_rows_of_landmarks_predict_how_residuals_change_with_the_state(readout_s
     for row in full:
         ok, p_WF, *_ = rows_of(table, row, Window.of(state, False), 1.0)
         assert ok
-        state.add_landmark(row, p_WF, p_WF, np.zeros((3, len(state.cov))), np.eye(3))
+        add_independent(state, row, p_WF, np.eye(3))
     landmarks, cameras = (index.ravel() for index in np.indices((len(full), cameras_count)))
     clone = 3
     xy = table.xy[full[landmarks], cameras_count * clone + cameras]
@@ -127,7 +133,7 @@ def test_first_estimates_hold_the_jacobian_and_not_the_residual():
     state, table = seeing_state()
     row = np.flatnonzero(table.seen.all(axis=1))[0]
     _, p_WF, *_ = rows_of(table, row, Window.of(state, True), 1.0)
-    state.add_landmark(row, p_WF, p_WF, np.zeros((3, len(state.cov))), np.eye(3))
+    add_independent(state, row, p_WF, np.eye(3))
     moved, dx = copy.deepcopy(state), 0.01 * np.random.default_rng(0).normal(size=len(state.cov))
     dx[state.calibrated] = 0.0
     moved._correct(dx)
@@ -184,32 +190,41 @@ def test_sightings_that_do_not_fit_get_cauchys_variance():
 
 
 @pytest.mark.parametrize("cauchy", [0.5, 1e6])
-def test_delayed_initialisation_is_the_joint_update_with_nothing_known_of_the_landmark(cauchy):
+def test_tracks_and_new_landmarks_are_one_update_with_nothing_known_of_any_landmark(cauchy):
+    """Two tracks become landmarks and two do not, between them in the table."""
     state, table = seeing_state()
     options, noise = MsckfOptions(cauchy_sigmas=cauchy), PointNoise(0.14)
-    row = np.flatnonzero(table.seen.all(axis=1))[0]
-    _, p_WF, H, H_f, residual = rows_of(table, row, Window.of(state, True), noise.px)
-    # In information form the landmark's prior is exactly nothing.
+    full = np.flatnonzero(table.seen.all(axis=1))[:4]
+    promoted, finished = full[[0, 2]], full[[1, 3]]
+    # In information form the landmarks' prior is exactly nothing; those that stay in the state come first.
     n = len(state.cov)
-    joint = np.zeros((len(residual), n + 3))
-    joint[:, IMU:n], joint[:, n:] = H, H_f
-    S = H @ state.cov[IMU:, IMU:] @ H.T
-    variances = np.repeat(distance_and_variances(S, H_f, residual, noise.px**2, cauchy)[1], 2)
-    information = joint.T @ (joint / variances[:, None])
-    information[:n, :n] += np.linalg.inv(state.cov)
+    information, gradient, p_WF = np.zeros((n + 12, n + 12)), np.zeros(n + 12), []
+    information[:n, :n] = np.linalg.inv(state.cov)
+    for k, row in enumerate([*promoted, *finished]):
+        _, p, H, H_f, residual = rows_of(table, row, Window.of(state, True), noise.px)
+        joint = np.zeros((len(residual), n + 12))
+        joint[:, IMU:n], joint[:, n + 3 * k : n + 3 * k + 3] = H, H_f
+        S = H @ state.cov[IMU:, IMU:] @ H.T
+        variances = np.repeat(distance_and_variances(S, H_f, residual, noise.px**2, cauchy)[1], 2)
+        information += joint.T @ (joint / variances[:, None])
+        gradient += joint.T @ (residual / variances)
+        p_WF.append(p)
     cov = np.linalg.inv(information)
-    dx = cov @ joint.T @ (residual / variances)
+    dx, cov = cov @ gradient, cov[: n + 6, : n + 6]
 
     before = copy.deepcopy(state)
-    gate = chi2.ppf(0.999999, np.arange(1, 40))
-    assert promote_tracks(state, table, np.array([row]), options, noise, np.r_[0.0, gate]).tolist() == [row]
+    gate = np.r_[0.0, chi2.ppf(0.999999, np.arange(1, 40))]
+    gone, ids, positions = update_from_tracks(state, table, Selection(finished, promoted), options, noise, gate)
+    assert sorted(gone) == full.tolist()
+    assert ids.tolist() == table.ids[finished].tolist()
+    assert state.landmark_ids.tolist() == table.ids[promoted].tolist()
+    np.testing.assert_allclose(positions, p_WF[2:], atol=0.0)
     np.testing.assert_allclose(state.cov, cov, rtol=1e-6, atol=1e-9 * np.abs(cov).max())
-    np.testing.assert_allclose(state.p_WF[0], p_WF + dx[n:], atol=1e-9)
-    np.testing.assert_allclose(state.p_WF_first[0], p_WF, atol=0.0)
+    np.testing.assert_allclose(state.p_WF, p_WF[:2] + dx[n : n + 6].reshape(2, 3), atol=1e-9)
+    np.testing.assert_allclose(state.p_WF_first, p_WF[:2], atol=0.0)
     np.testing.assert_allclose(state.p_WB, before.p_WB + dx[3:6], atol=1e-9)
     np.testing.assert_allclose(so3.log(before.R_WB.T @ state.R_WB), dx[:3], atol=1e-9)
     np.testing.assert_allclose(state.clones.p_WB, before.clones.p_WB + dx[30:n].reshape(-1, 6)[:, 3:], atol=1e-9)
-    assert state.landmark_ids.tolist() == [table.ids[row]]
 
 
 @pytest.mark.parametrize("cauchy", [0.5, 1e6])
@@ -219,7 +234,7 @@ def test_a_landmark_that_does_not_fit_is_discounted_and_gated_as_it_is(cauchy):
     full = np.flatnonzero(table.seen.all(axis=1))[:4]
     for row in full:
         _, p_WF, *_ = rows_of(table, row, Window.of(state, True), 1.0)
-        state.add_landmark(int(table.ids[row]), p_WF, p_WF, np.zeros((3, len(state.cov))), 0.01**2 * np.eye(3))
+        add_independent(state, int(table.ids[row]), p_WF, 0.01**2 * np.eye(3))
     options, noise = MsckfOptions(cauchy_sigmas=cauchy, landmark_drift_px=0.0), PointNoise(2.0)
     index, first, newest = np.arange(4), np.zeros(4, np.int64), len(state.clones) - 1
     xy = table.xy[full, -1].copy()
@@ -258,7 +273,7 @@ def test_delayed_initialisation_is_gated_by_two_rows_a_view_but_for_the_three_of
             gate = np.full(40, elsewhere)
             gate[2 * count - 3] = at_dof
             rows = np.flatnonzero(views == count)[:1]
-            assert promote_tracks(state, table, rows, MsckfOptions(), NOISE, gate).tolist() == rows.tolist()
+            assert promote(state, table, rows, MsckfOptions(), NOISE, gate).tolist() == rows.tolist()
             assert len(state.landmark_ids) == (at_dof > 0.0)
 
 
@@ -268,7 +283,7 @@ def test_an_implausible_track_is_used_up_and_changes_nothing():
     table.xy[row, 2] += 60.0
     cov = state.cov.copy()
     gate = np.r_[0.0, chi2.ppf(0.95, np.arange(1, 40))]
-    assert promote_tracks(state, table, np.array([row]), MsckfOptions(), NOISE, gate).tolist() == [row]
+    assert promote(state, table, np.array([row]), MsckfOptions(), NOISE, gate).tolist() == [row]
     assert not len(state.landmark_ids)
     np.testing.assert_array_equal(state.cov, cov)
 
@@ -278,7 +293,7 @@ def test_a_track_waits_until_its_distance_is_known():
     state, table = seeing_state()
     rows = np.flatnonzero(table.seen.all(axis=1))[:1]
     cov, gate = state.cov.copy(), np.full(40, np.inf)
-    assert not len(promote_tracks(state, table, rows, MsckfOptions(), PointNoise(5.6), gate))
+    assert not len(promote(state, table, rows, MsckfOptions(), PointNoise(5.6), gate))
     assert not len(state.landmark_ids)
     np.testing.assert_array_equal(state.cov, cov)
-    assert promote_tracks(state, table, rows, MsckfOptions(), PointNoise(0.14), gate).tolist() == rows.tolist()
+    assert promote(state, table, rows, MsckfOptions(), PointNoise(0.14), gate).tolist() == rows.tolist()

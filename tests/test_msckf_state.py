@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from filterpy.kalman import KalmanFilter
 from msckf_helpers import CALIBRATION, random_covariance, random_state
+from scipy.linalg import block_diag
 
 from vioframe.errors import DivergedError
 from vioframe.geometry import so3
@@ -77,16 +78,21 @@ def test_dropping_a_clone_and_landmarks_leaves_the_marginal():
     np.testing.assert_array_equal(state.p_WF, points[[0, 2]])
 
 
-def test_a_landmark_comes_last_with_its_correlations():
+def test_landmarks_come_last_with_their_correlations():
     state, rng = random_state(5), np.random.default_rng(5)
-    P, n = state.cov.copy(), len(state.cov)
-    joint = random_covariance(rng, n + 3)
-    state.add_landmark(99, np.array([1.0, 2.0, 3.0]), np.array([1.1, 2.0, 3.0]), joint[n:, :n], joint[n:, n:])
+    P, n, columns = state.cov.copy(), len(state.cov), slice(IMU, state.landmarks_begin)
+    gain, own = rng.normal(size=(2, 3, columns.stop - IMU)), np.stack([random_covariance(rng, 3) for _ in range(2)])
+    p_WF = rng.normal(size=(2, 3))
+    state.add_landmarks(np.array([98, 99]), p_WF, p_WF + 0.1, gain, columns, own)
+    G = np.zeros((6, n))
+    G[:, columns] = gain.reshape(6, -1)
     np.testing.assert_array_equal(state.cov[:n, :n], P)
-    np.testing.assert_allclose(state.cov[n:], joint[n:], rtol=1e-15)
-    np.testing.assert_allclose(state.cov[:, n:], joint[:, n:], rtol=1e-15)
-    np.testing.assert_array_equal(state.p_WF[-1], [1.0, 2.0, 3.0])
-    np.testing.assert_array_equal(state.p_WF_first[-1], [1.1, 2.0, 3.0])
+    np.testing.assert_allclose(state.cov[n:, :n], G @ P, rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(state.cov[n:, n:], G @ P @ G.T + block_diag(*own), rtol=1e-12, atol=1e-12)
+    np.testing.assert_array_equal(state.cov, state.cov.T)
+    assert state.landmark_ids[-2:].tolist() == [98, 99]
+    np.testing.assert_array_equal(state.p_WF[-2:], p_WF)
+    np.testing.assert_array_equal(state.p_WF_first[-2:], p_WF + 0.1)
 
 
 @pytest.mark.parametrize("part", ["all", "window", "imu"])
@@ -183,9 +189,8 @@ def test_covariance_stays_symmetric_and_positive_through_everything():
         n = len(state.cov)
         whole = slice(0, n)
         if k % 3 == 0:
-            gain = rng.normal(size=(3, n)) / np.sqrt(n)
-            cov = gain @ state.cov @ gain.T + 1e-4 * np.eye(3)
-            state.add_landmark(100 + k, np.ones(3), np.ones(3), gain @ state.cov, cov)
+            gain = rng.normal(size=(1, 3, n)) / np.sqrt(n)
+            state.add_landmarks(np.array([100 + k]), *np.ones((2, 1, 3)), gain, whole, 1e-4 * np.eye(3)[None])
         H = rng.normal(size=(5 + k % 60, n))
         S = H @ state.cov[whole, whole] @ H.T
         variance = 10.0 ** rng.uniform(-8, 2)

@@ -19,7 +19,6 @@ from vioframe_msckf.state import FilterState
 from vioframe_msckf.updates import (
     Turns,
     hold_still,
-    promote_tracks,
     select_tracks,
     update_from_landmarks,
     update_from_tracks,
@@ -74,15 +73,14 @@ class Msckf:
         full = self._turns.most >= options.max_clones
         watch.lap("propagate")
 
-        selection = select_tracks(observations, state, options, full)
-        ids, p_WF = update_from_tracks(state, observations, selection.finished, options, point_noise, gate)
-        watch.lap("msckf_update")
-        used = update_from_landmarks(state, tracks, self._turns.in_sight, options, point_noise, gate)
+        # Ahead of the tracks: what these make landmarks of has been used with what the newest frame sees of it.
+        landmarks = update_from_landmarks(state, tracks, self._turns.in_sight, options, point_noise, gate)
         watch.lap("landmark_update")
-        promoted = promote_tracks(state, observations, selection.promoted, options, point_noise, gate)
-        watch.lap("delayed_init")
+        selection = select_tracks(observations, state, options, full)
+        gone, ids, p_WF = update_from_tracks(state, observations, selection, options, point_noise, gate)
+        watch.lap("msckf_update")
 
-        observations.drop(np.concatenate([selection.finished, promoted]))
+        observations.drop(gone)
         if full:
             state.drop_oldest_clone()
             observations.drop_frame(0)
@@ -95,7 +93,7 @@ class Msckf:
             np.concatenate([ids, state.landmark_ids]),
             np.concatenate([p_WF, state.p_WF]),
             is_keyframe=True,
-            corrected=bool(len(ids) or used),
+            corrected=bool(len(ids) or landmarks),
             calibration=state.calibration(),
             stage_seconds=watch.seconds,
         )

@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vioframe.geometry.kernels import cross, distort, exp, hat, intrinsics_jacobian, product, turned, undistort
+from vioframe.geometry.kernels import distort, exp, intrinsics_jacobian, product, turned, undistort
 from vioframe.geometry.triangulation import triangulate
 from vioframe.jit import kernel
 from vioframe.types import Float, Int
@@ -79,37 +79,72 @@ def _camera_at(w, k, c, y):
     return product(turn, w.R_BC[c]), turned(turn, w.p_BC[c]) + late_s * w.velocity_B[k]
 
 
+# Vectors as tuples, for which nothing is allocated.
+
+
+@kernel(inlined=True)
+def _by(R, v):
+    """R v."""
+    return (
+        R[0, 0] * v[0] + R[0, 1] * v[1] + R[0, 2] * v[2],
+        R[1, 0] * v[0] + R[1, 1] * v[1] + R[1, 2] * v[2],
+        R[2, 0] * v[0] + R[2, 1] * v[1] + R[2, 2] * v[2],
+    )
+
+
+@kernel(inlined=True)
+def _back(R, a, b):
+    """R^T (a - b)."""
+    x, y, z = a[0] - b[0], a[1] - b[1], a[2] - b[2]
+    return (
+        R[0, 0] * x + R[1, 0] * y + R[2, 0] * z,
+        R[0, 1] * x + R[1, 1] * y + R[2, 1] * z,
+        R[0, 2] * x + R[1, 2] * y + R[2, 2] * z,
+    )
+
+
+@kernel(inlined=True)
+def _cross(a, b):
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+
+
+@kernel(inlined=True)
+def _dot(a, b):
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
 @kernel
-def _observe(w, k, c, p_WF, p_WF_first, xy, block, residual):
-    """One sighting: ``block`` (2, 25) over [camera 16, clone 6, landmark 3] and ``residual`` (2,)."""
+def _observe(w, k, c, R_lateC, p_lateC, p_WF, p_WF_first, xy, block, residual):
+    """One sighting, by the camera ``R_lateC``, ``p_lateC`` (:func:`_camera_at`): ``residual`` (2,) px and ``block``.
+
+    The latter (2, 25) is over [camera 16, clone 6, landmark 3].
+    """
     model, intrinsics = w.camera_models[c], w.intrinsics[c]
-    R_lateC, p_lateC = _camera_at(w, k, c, xy[1])
-    p_C = turned(R_lateC.T, turned(w.R_WB[k].T, p_WF - w.p_WB[k]) - p_lateC)
+    p_C = _back(R_lateC, _back(w.R_WB[k], p_WF, w.p_WB[k]), p_lateC)
     drawn, _ = distort(model, intrinsics, p_C[0] / p_C[2], p_C[1] / p_C[2])
     residual[0], residual[1] = xy[0] - drawn[0], xy[1] - drawn[1]
 
-    R_first = w.R_WB_first[k]
-    p_B = turned(R_first.T, p_WF_first - w.p_WB_first[k])
-    p_C = turned(R_lateC.T, p_B - p_lateC)
+    R_first, R_BC, p_BC = w.R_WB_first[k], w.R_BC[c], w.p_BC[c]
+    p_B = _back(R_first, p_WF_first, w.p_WB_first[k])
+    p_C = _back(R_lateC, p_B, p_lateC)
     x, y = p_C[0] / p_C[2], p_C[1] / p_C[2]
     _, D = distort(model, intrinsics, x, y)
-    J = np.empty((2, 3))
-    for i in range(2):
-        J[i, 0], J[i, 1] = D[i, 0] / p_C[2], D[i, 1] / p_C[2]
-        J[i, 2] = -(D[i, 0] * x + D[i, 1] * y) / p_C[2]
-    J_B = product(J, R_lateC.T)
-    J_W = product(J_B, R_first.T)
-    # By the point as seen from the body when the camera saw it.
-    J_late = product(J, w.R_BC[c].T)
-    p_late = turned(w.R_BC[c], p_C) + w.p_BC[c]
-    block[:, 0:3] = product(J, hat(p_C))
-    block[:, 3:6] = -J_late
-    block[:, 6] = -turned(J_late, cross(w.rate_B[k], p_late)) - turned(J_B, w.velocity_B[k])
+    # By the point as seen from the body when the camera saw it, and by how it moved there meanwhile.
+    turned_C = _by(R_BC, p_C)
+    p_late = turned_C[0] + p_BC[0], turned_C[1] + p_BC[1], turned_C[2] + p_BC[2]
+    moved_late = _cross(w.rate_B[k], p_late)
+    row = _row(w, c, xy[1])
     block[:, 7:15] = intrinsics_jacobian(model, intrinsics, x, y)
-    block[:, 15] = _row(w, c, xy[1]) * block[:, 6]
-    block[:, 16:19] = product(J_B, hat(p_B))
-    block[:, 19:22] = -J_W
-    block[:, 22:25] = J_W
+    for i in range(2):
+        J = D[i, 0] / p_C[2], D[i, 1] / p_C[2], -(D[i, 0] * x + D[i, 1] * y) / p_C[2]
+        J_late, J_B = _by(R_BC, J), _by(R_lateC, J)
+        J_W, by_turn_BC, by_turn_WB = _by(R_first, J_B), _cross(J, p_C), _cross(J_B, p_B)
+        by_offset = -_dot(J_late, moved_late) - _dot(J_B, w.velocity_B[k])
+        own = block[i]
+        own[6], own[15] = by_offset, row * by_offset
+        for m in range(3):
+            own[m], own[3 + m] = by_turn_BC[m], -J_late[m]
+            own[16 + m], own[19 + m], own[22 + m] = by_turn_WB[m], -J_W[m], J_W[m]
 
 
 @kernel
@@ -119,7 +154,9 @@ def observations(w, clone, cameras, p_WF, p_WF_first, xy):
     blocks = np.empty((m, 2, 25))
     residual = np.empty((m, 2))
     for i in range(m):
-        _observe(w, clone, cameras[i], p_WF[i], p_WF_first[i], xy[i], blocks[i], residual[i])
+        c = cameras[i]
+        R_lateC, p_lateC = _camera_at(w, clone, c, xy[i, 1])
+        _observe(w, clone, c, R_lateC, p_lateC, p_WF[i], p_WF_first[i], xy[i], blocks[i], residual[i])
     return blocks, residual
 
 
@@ -129,15 +166,15 @@ def track_rows(w, xy, xy_normalised, seen, pixel_sigma):
     K, N = len(w.p_WB), len(w.p_BC)
     views = np.flatnonzero(seen)
     m = len(views)
-    R_WC = np.empty((m, 3, 3))
-    p_WC = np.empty((m, 3))
+    R_WC, R_lateC = np.empty((m, 3, 3)), np.empty((m, 3, 3))
+    p_WC, p_lateC = np.empty((m, 3)), np.empty((m, 3))
     points = np.empty((m, 2))
     for i in range(m):
         v = views[i]
         k, c = v // N, v % N
-        R_lateC, p_lateC = _camera_at(w, k, c, xy[v, 1])
-        R_WC[i] = product(w.R_WB[k], R_lateC)
-        p_WC[i] = turned(w.R_WB[k], p_lateC) + w.p_WB[k]
+        R_lateC[i], p_lateC[i] = _camera_at(w, k, c, xy[v, 1])
+        R_WC[i] = product(w.R_WB[k], R_lateC[i])
+        p_WC[i] = turned(w.R_WB[k], p_lateC[i]) + w.p_WB[k]
         points[i, 0], points[i, 1] = undistort(
             w.camera_models[c], w.intrinsics[c], xy[v, 0], xy[v, 1], xy_normalised[v, 0], xy_normalised[v, 1]
         )
@@ -151,7 +188,7 @@ def track_rows(w, xy, xy_normalised, seen, pixel_sigma):
         for i in range(m):
             v = views[i]
             k, c = v // N, v % N
-            _observe(w, k, c, p_WF, p_WF, xy[v], block, residual[2 * i : 2 * i + 2])
+            _observe(w, k, c, R_lateC[i], p_lateC[i], p_WF, p_WF, xy[v], block, residual[2 * i : 2 * i + 2])
             H[2 * i : 2 * i + 2, n * c : n * c + n] = block[:, 0:n]
             H[2 * i : 2 * i + 2, n * N + 6 * k : n * N + 6 * k + 6] = block[:, 16:22]
             H_f[2 * i : 2 * i + 2] = block[:, 22:25]
@@ -245,33 +282,52 @@ def reduced_track(w, xy, xy_normalised, seen, P, pixel_sigma, cauchy):
     return ok, p_WF, H, H_f, residual, distance
 
 
+class TrackRows(NamedTuple):
+    """What F tracks say, over [cameras, clones]: ``H`` (m, n) and ``residual`` (m,) of all, free of the landmarks.
+
+    Of a landmark the rest is known by H_of e + T dp_WF = residual_of, up to the same white noise: ``H_of`` (F, 3, n),
+    ``T`` (F, 3, 3), ``residual_of`` (F, 3). ``p_WF`` (F, 3) is where it was linearised; ``squares`` (F,) are squared
+    Mahalanobis distances, zero where there are none. Only what is accepted by its ``verdict`` (F,) is in the rows.
+    """
+
+    H: Float
+    residual: Float
+    H_of: Float
+    T: Float
+    residual_of: Float
+    p_WF: Float
+    squares: Float
+    verdict: Int
+
+
 @kernel
 def msckf_rows(w, xy, xy_normalised, seen, P, pixel_sigma, cauchy, gate):
     """Triangulate (F, C) tracks, linearise them, project out the landmarks, and gate each at ``gate[dof]``.
 
-    The stacked H and residual over [cameras, clones], whose covariance is ``P``; p_WF (F, 3); each one's Mahalanobis
-    distance, squared, zero where there is none; each one's verdict.
+    ``P`` is the covariance of [cameras, clones].
     """
-    F = len(seen)
-    H_all = np.empty((2 * seen.sum(), len(P)))
+    F, n = len(seen), len(P)
+    H_all = np.empty((2 * seen.sum(), n))
     r_all = np.empty(2 * seen.sum())
+    H_of, T, residual_of = np.empty((F, 3, n)), np.empty((F, 3, 3)), np.empty((F, 3))
     p_WF = np.empty((F, 3))
-    distances = np.zeros(F)
+    squares = np.zeros(F)
     verdict = np.empty(F, dtype=np.int64)
     rows = 0
     for f in range(F):
-        ok, p_WF[f], H, _, residual, distances[f] = reduced_track(
+        ok, p_WF[f], H, H_f, residual, squares[f] = reduced_track(
             w, xy[f], xy_normalised[f], seen[f], P, pixel_sigma, cauchy
         )
         if not ok:
             verdict[f] = NOT_TRIANGULATED
             continue
-        H, residual = H[3:], residual[3:]
-        if distances[f] > gate[len(residual)]:
+        free = len(residual) - 3
+        if squares[f] > gate[free]:
             verdict[f] = GATED
             continue
         verdict[f] = ACCEPTED
-        H_all[rows : rows + len(residual)] = H
-        r_all[rows : rows + len(residual)] = residual
-        rows += len(residual)
-    return H_all[:rows], r_all[:rows], p_WF, distances, verdict
+        H_of[f], T[f], residual_of[f] = H[:3], H_f[:3], residual[:3]
+        H_all[rows : rows + free] = H[3:]
+        r_all[rows : rows + free] = residual[3:]
+        rows += free
+    return TrackRows(H_all[:rows], r_all[:rows], H_of, T, residual_of, p_WF, squares, verdict)

@@ -212,15 +212,20 @@ class FilterState:
         self._delete(self.calibrated.stop + np.arange(6))
         self.clones = self.clones.without_oldest()
 
-    def add_landmark(self, landmark_id: int, p_WF: Float, p_WF_first: Float, cross: Float, cov: Float) -> None:
-        """Append a landmark (3,) with its cross-covariance (3, n) to the state and its covariance (3, 3).
+    def add_landmarks(self, ids: Int, p_WF: Float, p_WF_first: Float, gain: Float, columns: slice, own: Float) -> None:
+        """Append landmarks (M, 3) whose errors are ``gain`` (M, 3, k) @ error[columns] + what ``own`` (M, 3, 3) is of.
 
-        ``p_WF_first`` (3,) is where the measurements that initialised it were linearised.
+        ``p_WF_first`` (M, 3) are where the measurements that initialised them were linearised.
         """
+        gain = gain.reshape(3 * len(ids), -1)
+        cross = gain @ self.cov[columns]
+        cov = cross[:, columns] @ gain.T
+        for i, block in enumerate(own):
+            cov[3 * i : 3 * i + 3, 3 * i : 3 * i + 3] += block
         self.cov = inserted(self.cov, len(self.cov), cross, cov)
-        self.landmark_ids = np.append(self.landmark_ids, landmark_id)
-        self.p_WF = np.concatenate([self.p_WF, p_WF[None]])
-        self.p_WF_first = np.concatenate([self.p_WF_first, p_WF_first[None]])
+        self.landmark_ids = np.concatenate([self.landmark_ids, ids])
+        self.p_WF = np.concatenate([self.p_WF, p_WF])
+        self.p_WF_first = np.concatenate([self.p_WF_first, p_WF_first])
 
     def keep_landmarks(self, keep: NDArray[np.bool_]) -> None:
         """Marginalise the landmarks for which ``keep`` (M,) is False."""

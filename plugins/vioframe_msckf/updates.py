@@ -12,7 +12,7 @@ from vioframe.estimation.point_noise import PointNoise
 from vioframe.estimation.standstill import Standstill
 from vioframe.types import DP, Float, FrameTracks, ImuNoise, ImuSegment, Int
 from vioframe_msckf.covariance import distances
-from vioframe_msckf.measurement import ACCEPTED, Window, landmark_blocks, msckf_rows, reduced_track
+from vioframe_msckf.measurement import ACCEPTED, GATED, TrackRows, Window, landmark_blocks, msckf_rows
 from vioframe_msckf.options import MsckfOptions
 from vioframe_msckf.state import IMU, FilterState, compress
 
@@ -69,14 +69,22 @@ def select_tracks(observations: TrackTable, state: FilterState, options: MsckfOp
 def update_from_tracks(
     state: FilterState,
     observations: TrackTable,
-    rows: NDArray[np.intp],
+    selection: Selection,
     options: MsckfOptions,
     point_noise: PointNoise,
     gate: Float,
-) -> tuple[Int, Float]:
-    """The multi-state constraint update; returns ids and positions of the landmarks it accepted."""
-    columns = slice(IMU, state.landmarks_begin)
-    H, residual, p_WF, squares, verdict = msckf_rows(
+) -> tuple[NDArray[np.intp], Int, Float]:
+    """The multi-state constraint update by all tracks of ``selection``, in which those promoted become landmarks.
+
+    Returns the rows used up, accepted or not, and ids and positions of the landmarks of finished tracks accepted.
+    Promoted ones whose distance nobody knows yet wait, with as many sightings as the window has.
+
+    Delayed initialisation (Li, "Visual-inertial odometry on resource-constrained systems", 2014): the three rows that
+    an orthogonal transformation leaves to a landmark initialise it, the others update the state as any track's do.
+    """
+    rows, finished = np.concatenate([selection.finished, selection.promoted]), len(selection.finished)
+    columns, views = slice(IMU, state.landmarks_begin), observations.lengths()[rows]
+    tracks = msckf_rows(
         Window.of(state, options.first_estimate_jacobians),
         observations.xy[rows],
         observations.xy_normalised[rows],
@@ -86,12 +94,38 @@ def update_from_tracks(
         options.cauchy_sigmas,
         gate,
     )
-    if len(residual):
-        H, residual = compress(H, residual)
-        state.update(H, residual, columns, point_noise.px**2)
-    point_noise.add(squares, observations.lengths()[rows])
-    accepted = verdict == ACCEPTED
-    return observations.ids[rows[accepted]], p_WF[accepted]
+    accepted, ended = tracks.verdict == ACCEPTED, np.arange(len(rows)) < finished
+    taken = _new_landmarks(
+        state, observations.ids[rows], tracks, np.flatnonzero(accepted & ~ended), columns, point_noise
+    )
+    use = accepted & ended
+    use[taken] = True
+    used = np.repeat(use[accepted], 2 * views[accepted] - 3)
+    if used.any():
+        state.update(*compress(tracks.H[used], tracks.residual[used]), columns, point_noise.px**2)
+    point_noise.add(tracks.squares[ended], views[ended])
+    gone = ended | use | (tracks.verdict == GATED)
+    return rows[gone], observations.ids[rows[accepted & ended]], tracks.p_WF[accepted & ended]
+
+
+def _new_landmarks(
+    state: FilterState, ids: Int, tracks: TrackRows, offered: NDArray[np.intp], columns: slice, point_noise: PointNoise
+) -> NDArray[np.intp]:
+    """Take those of ``tracks`` that are ``offered`` into the state; returns the ones taken, whose distance is known."""
+    T_inverse, p_WF = np.linalg.inv(tracks.T[offered]), tracks.p_WF[offered]
+    gain = -T_inverse @ tracks.H_of[offered]
+    own = point_noise.px**2 * T_inverse @ np.swapaxes(T_inverse, -1, -2)
+    # How unsure where it is from the body, not where both are in the world.
+    cross = gain @ state.cov[columns, DP]
+    cov = gain @ state.cov[columns, columns] @ np.swapaxes(gain, -1, -2) + own
+    relative = cov - cross - np.swapaxes(cross, -1, -2) + state.cov[DP, DP]
+    from_body = p_WF - state.p_WB
+    unsure = np.einsum("fi,fij,fj->f", from_body, relative, from_body)
+    known = unsure <= (_KNOWN_TO * (from_body**2).sum(axis=1)) ** 2
+    if known.any():
+        found = p_WF + (T_inverse @ tracks.residual_of[offered, :, None])[..., 0]
+        state.add_landmarks(ids[offered[known]], found[known], p_WF[known], gain[known], columns, own[known])
+    return offered[known]
 
 
 class Turns:
@@ -158,54 +192,3 @@ def update_from_landmarks(
     implausible = np.setdiff1d(tracks.ids[rows[~accepted]], tracks.ids[rows[accepted]])
     state.keep_landmarks(~np.isin(state.landmark_ids, implausible))
     return int(accepted.sum())
-
-
-def promote_tracks(
-    state: FilterState,
-    observations: TrackTable,
-    rows: NDArray[np.intp],
-    options: MsckfOptions,
-    point_noise: PointNoise,
-    gate: Float,
-) -> NDArray[np.intp]:
-    """Take the tracks ``rows`` into the state as landmarks; returns the rows used up, promoted or implausible.
-
-    Those whose distance nobody knows yet wait, with as many sightings as the window has.
-
-    Delayed initialisation (Li, "Visual-inertial odometry on resource-constrained systems", 2014): the three rows that
-    an orthogonal transformation leaves to the landmark initialise it, the others update the state.
-    """
-    used = []
-    variance = point_noise.px**2
-    for row in rows:
-        # Every promotion updates the state, so each is linearised at the estimate the last one left.
-        window = Window.of(state, options.first_estimate_jacobians)
-        columns = slice(IMU, state.landmarks_begin)
-        P = np.ascontiguousarray(state.cov[columns, columns])
-        ok, p_WF, H, H_f, residual, distance = reduced_track(
-            window,
-            observations.xy[row],
-            observations.xy_normalised[row],
-            observations.seen[row],
-            P,
-            point_noise.px,
-            options.cauchy_sigmas,
-        )
-        if not ok:
-            continue
-        if distance > gate[len(residual) - 3]:
-            used.append(row)
-            continue
-        T_inverse = np.linalg.inv(H_f[:3])
-        gain = -T_inverse @ H[:3]
-        cross = gain @ state.cov[columns]
-        cov = gain @ P @ gain.T + variance * T_inverse @ T_inverse.T
-        # How unsure where it is from the body, not where both are in the world.
-        relative = cov - cross[:, DP] - cross[:, DP].T + state.cov[DP, DP]
-        from_body = p_WF - state.p_WB
-        if from_body @ relative @ from_body > (_KNOWN_TO * (from_body @ from_body)) ** 2:
-            continue
-        used.append(row)
-        state.add_landmark(int(observations.ids[row]), p_WF + T_inverse @ residual[:3], p_WF, cross, cov)
-        state.update(H[3:], residual[3:], columns, variance)
-    return np.array(used, dtype=np.intp)

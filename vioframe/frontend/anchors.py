@@ -29,6 +29,8 @@ _STIFFNESS = 0.02
 # A patch is not its anchor any more where its correlation with that is less than this share of the image's median: of
 # noise and blur all have the same.
 _LEAST_LIKENESS = 0.8
+# Of the numbers of a map, whether it moves pixels down, and the powers of u across and of v down that it moves them by.
+_PARTS = ((0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1), (1, 1, 0), (1, 0, 1))
 # Farther than this from where the patch before leads, px, is something else that looks alike.
 _FARTHEST_PX = 3.0
 
@@ -95,19 +97,6 @@ def warm_up() -> None:
 
 
 @kernel(inlined=True)
-def _at(image: Image, x: float, y: float) -> np.float32:
-    """The pixels about a place, weighed; the place is inside by one at least."""
-    i, j = int(x), int(y)
-    a, b = np.float32(x - i), np.float32(y - j)
-    u, v = np.uint64(i), np.uint64(j)
-    beside, below = u + np.uint64(1), v + np.uint64(1)
-    upper = np.float32(image[v, u]) + a * (np.float32(image[v, beside]) - np.float32(image[v, u]))
-    lower = np.float32(image[below, u]) + a * (np.float32(image[below, beside]) - np.float32(image[below, u]))
-    value: np.float32 = upper + b * (lower - upper)
-    return value
-
-
-@kernel(inlined=True)
 def _sample(
     flat: Image, width: int, x: np.float32, y: np.float32, across: np.float32, down: np.float32, row: Pixels
 ) -> None:
@@ -133,29 +122,61 @@ def _anchor(
     """Fill what :class:`Anchors` holds of the patches about ``xy`` (N, 2) px of the bordered ``image``."""
     side = patch.shape[1]
     half = side // 2
-    J = np.empty(6)
+    flat, width = image.reshape(-1), image.shape[1]
+    along = np.empty(side, np.float32)
+    weight = np.empty(side, np.float32)
+    for k in range(side):
+        along[k] = (k - half) / half
+        weight[k] = math.exp(-0.5 * along[k] * along[k] / (_SPREAD * _SPREAD))
+    # With a pixel more all round, for the gradients.
+    wide = np.empty((side + 2, side + 2), np.float32)
+    sums = np.empty((3, 3, 3))
     for n in range(len(xy)):
-        x, y, mean = xy[n, 0] - half, xy[n, 1] - half, 0.0
-        for r in range(side):
-            for c in range(side):
-                patch[n, r, c] = _at(image, x + c, y + r)
-                mean += patch[n, r, c]
-        mean /= side * side
-        information[n] = 0.0
+        for r in range(side + 2):
+            x, y = np.float32(xy[n, 0] - half - 1), np.float32(xy[n, 1] - half - 1 + r)
+            _sample(flat, width, x, y, np.float32(1.0), np.float32(0.0), wide[r])
+        mean = wide[1:-1, 1:-1].sum() / np.float32(side * side)
         square = 0.0
+        sums[:] = 0.0
         for r in range(side):
+            above, here, below, v = wide[r], wide[r + 1], wide[r + 2], along[r]
+            xx_0, xx_1, xx_2 = np.float32(0.0), np.float32(0.0), np.float32(0.0)
+            xy_0, xy_1, xy_2 = np.float32(0.0), np.float32(0.0), np.float32(0.0)
+            yy_0, yy_1, yy_2 = np.float32(0.0), np.float32(0.0), np.float32(0.0)
+            squares = np.float32(0.0)
             for c in range(side):
-                u, v = (c - half) / half, (r - half) / half
-                dx = 0.5 * (_at(image, x + c + 1.0, y + r) - _at(image, x + c - 1.0, y + r))
-                dy = 0.5 * (_at(image, x + c, y + r + 1.0) - _at(image, x + c, y + r - 1.0))
-                weight = math.exp(-0.5 * (u * u + v * v) / (_SPREAD * _SPREAD))
-                J[0], J[1], J[2], J[3], J[4], J[5] = dx, dy, dx * u, dx * v, dy * u, dy * v
-                for i in range(6):
-                    for k in range(6):
-                        information[n, i, k] += weight * J[i] * J[k]
-                patch[n, r, c] -= mean
-                square += patch[n, r, c] ** 2
-                by_x[n, r, c], by_y[n, r, c] = weight * dx, weight * dy
+                dx, dy = np.float32(0.5) * (here[c + 2] - here[c]), np.float32(0.5) * (below[c + 1] - above[c + 1])
+                along_x, along_y, u = weight[r] * weight[c] * dx, weight[r] * weight[c] * dy, along[c]
+                xx, xy_, yy = along_x * dx, along_x * dy, along_y * dy
+                xx_0 += xx
+                xx_1 += xx * u
+                xx_2 += xx * u * u
+                xy_0 += xy_
+                xy_1 += xy_ * u
+                xy_2 += xy_ * u * u
+                yy_0 += yy
+                yy_1 += yy * u
+                yy_2 += yy * u * u
+                value = here[c + 1] - mean
+                squares += value * value
+                patch[n, r, c], by_x[n, r, c], by_y[n, r, c] = value, along_x, along_y
+            square += float(squares)
+            for k in range(3):
+                power = v**k
+                sums[0, 0, k] += power * xx_0
+                sums[0, 1, k] += power * xx_1
+                sums[0, 2, k] += power * xx_2
+                sums[1, 0, k] += power * xy_0
+                sums[1, 1, k] += power * xy_1
+                sums[1, 2, k] += power * xy_2
+                sums[2, 0, k] += power * yy_0
+                sums[2, 1, k] += power * yy_1
+                sums[2, 2, k] += power * yy_2
+        # The six numbers move a pixel by dx [1 u v] and dy [1 u v]: these are in the order below.
+        for i in range(6):
+            for k in range(6):
+                p, q = _PARTS[i], _PARTS[k]
+                information[n, i, k] = sums[p[0] + q[0], p[1] + q[1], p[2] + q[2]]
         stiffness = 0.5 * _STIFFNESS * (information[n, 0, 0] + information[n, 1, 1])
         for i in range(2, 6):
             information[n, i, i] += stiffness
