@@ -14,7 +14,8 @@ from vioframe.estimation.factors.problem import Normal, Problem, Variables, symm
 from vioframe.jit import kernel
 from vioframe.stopwatch import working_s
 
-_FIRST_DAMPING, _LARGEST_DAMPING = 1e-6, 1e3
+# Relative to the diagonal, beside which what is known of a whole window's scale or speed is little: it starts small.
+_FIRST_DAMPING, _LEAST_DAMPING, _LARGEST_DAMPING = 1e-8, 1e-12, 1e3
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,21 +50,26 @@ def solve(
     ``max_seconds`` ends it early, where it is not zero. Raises ``LinAlgError`` where nothing finite comes out.
     """
     begin_s = working_s()
-    damping, normal = _FIRST_DAMPING, problem.linearise(x)
+    damping, growth, normal = _FIRST_DAMPING, 2.0, problem.linearise(x)
     for iteration in range(max_iterations):
         while True:
-            trial = x.retract(*_step(normal, active, damping))
+            step, landmark_step = _step(normal, active, damping)
+            trial = x.retract(step, landmark_step)
             # Nearly all steps lead down: their equations are those of the next one.
             trial_normal = problem.linearise(trial)
             if trial_normal.cost <= normal.cost:
                 break
-            damping = max(10.0 * damping, 1e-4)
+            damping, growth = growth * damping, 2.0 * growth
             if damping > _LARGEST_DAMPING or not np.isfinite(trial_normal.cost):
                 # No step leads down: a minimum to rounding.
                 return _finite(Solution(x, normal, iteration, bool(np.isfinite(trial_normal.cost))))
-        least = max(decrease, relative_decrease * max(abs(trial_normal.cost), 1.0))
-        small = normal.cost - trial_normal.cost < least
-        x, normal, damping = trial, trial_normal, 0.1 * damping
+        decreased = normal.cost - trial_normal.cost
+        small = decreased < max(decrease, relative_decrease * max(abs(trial_normal.cost), 1.0))
+        # The damping falls the more, the better a step does what the equations promised: as Nielsen has it there.
+        promised = -0.5 * float(normal.b @ step + (normal.c * landmark_step).sum())
+        ratio = decreased / promised if promised > 0.0 else 0.0
+        damping = max(damping * max(1.0 / 3.0, 1.0 - (2.0 * ratio - 1.0) ** 3), _LEAST_DAMPING)
+        x, normal, growth = trial, trial_normal, 2.0
         if small or 0.0 < max_seconds < working_s() - begin_s:
             return _finite(Solution(x, normal, iteration + 1, small))
     return _finite(Solution(x, normal, max_iterations, False))
