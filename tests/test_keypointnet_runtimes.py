@@ -1,5 +1,6 @@
 """Every runtime computes what the trained network does, within what its precision allows."""
 
+import subprocess
 import sys
 from dataclasses import replace
 
@@ -46,6 +47,17 @@ def run_by(runtime, precision, made, image):
 def relative_error(found, expected):
     """Root mean square of the difference, as a share of the expected values' standard deviation."""
     return np.sqrt(np.mean((found - expected) ** 2)) / expected.std()
+
+
+def test_openvino_tells_nobody_that_it_is_used():
+    """By itself it forks to send its maker a word of each import; in a run that can leave a process behind."""
+    pytest.importorskip("openvino_telemetry")
+    code = (
+        "import sys; from vioframe_keypointnet.graph import import_openvino as load; load().Core(); print(*sys.modules)"
+    )
+    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert "openvino" in found.stdout.split()
+    assert not any(name.startswith("openvino_telemetry") for name in found.stdout.split())
 
 
 @each_architecture

@@ -9,6 +9,7 @@ zero is less than a step.
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -44,16 +45,27 @@ class _Values(NamedTuple):
     step: np.float32 | None = None
 
 
+def import_openvino() -> Any:
+    """OpenVINO, without what tells its maker of each import: that forks, in the midst of a run, to send it."""
+    told, sys.modules["openvino_telemetry"] = sys.modules.get("openvino_telemetry"), None  # type: ignore[assignment]
+    try:
+        with needs("OpenVINO", "openvino", user="KeypointNet by OpenVINO"):
+            import openvino
+    finally:
+        del sys.modules["openvino_telemetry"]
+        if told is not None:
+            sys.modules["openvino_telemetry"] = told
+    return openvino
+
+
 def model(weights: Weights, shape: tuple[int, int], *, descriptors: bool = False, int8: bool = False) -> Model:
     """The graph for grey images of ``shape`` (H, W), multiples of 8.
 
     It takes (1, C, h, w), what an :class:`~vioframe_keypointnet.seeing.Eye` sees, and gives what
     :meth:`vioframe_keypointnet.network.KeypointNet.found` does, which it equals on R = G = B but for rounding.
     """
-    with needs("OpenVINO", "openvino", user="KeypointNet by OpenVINO"):
-        from openvino import Model
-        from openvino import opset13 as ops
-
+    openvino = import_openvino()
+    ops = openvino.opset13
     architecture, tensors, f = weights.architecture, weights.tensors, weights.architecture.fold
     ranges: Mapping[str, float] = weights.activation_ranges or {} if int8 else {}
     kind = np.float32 if architecture.peaks and not int8 else np.uint8
@@ -82,13 +94,13 @@ def model(weights: Weights, shape: tuple[int, int], *, descriptors: bool = False
         hidden, output = _score_and_place(tensors)
         found = _convolve(output, _convolve(hidden, x, ranges), ranges).node
     if not descriptors:
-        return Model([found], [image], "keypointnet")
+        return openvino.Model([found], [image], "keypointnet")
     for layer in (_convolution(tensors, "Fa"), _convolution(tensors, "Fb", activated=False)):
         x = _convolve(layer, x, ranges)
     x = _Values(ops.concat([ops.depth_to_space(x.node, "depth_first", 2), after[3].node], axis=1))
     for layer in (_convolution(tensors, "Faa"), _convolution(tensors, "Fbb")):
         x = _convolve(layer, x, ranges)
-    return Model([found, x.node], [image], "keypointnet")
+    return openvino.Model([found, x.node], [image], "keypointnet")
 
 
 @dataclass(frozen=True, slots=True)

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from vioframe.errors import ConfigError, needs
 from vioframe.types import Image
-from vioframe_keypointnet.graph import model
+from vioframe_keypointnet.graph import import_openvino, model
 from vioframe_keypointnet.options import KeypointNetOptions, Precision, Runtime
 from vioframe_keypointnet.seeing import Eye
 from vioframe_keypointnet.weights import Weights
@@ -66,10 +66,7 @@ def start(runtime: str, precision: str, weights: Weights, options: KeypointNetOp
 
 def _by_openvino(weights: Weights, descriptors: bool, int8: bool, threads: int) -> Run:
     """OpenVINO's graph on a CPU, compiled for each size of image when the first comes."""
-    with needs("openvino", "openvino", user="KeypointNet by OpenVINO"):
-        import openvino
-
-    core, see = openvino.Core(), Eye(weights.architecture, eight_bits=int8)
+    core, see = import_openvino().Core(), Eye(weights.architecture, eight_bits=int8)
     settings: dict[str, Any] = {"INFERENCE_PRECISION_HINT": "f32", "PERFORMANCE_HINT": "LATENCY"}
     if threads:
         settings["INFERENCE_NUM_THREADS"] = threads
