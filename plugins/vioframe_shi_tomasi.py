@@ -80,7 +80,8 @@ def _peaks(eigenvalue: NDArray[np.float32], least: float) -> NDArray[np.int64]:
     """Places in the flattened image that are higher than ``least``, and than none of the eight about them is."""
     height, width = np.uint64(eigenvalue.shape[0]), np.uint64(eigenvalue.shape[1])
     one, two = np.uint64(1), np.uint64(2)
-    out, n = np.empty(eigenvalue.size // 4 + 1, np.int64), np.uint64(0)
+    # As many as there are pixels: where a pattern repeats itself, neighbours are equally high.
+    out, n = np.empty(eigenvalue.size, np.int64), np.uint64(0)
     highest, is_peak = np.empty(width, np.float32), np.zeros(width, np.uint8)
     # Loops without branches: several pixels at once, and none guessed wrong.
     for r in range(one, height - one):

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from image_helpers import textured
 
+import vioframe_shi_tomasi
 from vioframe.errors import ConfigError, PluginError
 from vioframe.parts import registry
 from vioframe_akaze import Akaze
@@ -140,6 +141,20 @@ def test_surf_says_what_to_install(monkeypatch):
 def test_an_option_out_of_range_is_refused(name, key, value):
     with pytest.raises(ConfigError, match=rf"detector '{name}': {key}='{value}': Input should be greater than"):
         registry.load().create_detector(name, {key: value})
+
+
+def test_a_pattern_that_repeats_itself_has_more_equal_corners_than_a_quarter_of_its_pixels():
+    """Of a tiling of three pixels by three nearly every one is as high as its neighbours."""
+    image = np.tile(np.array([[0, 0, 0], [0, 0, 0], [255, 0, 0]], np.uint8), (40, 40))
+    gradients = (np.asarray(d, np.int16) for d in cv2.spatialGradient(image))
+    eigenvalue = vioframe_shi_tomasi._least_eigenvalue(*gradients)
+    least = 0.001 * eigenvalue.max()
+    high = (eigenvalue >= cv2.dilate(eigenvalue, np.ones((3, 3), np.uint8))) & (eigenvalue > least)
+    high[[0, -1]], high[:, [0, -1]] = False, False
+    assert high.sum() > image.size / 4
+    np.testing.assert_array_equal(vioframe_shi_tomasi._peaks(eigenvalue, least), np.flatnonzero(high))
+    found = ShiTomasi().detect(image, 500)
+    assert len(found.xy) > 50
 
 
 def test_shi_tomasi_finds_the_corners_that_opencv_does():
