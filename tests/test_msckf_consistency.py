@@ -39,7 +39,8 @@ class GateCounts:
 
         def measured(window, xy, xy_normalised, seen, *arguments):
             found = measure(window, xy, xy_normalised, seen, *arguments)
-            for points, mask, verdict in zip(xy, seen, found.verdict[: self._finished].tolist(), strict=False):
+            finished = (values[: self._finished] for values in (xy, seen, found.verdict.tolist()))
+            for points, mask, verdict in zip(*finished, strict=True):
                 spoilt = any(tuple(point) in self.wrong for point in points[mask].tolist())
                 (self.wrong_tracks if spoilt else self.tracks)[verdict] += 1
             return found

@@ -116,11 +116,10 @@ def _new_landmarks(
     gain = -T_inverse @ tracks.H_of[offered]
     own = point_noise.px**2 * T_inverse @ np.swapaxes(T_inverse, -1, -2)
     # How unsure where it is from the body, not where both are in the world.
-    cross = gain @ state.cov[columns, DP]
-    cov = gain @ state.cov[columns, columns] @ np.swapaxes(gain, -1, -2) + own
-    relative = cov - cross - np.swapaxes(cross, -1, -2) + state.cov[DP, DP]
     from_body = p_WF - state.p_WB
-    unsure = np.einsum("fi,fij,fj->f", from_body, relative, from_body)
+    J = np.zeros((len(offered), len(state.cov)))
+    J[:, columns], J[:, DP] = np.einsum("fi,fik->fk", from_body, gain), -from_body
+    unsure = ((J @ state.cov) * J).sum(axis=1) + np.einsum("fi,fij,fj->f", from_body, own, from_body)
     known = unsure <= (_KNOWN_TO * (from_body**2).sum(axis=1)) ** 2
     if known.any():
         found = p_WF + (T_inverse @ tracks.residual_of[offered, :, None])[..., 0]
