@@ -261,8 +261,8 @@ class TestBundleAdjustment:
             bias_accel = np.random.default_rng(100 + seed).normal(0.0, 0.15, 3)
             s = scene(1.0, seed, noise=NOISE, bias_accel=bias_accel)
             problem, truth = problem_of(s)
-            x = adjusted(problem, truth, CALIBRATION_COV).variables
-            cov = covariance(problem, x, CALIBRATION_COV)
+            solution = adjusted(problem, truth, CALIBRATION_COV)
+            x, cov = solution.variables, covariance(problem, solution, CALIBRATION_COV)
             newest, true = x.states[-1:], s.truth[-1:]
             yaw = so3.log(newest.R_WB[0] @ true.R_WB[0].T)[2]
             turn = so3.exp([0.0, 0.0, yaw])

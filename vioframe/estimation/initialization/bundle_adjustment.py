@@ -36,14 +36,14 @@ from vioframe.types import DBA, DBG, DP, DTHETA, CameraOnBody
 _CAUCHY = 2.0  # standard deviations
 _MAX_ITERATIONS = 15
 # The last steps are small and many, as robust weights settle: much less than chance moves the minimum by.
-_RELATIVE_DECREASE, _ROUGH_DECREASE = 1e-4, 1e-3
+_RELATIVE_DECREASE, _ROUGH_DECREASE = 3e-4, 1e-2
 # Holds the four directions that nothing measures, 1/m^2 and 1/rad^2: softly, so that it does not hinder the way to the
 # minimum, where it is met exactly; and as good as fixed, for the covariance.
 _HELD, _FIXED = 1e4, 1e8
 
 
 def adjustment(
-    window: Window, imu: list[Preintegrated], x: Variables, cameras: Sequence[CameraOnBody], known: Float
+    window: Window, imu: Sequence[Preintegrated], x: Variables, cameras: Sequence[CameraOnBody], known: Float
 ) -> Problem:
     """All factors of ``window``, whose readings are ``imu``, about the values ``x``; the first state is held.
 
@@ -83,13 +83,14 @@ def with_calibration(problem: Problem, x: Variables, cameras: Sequence[CameraOnB
     return replace(problem, prior=_prior(x, 0, _HELD, Calibrated.of(*cameras), known))
 
 
-def covariance(problem: Problem, x: Variables, known: Float) -> Float:
-    """Of all states and the calibration (15 K + 16 N, 15 K + 16 N) at the minimum ``x``; zero where ``known`` is.
+def covariance(problem: Problem, solution: Solution, known: Float) -> Float:
+    """Of all states and the calibration (15 K + 16 N, 15 K + 16 N) at the ``solution``; zero where ``known`` is.
 
     Position and yaw are pinned at the *newest* state.
     """
+    x, normal = solution.variables, solution.normal
     prior = _prior(x, len(x.states) - 1, _FIXED, problem.prior.cameras, known)
-    normal = replace(problem, prior=prior).linearise(x)
+    normal = replace(normal, H=normal.H - problem.prior.H + prior.H)
     active = _active(x, known)
     cov = np.zeros(normal.H.shape)
     cov[np.ix_(active, active)] = solver.covariance(normal, active, len(active))

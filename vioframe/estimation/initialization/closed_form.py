@@ -25,13 +25,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg import eigh
 
 from vioframe.arrays import Bool, Float, Int
 from vioframe.estimation.factors.inertial import StateArrays
 from vioframe.estimation.inertial.preintegration import Preintegrated
 from vioframe.estimation.initialization.window import Window, refuse_unless
 from vioframe.estimation.turns import linearise_pairs
-from vioframe.geometry import so3
+from vioframe.geometry.kernels import exp, product, right_jacobian, turned
+from vioframe.jit import kernel
 from vioframe.types import GRAVITY_M_S2
 
 _FEWEST_COMMON = 10
@@ -59,17 +61,18 @@ def estimate_gyro_bias(
     ``imu`` holds the K - 1 measurements between the keyframes; ``sigma`` is the noise of an observation on the z = 1
     plane, ``bias_sigma`` the prior of the bias about zero, rad/s. A track in no pair has distance NaN.
     """
-    bias, pairs = imu[0].bias_gyro_B, _Pairs.of(window, np.inf)
+    about = imu[0].bias_gyro_B
+    bias, dR, by_bias = about, np.stack([m.dR for m in imu]), np.stack([m.bias_jacobian[:3, :3] for m in imu])
     for iterations, longest_s, cauchy in _STAGES:
         pairs = _Pairs.of(window, longest_s)
         weight, distance = pairs.common.astype(np.float64), np.full(pairs.common.shape, np.nan)
         for _ in range(iterations):
-            R_B1B2, by_bias = _relative_rotations(imu, bias, pairs.first, pairs.second)
+            R_B1B2, J = _relative_rotations(dR, by_bias, bias - about, pairs.first, pairs.second)
             H, b = linearise_pairs(
                 pairs.f, pairs.g, pairs.common, R_BC.T @ R_B1B2 @ R_BC, weight, sigma, cauchy, distance
             )
             # R_CB R_B1B2 Exp(dtheta_B) R_BC = R_C1C2 Exp(R_CB dtheta_B)
-            A = R_BC.T @ by_bias
+            A = R_BC.T @ J
             transposed = np.swapaxes(A, -1, -2)
             information = (transposed @ H[:, :3, :3] @ A).sum(axis=0) + np.eye(3) / bias_sigma**2
             gradient = (transposed @ b[:, :3, None]).sum(axis=0)[:, 0] + bias / bias_sigma**2
@@ -101,22 +104,26 @@ class _Pairs:
         return _Pairs(i, j, bearings[i], bearings[j], window.seen[i] & window.seen[j])
 
 
-def _relative_rotations(imu: Sequence[Preintegrated], bias: Float, first: Int, second: Int) -> tuple[Float, Float]:
-    """R_BiBj of every pair at ``bias`` (P, 3, 3), and its derivative by the bias (P, 3, 3), right perturbation.
+@kernel
+def _relative_rotations(dR: Float, by_bias: Float, change: Float, first: Int, second: Int) -> tuple[Float, Float]:
+    """R_BiBj of P pairs (P, 3, 3), and its derivative by the bias (P, 3, 3), right perturbation.
 
-    ``imu`` holds the measurements between consecutive frames, ``first`` and ``second`` (P,) the frames of each pair.
+    ``dR`` and ``by_bias`` (K - 1, 3, 3) are the turns between consecutive frames and their derivatives, at a bias that
+    is now another by ``change`` (3,); ``first`` and ``second`` (P,) are the frames of each pair.
     """
-    by_bias = np.stack([m.bias_jacobian[:3, :3] for m in imu])
-    correction = (by_bias @ (bias - np.stack([m.bias_gyro_B for m in imu]))[..., None])[..., 0]
-    steps = np.stack([m.dR for m in imu]) @ so3.exp(correction)
-    turned_by = so3.right_jacobian(correction) @ by_bias
-    R, J = [np.eye(3)], [np.zeros((3, 3))]
-    for step, by in zip(steps, turned_by, strict=True):
-        R.append(R[-1] @ step)
-        J.append(step.T @ J[-1] + by)
-    R_0, J_0 = np.stack(R), np.stack(J)
-    R_ij = np.swapaxes(R_0[first], -1, -2) @ R_0[second]
-    return R_ij, J_0[second] - np.swapaxes(R_ij, -1, -2) @ J_0[first]
+    R_0, J_0 = np.zeros((len(dR) + 1, 3, 3)), np.zeros((len(dR) + 1, 3, 3))
+    R_0[0] = np.eye(3)
+    for k in range(len(dR)):
+        correction = turned(by_bias[k], change)
+        step = product(dR[k], exp(correction))
+        R_0[k + 1] = product(R_0[k], step)
+        J_0[k + 1] = product(step.T, J_0[k]) + product(right_jacobian(correction), by_bias[k])
+    R, J = np.empty((len(first), 3, 3)), np.empty((len(first), 3, 3))
+    for p in range(len(first)):
+        i, j = first[p], second[p]
+        R[p] = product(R_0[i].T, R_0[j])
+        J[p] = J_0[j] - product(R[p].T, J_0[i])
+    return R, J
 
 
 def _median_over_pairs(distance: Float) -> Float:
@@ -199,7 +206,7 @@ def _null_vector(Q: Float, use: Bool) -> tuple[Float, Float]:
     S[np.arange(K), :, np.arange(K)] += Q.sum(axis=1)
     S = S.reshape(3 * K, 3 * K)[3:, 3:]
     c = np.zeros((K, 3))
-    c[1:] = np.linalg.eigh(S)[1][:, 0].reshape(K - 1, 3)
+    c[1:] = eigh(S, subset_by_index=(0, 0))[1].reshape(K - 1, 3)
     return c, (V_inv @ (right.T @ c.ravel()).reshape(L, 3, 1))[..., 0]
 
 

@@ -79,7 +79,7 @@ _SCALE_SIGMA_FOUND = 0.05
 CONTRADICTED = 20.0
 # A readout is doubted where it can be found to this.
 _READOUT_SIGMA_S, _READOUT = 0.0025, READOUT - CALIBRATION_SIZE
-# Beyond so many times these the first adjustment is not gone on with.
+# Beyond so many times these an attempt is not gone on with, be it before the first adjustment or after it.
 _HOPELESS = 1.5
 
 
@@ -114,20 +114,22 @@ def initialise(
     alignment = align(structure.position, imu[:-1], calibration.cameras[0].p_BC, BIAS_ACCEL_SIGMA)
     refuse_unless(alignment.scale > 0.0, "the readings contradict the direction of the motion in the images")
     x = _start_of_adjustment(window.without_last(), structure, alignment, calibration)
-    problem, solution = adjusted_window(window.without_last(), x, calibration, doubted, roughly=True)
-    cov = covariance(problem, solution.variables, doubted)
+    problem = adjustment(window.without_last(), imu[:-1], x, calibration.cameras, doubted)
     scale_sigma = _SCALE_SIGMA_FOUND if found else _SCALE_SIGMA
+    guess = Solution(x, problem.linearise(x), iterations=0, converged=False)
+    check_uncertainty(x.states, covariance(problem, guess, doubted), scale_sigma, _HOPELESS)
+    solution = adjusted(problem, x, doubted, roughly=True)
+    cov = covariance(problem, solution, doubted)
     check_uncertainty(solution.variables.states, cov, scale_sigma, _HOPELESS)
     if not cov[_READOUT, _READOUT] <= _READOUT_SIGMA_S**2:
         # Only fast turns tell a readout; slow ones would have it make up for something else.
         doubted = doubted.copy()
         doubted[READOUT, READOUT] = known[READOUT, READOUT]
     window, problem, solution = refined(window, problem, solution, packets[-held_out:], calibration, doubted)
-    x = solution.variables
-    cov = covariance(problem, x, doubted)
-    check_uncertainty(x.states, cov, scale_sigma)
-    problem, x = _believed(problem, solution, calibration, known, cov)
-    cov = covariance(problem, x, known)
+    cov = covariance(problem, solution, doubted)
+    check_uncertainty(solution.variables.states, cov, scale_sigma)
+    problem, solution = _believed(problem, solution, calibration, known, cov)
+    x, cov = solution.variables, covariance(problem, solution, known)
     keep = explained(problem, x)
     states, p_WF = from_zero(window.t_ns, x, cov, landmark_positions(problem, x)[keep])
     return InitialEstimate("dynamic", states, window.ids[keep], p_WF, x.cameras, _camera(cov))
@@ -145,16 +147,12 @@ def refined(
 
     That must predict what the first camera sees in the packets ``held_out`` behind it, of which the newest is the last.
     """
-    keep = explained(problem, rough.variables)
-    window = window.only(keep)
+    x = rough.variables
+    keep = explained(problem, x)
+    p_WF = landmark_positions(problem, x)[keep]
+    window, x = window.only(keep), replace(x, landmarks=x.landmarks[keep])
     require_tracks(window, "tracks fit the bundle adjustment")
-    x = replace(rough.variables, landmarks=rough.variables.landmarks[keep])
-    problem, solution = adjusted_window(window.without_last(), x, calibration, known)
-    _check_fit(problem, solution)
-
-    x = solution.variables
     predicted = _predicted_states(held_out, x.states.unstack(window.t_ns[:-1])[-1], calibration)
-    p_WF = landmark_positions(problem, x)
     _check_lookahead(predicted, held_out, x.cameras, window.ids, p_WF, calibration.cameras[0].model)
     x = replace(x, states=x.states.append(StateArrays.stack(predicted[-1:])))
     problem, solution = adjusted_window(window, x, calibration, known)
@@ -164,8 +162,8 @@ def refined(
 
 def _believed(
     problem: Problem, solution: Solution, calibration: Calibration, known: Float, cov: Float
-) -> tuple[Problem, Variables]:
-    """The adjustment where ``calibration`` is right, known to ``known`` (16, 16), and its minimum.
+) -> tuple[Problem, Solution]:
+    """The adjustment where ``calibration`` is right, known to ``known`` (16, 16).
 
     Raises :class:`ContradictedError` where the ``solution`` that doubts it, of covariance ``cov``, is far likelier.
     """
@@ -174,7 +172,7 @@ def _believed(
     believed = adjusted(problem, replace(x, cameras=Calibrated.of(*cameras)), known)
     if not believed.cost < solution.cost + CONTRADICTED * variance_of(problem, x):
         raise ContradictedError(x.cameras, _camera(cov))
-    return problem, believed.variables
+    return problem, believed
 
 
 def variance_of(problem: Problem, x: Variables) -> float:
@@ -212,6 +210,8 @@ def _structure(window: Window, R_B0C: Float, sigma: float) -> tuple[Window, Stru
         keep = structure.good & (typical < _STRUCTURE_LIMIT * sigma)
         window = window.only(keep)
         require_tracks(window, "tracks have parallax and fit the structure")
+        if keep.all():
+            break
     return window, structure.only(keep)
 
 
@@ -227,9 +227,7 @@ def _start_of_adjustment(
     return Variables(states, Calibrated.of(*calibration.cameras), landmarks)
 
 
-def adjusted_window(
-    window: Window, x: Variables, calibration: Calibration, known: Float, roughly: bool = False
-) -> tuple[Problem, Solution]:
+def adjusted_window(window: Window, x: Variables, calibration: Calibration, known: Float) -> tuple[Problem, Solution]:
     """The adjustment of ``window`` from ``x``, its readings integrated at the biases there.
 
     ``known`` (16 N, 16 N) is the covariance of the ``calibration``'s cameras.
@@ -237,7 +235,7 @@ def adjusted_window(
     biases = zip(x.states.bias_gyro_B[:-1], x.states.bias_accel_B[:-1], strict=True)
     imu = [preintegrate(segment, *bias, calibration.imu) for segment, bias in zip(window.segments, biases, strict=True)]
     problem = adjustment(window, imu, x, calibration.cameras, known)
-    return problem, adjusted(problem, x, known, roughly)
+    return problem, adjusted(problem, x, known)
 
 
 def explained(problem: Problem, x: Variables) -> Bool:

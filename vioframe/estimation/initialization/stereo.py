@@ -18,7 +18,7 @@ from vioframe.estimation.factors.inertial import StateArrays
 from vioframe.estimation.factors.landmarks import in_hosts
 from vioframe.estimation.factors.problem import Variables
 from vioframe.estimation.factors.reprojection import Calibrated
-from vioframe.estimation.initialization.bundle_adjustment import covariance
+from vioframe.estimation.initialization.bundle_adjustment import adjusted, adjustment, covariance
 from vioframe.estimation.initialization.closed_form import align, rotations
 from vioframe.estimation.initialization.dynamic import (
     CONTRADICTED,
@@ -89,13 +89,14 @@ def initialise(packets: Sequence[Packet], calibration: Calibration, known: Float
     require_tracks(window, "tracks lie ahead")
 
     x = Variables(alignment.states.turned(level_rotation(-alignment.g_B0)), calibrated, landmarks)
-    problem, solution = adjusted_window(window.without_last(), x, calibration, known, roughly=True)
+    problem = adjustment(window.without_last(), imu[:-1], x, cameras, known)
+    solution = adjusted(problem, x, known, roughly=True)
     window, problem, solution = refined(window, problem, solution, packets[-_HELD_OUT:], calibration, known)
     x = solution.variables
     _, other = adjusted_window(window, x, calibration, doubted)
     contradicted = not solution.cost < other.cost + CONTRADICTED * variance_of(problem, x)
     refuse_unless(not contradicted, "images and readings contradict the calibration")
-    cov = covariance(problem, x, known)
+    cov = covariance(problem, solution, known)
     check_uncertainty(x.states, cov, np.inf, _LESS_SURE)
     keep = explained(problem, x)
     states, p_WF = from_zero(window.t_ns, x, cov, landmark_positions(problem, x)[keep])
