@@ -5,7 +5,8 @@ A camera is a folder with a table ``data.csv`` and a folder ``data`` of images.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from functools import partial
 from heapq import merge
 from itertools import islice
 from pathlib import Path, PurePath
@@ -15,6 +16,7 @@ import numpy as np
 
 from vioframe.errors import DatasetError, shortened, shown
 from vioframe.interfaces import DatasetFactory
+from vioframe.io.ahead import decoded_ahead
 from vioframe.io.calibration import match_cameras
 from vioframe.io.images import check_bit_depth, decode_image, frame_set, gathered
 from vioframe.parts.hooks import hookimpl
@@ -106,16 +108,16 @@ class EurocDataset:
 
     def measurements(self) -> Iterator[Measurement]:
         """IMU samples and frames, each in the order of their file."""
-        return gathered(self._read())
+        return gathered(decoded_ahead(self._read()))
 
-    def _read(self) -> Iterator[Measurement]:
+    def _read(self) -> Iterator[Measurement | Callable[[], Measurement]]:
         imu = iter(self._imu)
         taken = 0
         due = _rows_due([sample.t_ns for sample in self._imu], [t_ns for t_ns, _, _ in self._images])
         for image, count in zip(self._images, due, strict=True):
             yield from islice(imu, max(0, count - taken))
             taken = max(taken, count)
-            yield self._frame(*image)
+            yield partial(self._frame, *image)
         yield from imu
 
     def _frame(self, t_ns: int, place: int, file: str) -> FrameSet | Unreadable:

@@ -13,6 +13,7 @@ import logging
 import os
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from functools import partial
 from itertools import chain, takewhile
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, BinaryIO
@@ -21,9 +22,10 @@ import numpy as np
 
 from vioframe.errors import DatasetError
 from vioframe.interfaces import DatasetFactory
+from vioframe.io.ahead import decoded_ahead
 from vioframe.io.calibration import PACKAGED, match_cameras, no_calibration, sidecar_folder
 from vioframe.io.images import check_bit_depth, frame_set, gathered
-from vioframe.io.ros import imu_sample, pixels, stamp_ns
+from vioframe.io.ros import imu_sample, is_compressed, pixels, stamp_ns
 from vioframe.io.writers import GROUND_TRUTH_TOPIC, TRUE_VECTOR_TOPICS
 from vioframe.parts.hooks import hookimpl
 from vioframe.types import FrameSet, Measurement, Unreadable
@@ -135,8 +137,14 @@ class RosbagDataset:
             )
 
     def _messages(self, reader: AnyReader, *topics: str) -> Iterator[Measurement]:
+        return decoded_ahead(self._undecoded(reader, *topics))
+
+    def _undecoded(self, reader: AnyReader, *topics: str) -> Iterator[Measurement | Callable[[], Measurement]]:
         for topic, message in self._deserialized(reader, *topics):
-            yield imu_sample(message) if topic == self._imu_topic else self._frame(topic, message)
+            if topic == self._imu_topic:
+                yield imu_sample(message)
+            else:
+                yield partial(self._frame, topic, message) if is_compressed(message) else self._frame(topic, message)
 
     def _frame(self, topic: str, message: Any) -> FrameSet | Unreadable:
         t_ns, where = stamp_ns(message), f"{self._path} [{topic}]"

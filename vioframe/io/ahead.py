@@ -1,12 +1,13 @@
-"""Reading a recording ahead of its use."""
+"""Reading a recording, and decoding its images, ahead of their use."""
 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Generator, Iterable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Generator, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 
+from vioframe.cores import usable_cores
 from vioframe.types import FrameSet, Measurement
 
 # Frames that may wait, decoded.
@@ -30,6 +31,50 @@ def read_ahead(measurements: Iterable[Measurement]) -> Iterator[Measurement]:
                 future.cancel()
             with suppress(RuntimeError):  # where the interpreter is about to end
                 thread.submit(batches.close)  # by who opened it: a data base insists on that
+
+
+def decoded_ahead(measurements: Iterable[Measurement | Callable[[], Measurement]]) -> Iterator[Measurement]:
+    """The same in their order, of which some are still to be made: by a thread, where there is a core for it.
+
+    Decoders work beside Python. What fails, be it making one or bringing them, fails in its turn.
+    """
+    if usable_cores() == 1:
+        for each in measurements:
+            yield each() if callable(each) else each
+        return
+    waiting: deque[Measurement | Future[Measurement]] = deque()
+    with ThreadPoolExecutor(1, "decoder") as thread:
+        in_work = 0
+        try:
+            for each in _failing_in_turn(measurements):
+                waiting.append(thread.submit(each) if callable(each) else each)
+                in_work += callable(each)
+                while in_work > _AHEAD:
+                    in_work -= isinstance(waiting[0], Future)
+                    yield _made(waiting.popleft())
+            while waiting:
+                yield _made(waiting.popleft())
+        finally:
+            thread.shutdown(wait=False, cancel_futures=True)
+
+
+def _made(measurement: Measurement | Future[Measurement]) -> Measurement:
+    return measurement.result() if isinstance(measurement, Future) else measurement
+
+
+def _failing_in_turn(
+    measurements: Iterable[Measurement | Callable[[], Measurement]],
+) -> Iterator[Measurement | Callable[[], Measurement]]:
+    """The same, and where they fail one that cannot be made."""
+
+    def fail() -> Measurement:
+        raise failure
+
+    try:
+        yield from measurements
+    except Exception as error:
+        failure = error
+        yield fail
 
 
 def _to_a_frame(measurements: Iterable[Measurement]) -> Generator[list[Measurement]]:

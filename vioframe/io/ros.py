@@ -30,7 +30,12 @@ def pixels(message: Any, where: str) -> NDArray[Any] | None:
 
     Raises :class:`DatasetError`, beginning with ``where``, for a kind of pixels that is not read.
     """
-    return _raw_image(message, where) if hasattr(message, "encoding") else decode_image(message.data, where)
+    return decode_image(message.data, where) if is_compressed(message) else _raw_image(message, where)
+
+
+def is_compressed(message: Any) -> bool:
+    """Whether an image has to be decoded."""
+    return not hasattr(message, "encoding")
 
 
 def _raw_image(message: Any, where: str) -> NDArray[Any] | None:
