@@ -33,8 +33,10 @@ if TYPE_CHECKING:
     from vioframe.frontend import FrontendOptions
     from vioframe.parts.registry import Origin, Part
 
-# Frames whose images lie in memory at once: one that is being taken from there, one that waits, one that is being put.
-_SLOTS = 3
+FRAMES_AHEAD = 3
+"""Frames whose points may be followed while one is estimated from."""
+# Frames whose images lie in memory at once: one that is being taken from there, those that wait, one that is being put.
+_SLOTS = FRAMES_AHEAD + 2
 # Images come and go with every frame. glibc would give their memory back each time, and have it filled with zeros anew.
 _KEPT_MEMORY = {"MALLOC_TOP_PAD_": str(64 << 20)}
 

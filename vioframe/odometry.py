@@ -9,6 +9,7 @@ closer, the first of them: what it knows by then goes along with the step.
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
@@ -23,7 +24,7 @@ from vioframe.estimation.options import EstimationOptions
 from vioframe.estimation.soundness import defect_of_correction
 from vioframe.frontend import Frontend, FrontendOptions
 from vioframe.frontend import warming as frontend_warming
-from vioframe.frontend_process import FrontendProcess
+from vioframe.frontend_process import FRAMES_AHEAD, FrontendProcess
 from vioframe.incidents import Incidents
 from vioframe.interfaces import Backend, Detector, LoopCloser
 from vioframe.io.ahead import read_ahead
@@ -55,6 +56,14 @@ class _Seen:
     frames: FrameSet
     tracks: FrameTracks
     stage_seconds: Mapping[str, float]
+
+
+@dataclass(frozen=True, slots=True)
+class _Known:
+    """The calibration as the newest estimate has it, and that by which a flight is followed, which starts find."""
+
+    rig: Calibration
+    following: Calibration
 
 
 class Odometry:
@@ -137,8 +146,11 @@ class Odometry:
         self._given = calibration.lenses
         self.calibration = calibration
         """What is known of the rig by now: as given at first, then as the back-end has learned it."""
-        self._tracking = False
-        self._seen_with = calibration
+        self._tracking, self._since_flight = False, FRAMES_AHEAD
+        known = _Known(calibration, self._life.calibration)
+        # After the newest estimate, and those before it.
+        self._known = deque([known] * (FRAMES_AHEAD + 1), maxlen=FRAMES_AHEAD + 1)
+        self._using = known
 
     def add(self, measurement: Measurement) -> list[Step]:
         """Take one measurement; the steps of the frames that are complete by it."""
@@ -217,13 +229,14 @@ class Odometry:
         yield from self._synchroniser.finish()
 
     def _follow_ahead(self, packets: Iterator[Packet], frontend: FrontendProcess) -> Iterator[Step]:
-        """Each step when the points of the next frame are already being followed.
+        """Each step when the points of the next frames are already being followed.
 
         Only in flight: at a start the next frame depends on what was found.
         """
-        ahead: Packet | None = None
+        ahead: deque[Packet] = deque()
         failure: Exception | None = None
         while True:
+            self._use(len(ahead))
             try:
                 packet = next(packets)
             except StopIteration:
@@ -231,31 +244,22 @@ class Odometry:
             except Exception as error:  # of whoever brings the measurements: what came before it still counts
                 failure = error
                 break
-            if ahead is None and not self._tracking:
+            if not ahead and not self._tracking:
                 yield self._step(*packet)
                 continue
-            self._recalibrate()
-            frontend.begin(*packet, self._seen_with)
-            before, ahead = ahead, packet
-            if before is not None:
-                yield self._estimate(self._seen(*before, frontend.end()))
-                self._retime()
-                if not self._tracking:
-                    seen, ahead = self._seen(*ahead, frontend.end()), None
-                    yield self._estimate_next(seen)
-        if ahead is not None:
-            yield self._estimate_next(self._seen(*ahead, frontend.end()))
+            frontend.begin(*packet, self._using.rig)
+            ahead.append(packet)
+            while len(ahead) > (FRAMES_AHEAD if self._tracking else 0):
+                yield self._estimate(self._seen(*ahead.popleft(), frontend.end()))
+        while ahead:
+            yield self._estimate(self._seen(*ahead.popleft(), frontend.end()))
         if failure is not None:
             raise failure
 
     def _step(self, imu: ImuSegment, frames: FrameSet) -> Step:
-        self._retime()
-        return self._estimate_next(self._see(imu, frames))
-
-    def _estimate_next(self, seen: _Seen) -> Step:
-        """Estimate from the frame that was seen last, before another is."""
-        self._recalibrate()
-        return self._estimate(seen)
+        step = self._estimate(self._see(imu, frames))
+        self._use(0)
+        return step
 
     def _see(self, imu: ImuSegment, frames: FrameSet) -> _Seen:
         """Follow the points of one frame."""
@@ -264,8 +268,8 @@ class Odometry:
             # Those before it belong to frames that were dropped.
             self._waiting_tracks = {t_ns: kept for t_ns, kept in self._waiting_tracks.items() if t_ns > frames.t_ns}
             if tracks is None:
-                return self._seen(imu, frames, self._frontend.track(imu, frames, self._seen_with))
-            lenses = self._life.calibration.lenses
+                return self._seen(imu, frames, self._frontend.track(imu, frames, self._using.rig))
+            lenses = self._using.following.lenses
             return _Seen(imu, frames, tracks if lenses == self._given else tracks.undistorted(*lenses), {})
 
     def _seen(self, imu: ImuSegment, frames: FrameSet, tracks: FrameTracks) -> _Seen:
@@ -282,12 +286,11 @@ class Odometry:
         self._tracking = estimate.status is Status.TRACKING
         if estimate.calibration is not None:
             self.calibration = estimate.calibration.calibration
-        if not in_flight:
-            # Another time offset or focal length may have been found while starting. In flight the next frame may have
-            # been cut, and its points followed, by now: then it counts from the one behind that, with one process as
-            # with two.
-            self._retime()
-            self._recalibrate()
+        self._since_flight = 0 if in_flight else self._since_flight + 1
+        known = _Known(self.calibration, self._life.calibration)
+        # While starting another time offset or focal length may be found, and counts from the next frame on. In flight
+        # the next frames may have been cut, and their points followed, by now, with one process as with two.
+        self._known.extend([known] * (FRAMES_AHEAD + 1 if self._since_flight >= FRAMES_AHEAD else 1))
         within = {f"backend.{stage}": seconds for stage, seconds in estimate.stage_seconds.items()}
         step = Step(seen.frames, seen.tracks, estimate, {**seen.stage_seconds, "backend": backend_s, **within})
         return step if self._loop_closer is None else self._corrected(step, self._loop_closer)
@@ -302,14 +305,15 @@ class Odometry:
             raise PluginError(f"{self._loop_closer_name} at {step.frames.t_ns} ns: {defect}; repair the plug-in")
         return replace(step, stage_seconds=seconds, correction=correction)
 
-    def _retime(self) -> None:
-        """Cut frames from now on as the newest estimate has it."""
-        self._synchroniser.retime(self._life.calibration.cameras[0].time_offset_ns)
+    def _use(self, ahead: int) -> None:
+        """Cut the next frame, and follow its points, with what was known as long before it with any number ``ahead``.
 
-    def _recalibrate(self) -> None:
-        """Follow points from now on with the calibration of the newest estimate."""
-        self._seen_with = self.calibration
-        self._frontend.recalibrate(self._life.calibration)
+        So many frames were seen that are still to be estimated from.
+        """
+        using, self._using = self._using, self._known[ahead]
+        if self._using is not using:
+            self._synchroniser.retime(self._using.following.cameras[0].time_offset_ns)
+            self._frontend.recalibrate(self._using.following)
 
 
 def _own(image: Image) -> Image:
