@@ -73,9 +73,10 @@ def test_left_early_the_source_is_closed_by_who_opened_it():
 
 def test_an_interpreter_ends_quietly_with_one_that_is_not_through():
     code = (
-        "from vioframe.io.ahead import read_ahead\n"
+        "from functools import partial\n"
+        "from vioframe.io.ahead import decoded_ahead, read_ahead\n"
         "from vioframe.types import FrameSet\n"
-        "left = read_ahead(FrameSet(t_ns, ()) for t_ns in range(100))\n"
+        "left = read_ahead(decoded_ahead(partial(FrameSet, t_ns, ()) for t_ns in range(100)))\n"
         "print(next(left).t_ns)\n"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60)

@@ -58,7 +58,7 @@ _MOST_REASONS = 4
 @click.option(
     "--cores",
     type=click.IntRange(1, 2),
-    help="With 2, another process follows points while the frame before is estimated from; the results are the same.  "
+    help="With 2, another process follows points while frames before are estimated from; the results are the same.  "
     "[default: 2 where there are as many]",
 )
 @click.option("--out", type=FILE, help="Run folder.  [default: runs/DATASET_DETECTOR_BACKEND]")
