@@ -306,9 +306,9 @@ class Odometry:
         return replace(step, stage_seconds=seconds, correction=correction)
 
     def _use(self, ahead: int) -> None:
-        """Cut the next frame, and follow its points, with what was known as long before it with any number ``ahead``.
+        """Cut the next frame, and follow its points, by what was known ``FRAMES_AHEAD`` + 1 frames before it.
 
-        So many frames were seen that are still to be estimated from.
+        That is so with any number ``ahead`` of frames that were begun and are still to be estimated from.
         """
         using, self._using = self._using, self._known[ahead]
         if self._using is not using:

@@ -59,7 +59,7 @@ class Frontend:
                 self._prepared[id(frames)] = self._prepare(frames)
 
     def track(self, imu: ImuSegment, frames: FrameSet, calibration: Calibration) -> FrameTracks:
-        """The tracks of ``frames``; ``imu`` spans the time since those before, ``calibration`` is the newest there is.
+        """The tracks of ``frames``; ``imu`` spans the time since those before, ``calibration`` is as known by then.
 
         Of the calibration only the cameras' poses on the body are used, where they are known. Raises
         :class:`DatasetError` where an image does not fit the calibration, and :class:`PluginError` where the detector
