@@ -5,7 +5,8 @@ A camera is a folder with a table ``data.csv`` and a folder ``data`` of images.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import suppress
 from functools import partial
 from heapq import merge
 from itertools import islice
@@ -59,8 +60,8 @@ class EurocDataset:
         self.calibration, self._folders = match_cameras(files, list(folders), wanted)
         rows = [[(t_ns, place, file) for t_ns, file in folders[name]] for place, name in enumerate(self._folders)]
         self._images = list(merge(*rows, key=lambda row: row[0]))
-        self._imu = list(_imu_rows(imu_file))
-        if not any(isinstance(row, ImuSample) for row in self._imu):
+        self._imu_name, self._imu_lines = imu_file.name, _csv_lines(imu_file)
+        if not any(isinstance(row, ImuSample) for row in self._imu()):
             raise DatasetError(f"{imu_file} holds no sample; the recording has no IMU data")
 
     def _camera_folders(self, wanted: list[str] | None) -> dict[str, list[tuple[int, str]]]:
@@ -111,14 +112,17 @@ class EurocDataset:
         return gathered(decoded_ahead(self._read()))
 
     def _read(self) -> Iterator[Measurement | Callable[[], Measurement]]:
-        imu = iter(self._imu)
+        imu = self._imu()
         taken = 0
-        due = _rows_due([sample.t_ns for sample in self._imu], [t_ns for t_ns, _, _ in self._images])
+        due = _rows_due(list(_imu_stamps(self._imu_lines)), [t_ns for t_ns, _, _ in self._images])
         for image, count in zip(self._images, due, strict=True):
             yield from islice(imu, max(0, count - taken))
             taken = max(taken, count)
             yield partial(self._frame, *image)
         yield from imu
+
+    def _imu(self) -> Iterator[ImuSample | Unreadable]:
+        return _imu_rows(self._imu_name, self._imu_lines)
 
     def _frame(self, t_ns: int, place: int, file: str) -> FrameSet | Unreadable:
         folder = self._mav0 / self._folders[place]
@@ -153,42 +157,49 @@ def _mav0(path: Path) -> Path:
     raise DatasetError(f"{path} holds no mav0/; name the folder of one sequence in ASL layout")
 
 
-def _csv_rows(file: Path) -> Iterator[list[str]]:
+def _csv_lines(file: Path) -> list[str]:
     """The rows of a csv file, without comments and a heading."""
     try:
         lines = file.read_text(encoding="utf-8-sig").splitlines()
     except (OSError, UnicodeDecodeError) as err:
         raise DatasetError(f"cannot read {file}: {' '.join(str(err).split())}") from None
-    for number, line in enumerate(lines):
-        is_heading = number == 0 and not line[:1].isdigit()
-        if line.strip() and not line.startswith("#") and not is_heading:
-            yield line.split(",")
+    if lines and not lines[0][:1].isdigit():
+        del lines[0]
+    return [line for line in lines if line.strip() and not line.startswith("#")]
 
 
 def _frame_rows(file: Path) -> Iterator[tuple[int, str]]:
     """Stamp and image file of each frame."""
-    for row in _csv_rows(file):
+    for line in _csv_lines(file):
+        row = line.split(",")
         try:
             t_ns = _stamp_ns(row[0])
         except ValueError:
-            raise DatasetError(
-                f"{file}: {shown(','.join(row))} does not begin with a stamp in integer nanoseconds"
-            ) from None
+            raise DatasetError(f"{file}: {shown(line)} does not begin with a stamp in integer nanoseconds") from None
         yield t_ns, row[1].strip() if len(row) > 1 else f"{t_ns}.png"
 
 
-def _imu_rows(file: Path) -> Iterator[ImuSample | Unreadable]:
-    """The samples of the file; a row that is none takes the place, and the stamp, of its predecessor's."""
+def _imu_rows(name: str, lines: Iterable[str]) -> Iterator[ImuSample | Unreadable]:
+    """The samples of the file ``name``; a row that is none takes the place, and the stamp, of its predecessor's."""
     t_ns = 0
-    for row in _csv_rows(file):
+    for line in lines:
+        row = line.split(",")
         try:
             wx, wy, wz, ax, ay, az = map(float, row[1:7])
             t_ns = _stamp_ns(row[0])
         except ValueError:
-            problem = f"{file.name}: {shown(','.join(row))} is no stamp with six readings"
-            yield Unreadable(t_ns, "imu_unreadable", problem)
+            yield Unreadable(t_ns, "imu_unreadable", f"{name}: {shown(line)} is no stamp with six readings")
         else:
             yield ImuSample(t_ns, np.array([wx, wy, wz]), np.array([ax, ay, az]))
+
+
+def _imu_stamps(lines: Iterable[str]) -> Iterator[int]:
+    """The stamp of each row, or where that is none its predecessor's; readings are read when their turn comes."""
+    t_ns = 0
+    for line in lines:
+        with suppress(ValueError):
+            t_ns = _stamp_ns(line.partition(",")[0])
+        yield t_ns
 
 
 def _stamp_ns(text: str) -> int:

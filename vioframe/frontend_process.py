@@ -5,7 +5,7 @@ for the interpreter's lock many times a frame. Images go through memory that bot
 comes back is what :class:`~vioframe.frontend.Frontend` gives, to the last bit. This is the side of whoever estimates,
 :mod:`vioframe.frontend_worker` the other one.
 
-Little is imported here: the other process is to be begun before this one loads what it needs itself.
+Next to nothing is imported here: the other process is to be begun before this one loads what it needs itself.
 """
 
 from __future__ import annotations
@@ -17,26 +17,20 @@ import sys
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
-from itertools import accumulate
-from mmap import mmap
 from tempfile import TemporaryFile
 from typing import IO, TYPE_CHECKING, Any, Self
 from weakref import finalize
 
-import numpy as np
-
 from vioframe.errors import RunError, VioframeError
-from vioframe.incidents import Incidents
-from vioframe.types import Calibration, FrameSet, FrameTracks, Image, ImuSegment
 
 if TYPE_CHECKING:
     from vioframe.frontend import FrontendOptions
+    from vioframe.incidents import Incidents
     from vioframe.parts.registry import Origin, Part
+    from vioframe.types import Calibration, FrameSet, FrameTracks, Image, ImuSegment
 
 FRAMES_AHEAD = 3
 """Frames whose points may be followed while one is estimated from."""
-# Frames whose images lie in memory at once: one that is being taken from there, those that wait, one that is being put.
-_SLOTS = FRAMES_AHEAD + 2
 # Images come and go with every frame. glibc would give their memory back each time, and have it filled with zeros anew.
 _KEPT_MEMORY = {"MALLOC_TOP_PAD_": str(64 << 20)}
 
@@ -93,41 +87,6 @@ class Failed:
     incidents: list[Incident]
 
 
-class Images:
-    """Images of a rig's cameras, a few frames in turn, in the open file ``descriptor`` that two processes see."""
-
-    def __init__(self, descriptor: int, calibration: Calibration) -> None:
-        self._shapes = [camera.model.resolution[::-1] for camera in calibration.cameras]
-        *self._begins, self._frame_bytes = accumulate((h * w for h, w in self._shapes), initial=0)
-        size = _SLOTS * self._frame_bytes
-        os.truncate(descriptor, size)
-        self._memory = np.frombuffer(mmap(descriptor, size), np.uint8)
-        self._slot = 0
-
-    def put(self, images: tuple[Image | None, ...]) -> tuple[Image | int | None, ...]:
-        """Where each image now is; itself, if it is none or not as calibrated, which the front-end will refuse."""
-        self._slot = (self._slot + 1) % _SLOTS
-        places: list[Image | int | None] = []
-        for image, shape, begin in zip(images, self._shapes, self._begins, strict=True):
-            place = self._slot * self._frame_bytes + begin
-            if image is None or image.shape != shape or image.dtype != np.uint8:
-                places.append(image)
-            else:
-                self._at(place, shape)[:] = image
-                places.append(place)
-        return tuple(places)
-
-    def taken(self, places: tuple[Image | int | None, ...]) -> tuple[Image | None, ...]:
-        """Copies of what was put: a detector, which is anybody's code, may keep them."""
-        return tuple(
-            self._at(place, shape).copy() if isinstance(place, int) else place
-            for place, shape in zip(places, self._shapes, strict=True)
-        )
-
-    def _at(self, place: int, shape: tuple[int, int]) -> Image:
-        return self._memory[place : place + shape[0] * shape[1]].reshape(shape)
-
-
 class FrontendProcess:
     """Does what :class:`~vioframe.frontend.Frontend` does, with a detector made there of an installed part.
 
@@ -166,9 +125,11 @@ class FrontendProcess:
 
         ``warm``, it has looked at some images before.
         """
+        from vioframe.shared_images import SharedImages
+
         self._incidents, self._lenses = incidents, calibration
         try:
-            self._images = Images(self._memory.fileno(), calibration)
+            self._images = SharedImages(self._memory.fileno(), calibration, FRAMES_AHEAD)
         except OSError as error:
             what = f"no memory for the images that two processes share: {error.strerror}"
             raise RunError(f"{what}; --cores 1 does with one process") from error

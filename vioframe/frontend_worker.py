@@ -18,10 +18,11 @@ from typing import IO
 from vioframe.cores import limited_threads, usable_cores
 from vioframe.errors import VioframeError
 from vioframe.frontend import Frontend, warming
-from vioframe.frontend_process import Compiling, Done, Failed, Images, Incident, Job, Setup, put
+from vioframe.frontend_process import FRAMES_AHEAD, Compiling, Done, Failed, Incident, Job, Setup, put
 from vioframe.incidents import Incidents
 from vioframe.jit import have_been_compiled, heard
 from vioframe.parts import registry
+from vioframe.shared_images import SharedImages
 from vioframe.types import FrameSet, FrameTracks
 
 
@@ -46,7 +47,7 @@ def serve(memory: int) -> None:
             if have_been_compiled():  # else the first frame needs but some of them
                 warming.load_kernels()  # while the other process is busy with itself
             setup = pickle.load(source)
-            _follow(setup, Images(memory, setup.calibration), incidents, source, answers)
+            _follow(setup, SharedImages(memory, setup.calibration, FRAMES_AHEAD), incidents, source, answers)
         except EOFError:
             raise
         except Exception as error:
@@ -68,7 +69,7 @@ class _Noted(Incidents):
         return new
 
 
-def _follow(setup: Setup, images: Images, incidents: _Noted, source: IO[bytes], answers: IO[bytes]) -> None:
+def _follow(setup: Setup, images: SharedImages, incidents: _Noted, source: IO[bytes], answers: IO[bytes]) -> None:
     installed = registry.load_alone(setup.origin)
     with installed.blaming():
         detector = installed.create_detector(setup.detector, setup.detector_options)

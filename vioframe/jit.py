@@ -179,10 +179,11 @@ def _temporary_folder() -> Path:
 @cache
 def _fingerprint(own: Path) -> str:
     """A hash of every source that has kernels: vioframe's, and those of the plug-in at ``own``."""
-    texts = set()
-    for folder in {_PACKAGE, own}:
-        for path in [folder] if folder.is_file() else folder.rglob("*.py"):
-            text = path.read_bytes()
-            if b"vioframe.jit" in text:
-                texts.add(text)
+    texts = _texts(_PACKAGE) | _texts(own)
     return hashlib.sha256(b"\0".join(sorted(texts))).hexdigest()[:16]
+
+
+@cache
+def _texts(own: Path) -> frozenset[bytes]:
+    paths = [own] if own.is_file() else own.rglob("*.py")
+    return frozenset(text for path in paths if b"vioframe.jit" in (text := path.read_bytes()))

@@ -213,6 +213,8 @@ def record(
     however the run ends. The summary has the ``findings`` about the recording: those of its stamps and readings, or
     with ``explain`` all that can be found (:meth:`Experiment.look_closely`) where the run never initialised.
     """
+    with limited_threads():  # as in flight; ahead of it, while a front-end's process still loads
+        facts = machine.describe()
     begin_s = working_s()
     steps = experiment.steps()
     first = next(steps, None)
@@ -221,6 +223,7 @@ def record(
     taken_s = working_s() - begin_s
     new_run_folder(folder, overwrite=overwrite)
     try:
+        write_json(folder / "machine.json", facts)
         return _write(experiment, folder, chain([first], steps), taken_s, on_step, explain)
     except OSError as error:
         raise RunError(f"cannot write to {folder}: {error.strerror}; is the disk full?") from error
@@ -254,7 +257,6 @@ def _write(
 ) -> dict[str, Any]:
     config, registry, live = experiment.config, experiment.registry, experiment.live
     (folder / "config.yaml").write_text(configuration.render(config, registry), encoding="utf-8")
-    write_json(folder / "machine.json", machine.describe())
     write_calibration(experiment.dataset.calibration, folder / "calibration")
     begin_s = working_s() - taken_s  # the clock stood still meanwhile: no frame was under way
     with (

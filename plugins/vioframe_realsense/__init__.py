@@ -7,16 +7,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 from pydantic import Field
 
+from vioframe.interfaces import Source, SourceFactory
 from vioframe.parts.hooks import hookimpl
-from vioframe_realsense.device import Wanted, plugged_in
-from vioframe_realsense.source import RealSense
-
-if TYPE_CHECKING:
-    from vioframe.interfaces import SourceFactory
 
 
 def realsense(
@@ -29,11 +25,14 @@ def realsense(
     calibration: Annotated[
         list[Path] | Path | None, "calibration files or folder; by default the device's own is read"
     ] = None,
-) -> RealSense:
+) -> Source:
     """A RealSense camera with an IMU: its infrared images and readings, through pyrealsense2.
 
     ``address`` is its serial number; the first one that is found where it is empty.
     """
+    from vioframe_realsense.device import Wanted, plugged_in
+    from vioframe_realsense.source import RealSense
+
     width, height = map(int, resolution.split("x"))
     wanted = Wanted((width, height), frame_rate_hz, emitter)
     return RealSense(plugged_in, address, wanted, cameras=cameras, calibration=calibration)

@@ -1,4 +1,7 @@
-"""What the commands share: options, the progress bar, and how notes and tables are printed."""
+"""What the commands share: options, the progress bar, and how notes and tables are printed.
+
+rich is imported where something is shown, as a run first has its other process begin.
+"""
 
 from __future__ import annotations
 
@@ -10,17 +13,6 @@ from typing import TYPE_CHECKING, Any, Self, TypeVar
 
 import click
 from click.shell_completion import CompletionItem
-from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    SpinnerColumn,
-    TaskProgressColumn,
-    TextColumn,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
-)
 
 from vioframe.errors import VioframeError
 
@@ -126,6 +118,8 @@ _WIDE = 1000
 
 def print_table(table: Table) -> None:
     """Into a file or a pipe the table goes whole: rich would fold it at 80 columns."""
+    from rich.console import Console
+
     console = Console()
     (console if console.is_terminal else Console(width=_WIDE)).print(table)
 
@@ -141,6 +135,9 @@ _COMPILING = "compiling kernels (once after installation)"
 @contextmanager
 def compiling_shown(*, quiet: bool = False) -> Iterator[None]:
     """Say so while kernels are compiled, which is half a minute of silence else; nothing where all are cached."""
+    from rich.console import Console
+    from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+
     from vioframe.jit import heard
 
     console = Console(stderr=True)
@@ -182,6 +179,16 @@ class Bar:
     def __init__(
         self, total: float | None, figures: str = "", *, quiet: bool = False, late: bool = False, percent: bool = False
     ) -> None:
+        from rich.console import Console
+        from rich.progress import (
+            BarColumn,
+            MofNCompleteColumn,
+            Progress,
+            TaskProgressColumn,
+            TextColumn,
+            TimeRemainingColumn,
+        )
+
         self.progress = Progress(
             BarColumn(bar_width=12),
             TaskProgressColumn() if percent else MofNCompleteColumn(),

@@ -19,7 +19,6 @@ from vioframe.cli.common import FILE, Bar, PartName, calibration_option, cameras
 from vioframe.cores import usable_cores
 from vioframe.errors import DatasetError, TrajectoryError
 from vioframe.frontend_process import FrontendProcess
-from vioframe.types import NS_PER_S, Step
 
 if TYPE_CHECKING:
     from vioframe.geometry.trajectory import Trajectory
@@ -27,6 +26,7 @@ if TYPE_CHECKING:
     from vioframe.parts.config import Config
     from vioframe.parts.registry import Registry
     from vioframe.pipeline import Experiment
+    from vioframe.types import Step
 
 _MOST_REASONS = 4
 
@@ -192,6 +192,8 @@ def _viewer(experiment: Experiment, window: bool, save: Path | None) -> Iterator
 
 def _watched(bar: Bar, experiment: Experiment) -> Callable[[Step], None]:
     """Has ``bar`` show frame rate, real-time factor, tracked points and what the back-end says."""
+    from vioframe.types import NS_PER_S
+
     config, frame_count = experiment.config, experiment.dataset.frame_count
     first_t_ns: int | None = None
 

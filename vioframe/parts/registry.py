@@ -12,7 +12,8 @@ import logging
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import astuple, dataclass, field, replace
-from importlib.metadata import EntryPoint, entry_points
+from functools import lru_cache
+from importlib.metadata import Distribution, EntryPoint, entry_points
 from pathlib import Path
 from types import TracebackType
 from typing import Any, cast
@@ -362,8 +363,13 @@ def _is_interrupt(error: BaseException | None) -> bool:
 
 
 def _origin(entry: EntryPoint) -> Origin:
-    name, version = (entry.dist.name, entry.dist.version) if entry.dist else ("unknown", "?")
-    return Origin(entry.name, entry.module, name, version)
+    return Origin(entry.name, entry.module, *(_name_and_version(entry.dist) if entry.dist else ("unknown", "?")))
+
+
+@lru_cache(maxsize=16)
+def _name_and_version(distribution: Distribution) -> tuple[str, str]:
+    facts = distribution.metadata  # each look at it reads a file, and most plug-ins come in one distribution
+    return facts["Name"], facts["Version"]
 
 
 def _accepts(part: Part, path: Path) -> bool:

@@ -41,7 +41,7 @@ from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, TypeVar
 
 import numpy as np
-from pydantic import AliasChoices, BaseModel, Field, FiniteFloat, PlainValidator, PositiveInt
+from pydantic import AliasChoices, BaseModel, ConfigDict, Field, FiniteFloat, PlainValidator, PositiveInt
 from pydantic import ValidationError as InvalidError
 
 from vioframe.errors import CalibrationError, shown
@@ -232,7 +232,13 @@ def _numbers(*counts: int) -> PlainValidator:
     return PlainValidator(read)
 
 
-class _Camera(BaseModel):
+class _Section(BaseModel):
+    """Checked by code that is made when the first of it is read: of all these formats a run meets one."""
+
+    model_config = ConfigDict(defer_build=True)
+
+
+class _Camera(_Section):
     """A camera of EuRoC's (``T_BS``), of Kalibr's or of OpenVINS' (``T_cam_imu``, ``T_imu_cam``)."""
 
     camera_model: Literal["pinhole", "ds", "eucm"]
@@ -251,7 +257,7 @@ class _Camera(BaseModel):
     T_cam_imu: Annotated[Float | None, _numbers(16)] = None
 
 
-class _Imu(BaseModel):
+class _Imu(_Section):
     """EuRoC's or Kalibr's IMU: continuous-time densities, SI units; and OpenVINS' scale and misalignment matrices."""
 
     gyroscope_noise_density: _Positive
@@ -266,7 +272,7 @@ class _Imu(BaseModel):
     R_IMUtoACC: Annotated[Float | None, _numbers(9)] = None
 
 
-class _VinsLens(BaseModel):
+class _VinsLens(_Section):
     """How VINS-Mono and VINS-Fusion describe a lens."""
 
     model_type: Literal["PINHOLE", "KANNALA_BRANDT"]
@@ -276,7 +282,7 @@ class _VinsLens(BaseModel):
     distortion_parameters: dict[str, FiniteFloat] = {}
 
 
-class _VinsImu(BaseModel):
+class _VinsImu(_Section):
     """What the two say of the IMU and of its time, which is that of all cameras."""
 
     OF_THE_IMU: ClassVar = ("gyr_n", "acc_n", "gyr_w", "acc_w")
@@ -317,7 +323,7 @@ class _VinsFusion(_VinsImu):
     image1_topic: str | None = None
 
 
-class _BasaltPose(BaseModel):
+class _BasaltPose(_Section):
     px: _Finite
     py: _Finite
     pz: _Finite
@@ -327,12 +333,12 @@ class _BasaltPose(BaseModel):
     qw: _Finite
 
 
-class _BasaltLens(BaseModel):
+class _BasaltLens(_Section):
     camera_type: Literal["pinhole", "pinhole-radtan8", "kb4", "ds", "ucm", "eucm"]
     intrinsics: dict[str, _Finite]
 
 
-class _Basalt(BaseModel):
+class _Basalt(_Section):
     """Basalt's calibration: all cameras and the IMU."""
 
     T_imu_cam: list[_BasaltPose]
