@@ -112,7 +112,7 @@ def _ratio(found: list[Row], others: list[Row], name: str) -> float:
 def _yardstick(data: Path, copies: int) -> Row:
     """So many at once, each on a core of its own: their mean time, and the frames a second of all."""
     command = [sys.executable, str(HERE / "yardstick.py"), str(data)]
-    begun = [_on_cores(command, 1, {}, first_core=core) for core in range(copies)]
+    begun = [on_cores(command, 1, {}, first_core=core) for core in range(copies)]
     frames_s = sum(1e3 / float(each.communicate()[0]) for each in begun)
     return {"frame_ms": 1e3 * copies / frames_s, "frames_s": frames_s}
 
@@ -126,13 +126,7 @@ def _run(data: Path, run: str, checkout: Path | None, cores: int, out: Path) -> 
     if checkout is not None:  # its own, though another vioframe may lie in the folder that this was begun in
         code = {"PYTHONPATH": f"{checkout}{os.pathsep}{checkout / 'plugins'}", "PYTHONSAFEPATH": "1"}
     rmtree(out, ignore_errors=True)
-    begin_s = monotonic()
-    process = _on_cores(command, cores, code)
-    while process.poll() is None and _lines(out / "timings.csv") < 2:
-        sleep(_POLL_S)
-    first_s = monotonic() - begin_s
-    if process.wait() != 0:
-        raise click.ClickException(f"{' '.join(command)} failed")
+    first_s = first_frame_s(command, cores, out, code)
     summary = json.loads((out / "summary.json").read_text())
     seconds = (summary["last_frame_t_ns"] - summary["first_frame_t_ns"]) * 1e-9 / summary["real_time_factor"]
     return {
@@ -144,6 +138,18 @@ def _run(data: Path, run: str, checkout: Path | None, cores: int, out: Path) -> 
     }
 
 
+def first_frame_s(command: list[str], cores: int, out: Path, environment: dict[str, str]) -> float:
+    """Have ``command`` write the run folder ``out`` to its end; how long it took until its first frame was there."""
+    begin_s = monotonic()
+    process = on_cores(command, cores, environment)
+    while process.poll() is None and _lines(out / "timings.csv") < 2:
+        sleep(_POLL_S)
+    seconds = monotonic() - begin_s
+    if process.wait() != 0:
+        raise click.ClickException(f"{' '.join(command)} failed")
+    return seconds
+
+
 def _lines(path: Path) -> int:
     try:
         return path.read_bytes().count(b"\n")
@@ -151,8 +157,8 @@ def _lines(path: Path) -> int:
         return 0
 
 
-def _on_cores(
-    command: list[str], cores: int, environment: dict[str, str], first_core: int = 0
+def on_cores(
+    command: list[str], cores: int, environment: dict[str, str], first_core: int = 0, stderr: int | None = None
 ) -> subprocess.Popen[bytes]:
     """Begin ``command`` where it may use so many cores, and its BLAS one.
 
@@ -164,6 +170,7 @@ def _on_cores(
     return subprocess.Popen(
         command,
         stdout=subprocess.PIPE,
+        stderr=stderr,
         env={**kept, **one, **environment},
         preexec_fn=partial(os.sched_setaffinity, 0, some),
     )

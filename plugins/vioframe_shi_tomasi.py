@@ -18,6 +18,9 @@ from vioframe.types import Image, Keypoints
 
 # Gradients as Sobel's filter sums them, over the 3 x 3 pixels about each, in terms of grey levels from 0 to 1.
 _SCALE = np.float32((1.0 / (4.0 * 3.0 * 255.0)) ** 2)
+# Among the strongest peaks, so many times the points asked for, there nearly always are as many that keep their
+# distance: then the order of the others is of no use.
+_PEAKS_PER_POINT = 6
 _HALF, _LOWER_HALF = np.uint64(32), np.uint64(0xFFFFFFFF)
 
 
@@ -43,11 +46,15 @@ class ShiTomasi:
         peaks = _peaks(eigenvalue, eigenvalue.max() * np.float32(self._quality_level))
         score = eigenvalue.ravel()[peaks]
         # Strongest first, of equal ones the first: positive floats are in the order of their bits.
-        order = np.sort((~score.view(np.uint32)).astype(np.uint64) << _HALF | np.arange(len(peaks), dtype=np.uint64))
-        order &= _LOWER_HALF
-        rows, columns = np.divmod(peaks[order], image.shape[1])
-        xy = np.column_stack([columns, rows]).astype(np.float32)
-        taken = distinct(xy, self._min_distance_px, max_points)
+        keys = (~score.view(np.uint32)).astype(np.uint64) << _HALF | np.arange(len(peaks), dtype=np.uint64)
+        for most in (_PEAKS_PER_POINT * max_points, len(keys)):
+            strongest = np.sort(np.partition(keys, most)[:most] if most < len(keys) else keys)
+            order = strongest & _LOWER_HALF
+            rows, columns = np.divmod(peaks[order], image.shape[1])
+            xy = np.column_stack([columns, rows]).astype(np.float32)
+            taken = distinct(xy, self._min_distance_px, max_points)
+            if len(taken) == max_points or most >= len(keys):
+                break
         return Keypoints(xy[taken], score[order[taken]])
 
 

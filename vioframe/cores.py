@@ -6,6 +6,7 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import cache
+from threading import Lock
 from typing import Any
 
 # More threads than this gain nothing on images of this size, and cost on machines that have many.
@@ -19,7 +20,7 @@ def usable_cores() -> int:
 
 @contextmanager
 def limited_threads(opencv: int = _MAX_OPENCV_THREADS) -> Iterator[None]:
-    """One BLAS thread, and few of OpenCV's, as long as it lasts.
+    """One BLAS thread, and few of OpenCV's, as long as it lasts; next to nothing to do within another.
 
     numpy and scipy bring a BLAS each; on matrices this small their threads only wait for one another.
     """
@@ -29,11 +30,34 @@ def limited_threads(opencv: int = _MAX_OPENCV_THREADS) -> Iterator[None]:
     if before > most:
         cv2.setNumThreads(most)
     try:
-        with _blas_libraries().limit(limits=1):
+        with _one_blas_thread:
             yield
     finally:
         if before > most:
             cv2.setNumThreads(before)
+
+
+class _OneBlasThread:
+    """From the first that enters to the last that leaves, whichever threads they are."""
+
+    def __init__(self) -> None:
+        self._lock, self._within = Lock(), 0
+        self._limit: Any = None
+
+    def __enter__(self) -> None:
+        with self._lock:
+            if self._within == 0:
+                self._limit = _blas_libraries().limit(limits=1)
+            self._within += 1
+
+    def __exit__(self, *_: object) -> None:
+        with self._lock:
+            self._within -= 1
+            if self._within == 0:
+                self._limit.__exit__(None, None, None)
+
+
+_one_blas_thread = _OneBlasThread()
 
 
 @cache

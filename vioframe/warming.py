@@ -17,6 +17,7 @@ from vioframe import jit
 from vioframe.cores import limited_threads, usable_cores
 from vioframe.errors import DivergedError
 from vioframe.estimation import initialization
+from vioframe.estimation.standstill import common_motion_px
 from vioframe.frontend.warming import load_kernels
 from vioframe.interfaces import Backend
 from vioframe.io.calibration import packaged_calibration
@@ -97,7 +98,8 @@ def _fly_along_a_wall(backend: Backend, calibration: Calibration) -> None:
             backend.process(imu, tracks, False)
             if k == 1:
                 resting = imu, tracks
-    # A body that rests is held: many a flight comes to that late, and none may wait then.
+    # A body that rests is seen to, and held: many a flight comes to that late, and none may wait then.
+    common_motion_px(resting[1], resting[1])
     backend.begin(replace(start, state=replace(state, v_WB=np.zeros(3))))
     backend.process(*resting, True)
 

@@ -249,7 +249,7 @@ class FilterState:
         """
         HP = H @ self.cov[columns]
         S = HP[:, columns] @ H.T
-        S[np.diag_indices(len(S))] += R
+        np.einsum("ii->i", S)[:] += R
         self.update_by(HP, S, residual)
 
     def innovation(

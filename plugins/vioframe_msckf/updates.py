@@ -184,7 +184,10 @@ def update_from_landmarks(
     squares = distances(S, residual)
     accepted = squares < gate[2]
     # Cauchy's loss, as for tracks.
-    S[np.diag_indices(len(S))] += np.repeat(variance / options.cauchy_sigmas**2 * squares, 2)
+    np.einsum("ii->i", S)[:] += np.repeat(variance / options.cauchy_sigmas**2 * squares, 2)
+    if accepted.all():
+        state.update_by(HP, S, residual)
+        return len(accepted)
     if accepted.any():
         use = np.repeat(accepted, 2)
         state.update_by(HP[use], S[np.ix_(use, use)], residual[use])

@@ -6,12 +6,14 @@ shakes (motors, a hand nearby) does not, although its IMU reads far more than no
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
 
 from vioframe.geometry import so3
+from vioframe.jit import kernel
 from vioframe.quantiles import gate
 from vioframe.types import DBA, DBG, DTHETA, DV, NS_PER_S, Float, FrameTracks, ImuNoise, ImuSegment, g_W
 
@@ -57,23 +59,26 @@ def common_motion_px(before: FrameTracks, now: FrameTracks) -> float:
     """
     motions = []
     for camera in np.unique(now.camera):
-        old, new = before.only(before.camera == camera), now.only(now.camera == camera)
+        old, new = before.of_camera(camera), now.of_camera(camera)
         _, i, j = np.intersect1d(old.ids, new.ids, assume_unique=True, return_indices=True)
         if len(i) >= _MIN_COMMON_TRACKS:
             motions.append(_picture_motion_px(old.xy[i], new.xy[j]))
     return max(motions, default=float("inf"))
 
 
+@kernel
 def _picture_motion_px(before: Float, now: Float) -> float:
     """Of points (N, 2)."""
     flow = now - before
-    shift = np.median(flow, axis=0)
-    outward = before - before.mean(axis=0)
-    outward /= np.maximum(np.linalg.norm(outward, axis=1), 1e-9)[:, None]
-    rest = flow - shift
-    growth = np.median(np.sum(rest * outward, axis=1))
-    turn = np.median(rest[:, 1] * outward[:, 0] - rest[:, 0] * outward[:, 1])
-    return float(np.linalg.norm([*shift, growth, turn]))
+    shift_x, shift_y = np.median(flow[:, 0]), np.median(flow[:, 1])
+    middle_x, middle_y = before[:, 0].mean(), before[:, 1].mean()
+    growth, turn = np.empty(len(flow)), np.empty(len(flow))
+    for k in range(len(flow)):
+        x, y = before[k, 0] - middle_x, before[k, 1] - middle_y
+        away = max(math.hypot(x, y), 1e-9)
+        rest_x, rest_y = flow[k, 0] - shift_x, flow[k, 1] - shift_y
+        growth[k], turn[k] = (rest_x * x + rest_y * y) / away, (rest_y * x - rest_x * y) / away
+    return math.sqrt(shift_x**2 + shift_y**2 + np.median(growth) ** 2 + np.median(turn) ** 2)
 
 
 @dataclass(frozen=True, slots=True)
