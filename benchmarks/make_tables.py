@@ -367,6 +367,20 @@ def whole_runs() -> str:
     return markdown(shown) + source(rows)
 
 
+def first_frame() -> str:
+    """What a run waits for before its first frame."""
+    rows = recorded("first_frame.json")
+    shown = [
+        {
+            "what": row.what,
+            "n": f"{row.rounds}",
+            "seconds": f"{row.seconds:.2f} ({row.lowest_s:.2f} to {row.highest_s:.2f})",
+        }
+        for row in rows.sort_values("seconds", ascending=False).itertuples()
+    ]
+    return markdown(shown) + source(rows)
+
+
 def consistency() -> str:
     """Monte Carlo: errors, and NEES a degree of freedom with the band of an honest filter and the verdict."""
     rows = recorded("montecarlo*.json")
@@ -610,6 +624,7 @@ FIGURES: dict[str, Callable[[], str]] = {
             frontend,
             tracks,
             whole_runs,
+            first_frame,
             consistency,
             memory,
             live,

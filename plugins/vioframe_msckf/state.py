@@ -249,7 +249,7 @@ class FilterState:
         """
         HP = H @ self.cov[columns]
         S = HP[:, columns] @ H.T
-        np.einsum("ii->i", S)[:] += R
+        np.einsum("ii->i", S)[:] += R  # the diagonal, to write to
         self.update_by(HP, S, residual)
 
     def innovation(

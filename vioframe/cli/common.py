@@ -8,6 +8,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self, TypeVar
 
@@ -17,6 +18,7 @@ from click.shell_completion import CompletionItem
 from vioframe.errors import VioframeError
 
 if TYPE_CHECKING:
+    from rich.progress import Progress, TaskID
     from rich.table import Table
 
 _Command = TypeVar("_Command", bound=Callable[..., Any])
@@ -135,27 +137,25 @@ _COMPILING = "compiling kernels (once after installation)"
 @contextmanager
 def compiling_shown(*, quiet: bool = False) -> Iterator[None]:
     """Say so while kernels are compiled, which is half a minute of silence else; nothing where all are cached."""
-    from rich.console import Console
-    from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
-
     from vioframe.jit import heard
 
-    console = Console(stderr=True)
-    columns = (SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn())
-    progress = Progress(*columns, console=console, transient=True)
-    task = progress.add_task(_COMPILING)
-
-    said = False
+    shown: Progress | None = None
 
     def on_kernel(name: str) -> None:
-        nonlocal said
-        if not said and not console.is_terminal:
-            click.echo(f"vioframe: {_COMPILING} ...", err=True)
-        elif not said:
-            progress.reset(task)
-            progress.start()
-        said = True
-        progress.update(task, description=f"{_COMPILING}: {name}")
+        nonlocal shown
+        if shown is None:
+            from rich.console import Console
+            from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+
+            console = Console(stderr=True)
+            columns = (SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn())
+            shown = Progress(*columns, console=console, transient=True)
+            shown.add_task(_COMPILING)
+            if console.is_terminal:
+                shown.start()
+            else:
+                click.echo(f"vioframe: {_COMPILING} ...", err=True)
+        shown.update(shown.task_ids[0], description=f"{_COMPILING}: {name}")
 
     if quiet:
         yield
@@ -164,8 +164,8 @@ def compiling_shown(*, quiet: bool = False) -> Iterator[None]:
         with heard(on_kernel):
             yield
     finally:
-        if progress.live.is_started:
-            progress.stop()
+        if shown is not None and shown.live.is_started:
+            shown.stop()
 
 
 class Bar:
@@ -179,6 +179,13 @@ class Bar:
     def __init__(
         self, total: float | None, figures: str = "", *, quiet: bool = False, late: bool = False, percent: bool = False
     ) -> None:
+        self._total, self._figures, self._percent = total, figures, percent
+        self._late, self._shown, self._quiet = late, False, quiet
+        self._before, self._within = ExitStack(), ExitStack()
+
+    @cached_property
+    def progress(self) -> Progress:
+        """What is shown, with this as its first task."""
         from rich.console import Console
         from rich.progress import (
             BarColumn,
@@ -189,17 +196,20 @@ class Bar:
             TimeRemainingColumn,
         )
 
-        self.progress = Progress(
+        progress = Progress(
             BarColumn(bar_width=12),
-            TaskProgressColumn() if percent else MofNCompleteColumn(),
+            TaskProgressColumn() if self._percent else MofNCompleteColumn(),
             TextColumn("{task.fields[figures]}"),
             TimeRemainingColumn(compact=True),
             console=Console(stderr=True),
-            disable=quiet,
+            disable=self._quiet,
         )
-        self._id = self.progress.add_task("", total=total, figures=figures)
-        self._figures, self._late, self._shown, self._quiet = figures, late, False, quiet
-        self._before, self._within = ExitStack(), ExitStack()
+        progress.add_task("", total=self._total, figures=self._figures)
+        return progress
+
+    @property
+    def _id(self) -> TaskID:
+        return self.progress.task_ids[0]
 
     def __enter__(self) -> Self:
         if self._late:
