@@ -382,17 +382,24 @@ def test_the_calibration_is_as_learned_by_now():
 
 
 def test_threads_are_few_while_it_runs_and_as_before_afterwards():
+    """Also where one that began within another outlives it, as generators do."""
     import cv2
-    from threadpoolctl import threadpool_info
+    from threadpoolctl import threadpool_info, threadpool_limits
 
-    def blas() -> list[int]:
-        return [library["num_threads"] for library in threadpool_info() if library["user_api"] == "blas"]
+    def blas() -> set[int]:
+        return {library["num_threads"] for library in threadpool_info() if library["user_api"] == "blas"}
 
-    before, opencv = blas(), cv2.getNumThreads()
-    with limited_threads():
-        assert set(blas()) == {1}
-        assert cv2.getNumThreads() <= 4
-    assert (blas(), cv2.getNumThreads()) == (before, opencv)
+    opencv = cv2.getNumThreads()
+    with threadpool_limits(2, user_api="blas"):
+        outer, inner = limited_threads(), limited_threads()
+        for each in (outer, inner):
+            each.__enter__()
+            assert blas() == {1}
+            assert cv2.getNumThreads() <= 4
+        outer.__exit__(None, None, None)
+        assert blas() == {1}
+        inner.__exit__(None, None, None)
+        assert (blas(), cv2.getNumThreads()) == ({2}, opencv)
 
 
 # With a loop closer.
