@@ -25,6 +25,7 @@ from vioframe.cli import main
 from vioframe.cores import limited_threads
 from vioframe.errors import ConfigError, DatasetError, PluginError, RunError
 from vioframe.estimation.lifecycle import LifeCycle
+from vioframe.frontend_process import FRAMES_AHEAD
 from vioframe.geometry import so3
 from vioframe.incidents import Incidents
 from vioframe.io.calibration import load_calibration
@@ -181,21 +182,32 @@ def test_two_processes_give_the_bytes_of_one(backend: str):
 
 
 def test_the_next_frame_is_begun_before_the_last_is_estimated():
+    """Unless that may find another calibration."""
     odometry = Odometry(CALIBRATION, "shi_tomasi", "msckf", pipelined=True, installed=INSTALLED)
-    begun, most = [], 0
-    begin = odometry._frontend.begin
+    begun, ahead = 0, {Status.INITIALISING: [], Status.TRACKING: []}
+    begin, life = odometry._frontend.begin, odometry._life
+    process, keeps, doubtful = life.process, life.keeps_calibration, []
 
     def counted(imu: ImuSegment, frames: FrameSet, calibration: Calibration) -> None:
-        begun.append(frames.t_ns)
+        nonlocal begun
+        begun += 1
+        if begun == 8:
+            doubtful.append(frames.t_ns)
         begin(imu, frames, calibration)
 
-    odometry._frontend.begin = counted
-    for k, step in enumerate(odometry.follow(short_flight())):
-        if step.estimate.status is Status.INITIALISING:
-            assert len(begun) == k + 1
-        most = max(most, len(begun) - k)
-    assert most >= 2
-    assert len(begun) == k + 1
+    def estimated(imu: ImuSegment, tracks: FrameTracks) -> Estimate:
+        nonlocal begun
+        estimate = process(imu, tracks)
+        ahead[estimate.status].append(begun - sum(map(len, ahead.values())) - 1)
+        return estimate
+
+    odometry._frontend.begin, life.process = counted, estimated
+    life.keeps_calibration = lambda t_ns: t_ns not in doubtful and keeps(t_ns)
+    list(odometry.follow(short_flight()))
+    starting, flying = ahead[Status.INITIALISING], ahead[Status.TRACKING]
+    assert max(starting) == max(flying) == FRAMES_AHEAD
+    assert starting[7] == 0
+    assert begun == len(starting) + len(flying)
 
 
 @pytest.mark.parametrize("pipelined", [False, True])

@@ -231,7 +231,7 @@ class Odometry:
     def _follow_ahead(self, packets: Iterator[Packet], frontend: FrontendProcess) -> Iterator[Step]:
         """Each step when the points of the next frames are already being followed.
 
-        Only in flight: at a start the next frame depends on what was found.
+        Not where these depend on what comes of it: a start may find another calibration.
         """
         ahead: deque[Packet] = deque()
         failure: Exception | None = None
@@ -244,12 +244,9 @@ class Odometry:
             except Exception as error:  # of whoever brings the measurements: what came before it still counts
                 failure = error
                 break
-            if not ahead and not self._tracking:
-                yield self._step(*packet)
-                continue
             frontend.begin(*packet, self._using.rig)
             ahead.append(packet)
-            while len(ahead) > (FRAMES_AHEAD if self._tracking else 0):
+            while len(ahead) > (FRAMES_AHEAD if self._tracking or self._life.keeps_calibration(packet[1].t_ns) else 0):
                 yield self._estimate(self._seen(*ahead.popleft(), frontend.end()))
         while ahead:
             yield self._estimate(self._seen(*ahead.popleft(), frontend.end()))

@@ -77,6 +77,13 @@ class LifeCycle:
         """
         return self._initializer.calibration
 
+    def keeps_calibration(self, t_ns: int) -> bool:
+        """Whether, ahead of the first flight, what comes of frames up to ``t_ns`` leaves the calibration as it is.
+
+        A start after a flight does not: what was learned is forgotten.
+        """
+        return not self._following and self._last is None and not self._initializer.may_find(t_ns)
+
     def process(self, imu: ImuSegment, tracks: FrameTracks) -> Estimate:
         """Begin, or follow one frame; where that fails it says so, and begins anew from where it was."""
         tracks = tracks.finite()

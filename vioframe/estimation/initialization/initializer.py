@@ -109,6 +109,12 @@ class Initializer:
         """Why the last attempt of each method came to nothing, in one line; "" before the first and after a success."""
         return "; ".join(f"{method}: {reason}" for method, reason in self._refusals.items())
 
+    def may_find(self, t_ns: int) -> bool:
+        """Whether a frame at ``t_ns`` may change the :attr:`calibration`, or begin with one that was found before."""
+        if self._found is not None or not self._packets:
+            return True
+        return t_ns >= max(self._next_attempt_ns, self._packets[0][1].t_ns + round(_SHORTEST_WINDOW_S * NS_PER_S))
+
     def reset(self) -> None:
         """Forget everything seen, but not what was found of the calibration."""
         self._sensors.reset()
