@@ -279,6 +279,29 @@ def test_what_cannot_be_believed_is_lost_and_begun_anew(say, event):
     np.testing.assert_array_equal(backend.starts[1].state.p_WB, backend.starts[0].state.p_WB)
 
 
+def test_frames_keep_the_calibration_until_the_first_flight_where_no_start_can_find_another():
+    """After a flight what was learned is forgotten with the next start, whenever that is."""
+    fails = []
+
+    def say(estimate: Estimate) -> Estimate:
+        return replace(estimate, status=Status.LOST, state=None) if fails else estimate
+
+    packets = flight().packets
+    life = LifeCycle(Scripted(say), CALIBRATION)
+    for imu, tracks in packets[:10]:
+        assert life.process(imu, tracks).status is Status.INITIALISING
+    assert life.keeps_calibration(packets[10][1].t_ns)
+    assert not life.keeps_calibration(packets[-1][1].t_ns)  # long enough for a start in motion
+    life = begun(Scripted(say))
+    assert not life.keeps_calibration(packets[1][1].t_ns)
+    life.process(*packets[1])
+    fails.append(True)
+    assert life.process(*packets[2]).status is Status.LOST
+    for imu, tracks in packets[3:13]:
+        life.process(imu, tracks)
+    assert not life.keeps_calibration(packets[13][1].t_ns)
+
+
 def test_a_backend_that_says_so_is_lost():
     life = begun(Scripted(lambda estimate: Estimate(Status.LOST, events=("lost: by its own account",))))
     assert life.process(*flight().packets[1]).events == ("lost: by its own account",)
