@@ -355,7 +355,7 @@ def whole_runs() -> str:
             "run": row.run,
             "cores": f"{row.cores}",
             "n": f"{row.rounds}",
-            "ms a frame": f"{row.frame_ms:.1f} ({row.lowest_ms:.1f} to {row.highest_ms:.1f})",
+            "ms a frame": _within(row.frame_ms, row.lowest_ms, row.highest_ms, ".1f"),
             "of the yardstick": _number(row.by_yardstick, ".2f"),
             "frames/s": _number(row.frames_s, ".0f"),
             "times real time": _number(row.real_time, ".1f"),
@@ -374,7 +374,7 @@ def first_frame() -> str:
         {
             "what": row.what,
             "n": f"{row.rounds}",
-            "seconds": f"{row.seconds:.2f} ({row.lowest_s:.2f} to {row.highest_s:.2f})",
+            "seconds": _within(row.seconds, row.lowest_s, row.highest_s, ".2f"),
         }
         for row in rows.sort_values("seconds", ascending=False).itertuples()
     ]
@@ -448,7 +448,7 @@ def push() -> str:
         {
             "way": row.way,
             "n, runs": f"{row.rounds}",
-            "ms a frame, median": f"{row.frame_ms:.1f} ({row.lowest_ms:.1f} to {row.highest_ms:.1f})",
+            "ms a frame, median": _within(row.frame_ms, row.lowest_ms, row.highest_ms, ".1f"),
             "times the command line": f"{row.ratio:.2f}",
             "the same bytes": row.same_bytes,
         }
@@ -713,6 +713,11 @@ def _spread(ate_m: Iterable[float]) -> str:
     values = pd.Series(list(ate_m), dtype=float)
     of_many = f" (n = {len(values)})" if len(values) > 1 else ""
     return f"{length(values.mean(), values.std())}{of_many}"
+
+
+def _within(median: float, lowest: float, highest: float, spec: str) -> str:
+    """A median, with the lowest and the highest beside it."""
+    return f"{median:{spec}} ({lowest:{spec}} to {highest:{spec}})"
 
 
 def _parts(rows: pd.DataFrame, what: str, spec: str, *, axes: int = 1) -> str:

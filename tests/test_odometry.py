@@ -196,7 +196,6 @@ def test_the_next_frame_is_begun_before_the_last_is_estimated():
         begin(imu, frames, calibration)
 
     def estimated(imu: ImuSegment, tracks: FrameTracks) -> Estimate:
-        nonlocal begun
         estimate = process(imu, tracks)
         ahead[estimate.status].append(begun - sum(map(len, ahead.values())) - 1)
         return estimate
