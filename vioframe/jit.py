@@ -54,10 +54,12 @@ def _compiled(function: FunctionT, reorder_sums: bool, inlined: bool) -> Functio
     settings: Any = numba.config
     before = settings.CACHE_DIR
     settings.CACHE_DIR = str(_folder(before) / _fingerprint(source.parent if in_package else source))
-    compiled = numba.njit(
+    njit: Any = numba.njit
+    compiled = njit(
         cache=True,
         error_model="numpy",
         nogil=True,
+        no_cfunc_wrapper=True,  # nothing calls it from C
         fastmath={"reassoc", "nsz"} if reorder_sums else False,
         inline="always" if inlined else "never",
     )

@@ -216,7 +216,7 @@ def _peaks(response: Array, reach: int) -> Int:
     return found[:count]
 
 
-@kernel
+@kernel(inlined=True)
 def _is_peak(response: Array, row: int, column: int, reach: int) -> bool:
     here = response[row, column]
     for r in range(max(row - reach, 0), min(row + reach + 1, response.shape[0])):
@@ -243,7 +243,7 @@ def _first_varied(image: Image, at: Int | Array, height: int, width: int, min_co
     return kept[:count]
 
 
-@kernel
+@kernel(inlined=True)
 def _varies(image: Image, x: int, y: int, height: int, width: int, min_contrast: int) -> bool:
     low = high = int(image[y, x])
     if min_contrast <= 0:

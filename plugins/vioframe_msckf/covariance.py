@@ -78,6 +78,13 @@ def only(P: Float, keep: Int) -> Float:
     return out
 
 
+@kernel(inlined=True)
+def add(out: Float, factor: float, row: Float) -> None:
+    """Add ``factor`` times ``row`` to ``out``."""
+    for j in range(len(out)):
+        out[j] += factor * row[j]
+
+
 @kernel
 def landmark_innovation(
     P: Float, blocks: Float, cameras: Int, of_camera: int, clone: int, landmarks: Int, variance: float
@@ -92,11 +99,11 @@ def landmark_innovation(
     for r in range(rows):
         b, camera, own, out = blocks[r // 2, r % 2], cameras[r // 2], landmarks[r // 2], HP[r]
         for k in range(of_camera):
-            _add(out, b[k], P[camera + k])
+            add(out, b[k], P[camera + k])
         for k in range(6):
-            _add(out, b[16 + k], P[clone + k])
+            add(out, b[16 + k], P[clone + k])
         for k in range(3):
-            _add(out, b[22 + k], P[own + k])
+            add(out, b[22 + k], P[own + k])
     S = np.empty((rows, rows))
     for c in range(rows):
         b, camera, own = blocks[c // 2, c % 2], cameras[c // 2], landmarks[c // 2]
@@ -111,12 +118,6 @@ def landmark_innovation(
             S[r, c] = S[c, r] = total
         S[c, c] += variance
     return HP, S
-
-
-@kernel
-def _add(out: Float, factor: float, row: Float) -> None:
-    for j in range(len(out)):
-        out[j] += factor * row[j]
 
 
 @kernel

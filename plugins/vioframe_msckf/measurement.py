@@ -14,10 +14,22 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vioframe.geometry.kernels import distort, exp, intrinsics_jacobian, product, turned, undistort
+from vioframe.geometry.kernels import (
+    distort,
+    exp,
+    intrinsics_jacobian,
+    inverse_cholesky,
+    product,
+    set_matrix,
+    set_vector,
+    turned,
+    undistort,
+    whiten,
+)
 from vioframe.geometry.triangulation import triangulate
 from vioframe.jit import kernel
 from vioframe.types import Float, Int
+from vioframe_msckf.covariance import add
 from vioframe_msckf.state import FilterState
 
 ACCEPTED, NOT_TRIANGULATED, GATED = 0, 1, 2
@@ -134,7 +146,7 @@ def _observe(w, k, c, R_lateC, p_lateC, p_WF, p_WF_first, xy, block, residual):
     p_late = turned_C[0] + p_BC[0], turned_C[1] + p_BC[1], turned_C[2] + p_BC[2]
     moved_late = _cross(w.rate_B[k], p_late)
     row = _row(w, c, xy[1])
-    block[:, 7:15] = intrinsics_jacobian(model, intrinsics, x, y)
+    set_matrix(block[:, 7:15], intrinsics_jacobian(model, intrinsics, x, y))
     for i in range(2):
         J = D[i, 0] / p_C[2], D[i, 1] / p_C[2], -(D[i, 0] * x + D[i, 1] * y) / p_C[2]
         J_late, J_B = _by(R_BC, J), _by(R_lateC, J)
@@ -160,7 +172,7 @@ def observations(w, clone, cameras, p_WF, p_WF_first, xy):
     return blocks, residual
 
 
-@kernel
+@kernel(inlined=True)
 def track_rows(w, xy, xy_normalised, seen, pixel_sigma):
     """One track (C,): whether it was triangulated, p_WF, H over [cameras, clones] and the landmark, residual."""
     K, N = len(w.p_WB), len(w.p_BC)
@@ -172,9 +184,11 @@ def track_rows(w, xy, xy_normalised, seen, pixel_sigma):
     for i in range(m):
         v = views[i]
         k, c = v // N, v % N
-        R_lateC[i], p_lateC[i] = _camera_at(w, k, c, xy[v, 1])
-        R_WC[i] = product(w.R_WB[k], R_lateC[i])
-        p_WC[i] = turned(w.R_WB[k], p_lateC[i]) + w.p_WB[k]
+        R, p = _camera_at(w, k, c, xy[v, 1])
+        set_matrix(R_lateC[i], R)
+        set_vector(p_lateC[i], p)
+        set_matrix(R_WC[i], product(w.R_WB[k], R))
+        set_vector(p_WC[i], turned(w.R_WB[k], p) + w.p_WB[k])
         points[i, 0], points[i, 1] = undistort(
             w.camera_models[c], w.intrinsics[c], xy[v, 0], xy[v, 1], xy_normalised[v, 0], xy_normalised[v, 1]
         )
@@ -189,20 +203,20 @@ def track_rows(w, xy, xy_normalised, seen, pixel_sigma):
             v = views[i]
             k, c = v // N, v % N
             _observe(w, k, c, R_lateC[i], p_lateC[i], p_WF, p_WF, xy[v], block, residual[2 * i : 2 * i + 2])
-            H[2 * i : 2 * i + 2, n * c : n * c + n] = block[:, 0:n]
-            H[2 * i : 2 * i + 2, n * N + 6 * k : n * N + 6 * k + 6] = block[:, 16:22]
-            H_f[2 * i : 2 * i + 2] = block[:, 22:25]
+            set_matrix(H[2 * i : 2 * i + 2, n * c : n * c + n], block[:, 0:n])
+            set_matrix(H[2 * i : 2 * i + 2, n * N + 6 * k : n * N + 6 * k + 6], block[:, 16:22])
+            set_matrix(H_f[2 * i : 2 * i + 2], block[:, 22:25])
     return ok, p_WF, H, H_f, residual
 
 
-@kernel
+@kernel(inlined=True)
 def reduce_landmark(H, H_f, residual):
     """Rotate the rows by the orthogonal Q with Q H_f = [T; 0], T (3, 3) upper triangular, in place.
 
     Householder reflections. The rows below the third are free of the landmark: Mourikis and Roumeliotis, eq. (22)-(24).
     """
     m, n = H.shape
-    v = np.empty(m)
+    v, dots = np.empty(m), np.empty(n)
     for j in range(3):
         norm = 0.0
         for i in range(j, m):
@@ -222,11 +236,11 @@ def reduce_landmark(H, H_f, residual):
                 dot += v[i] * H_f[i, c]
             for i in range(j, m):
                 H_f[i, c] -= scale * dot * v[i]
-        dots = v[j:m] @ H[j:m]
+        dots[:] = 0.0
         for i in range(j, m):
-            weight = scale * v[i]
-            for c in range(n):
-                H[i, c] -= weight * dots[c]
+            add(dots, v[i], H[i])
+        for i in range(j, m):
+            add(H[i], -scale * v[i], dots)
         dot = 0.0
         for i in range(j, m):
             dot += v[i] * residual[i]
@@ -234,7 +248,7 @@ def reduce_landmark(H, H_f, residual):
             residual[i] -= scale * dot * v[i]
 
 
-@kernel
+@kernel(inlined=True)
 def distance_and_variances(S, H_f, residual, variance, cauchy):
     """Of M sightings of one landmark their squared Mahalanobis distance, and (M,) variances to take them with, px^2.
 
@@ -246,22 +260,47 @@ def distance_and_variances(S, H_f, residual, variance, cauchy):
     S = S.copy()
     for i in range(m):
         S[i, i] += variance
-    rows = np.column_stack((H_f, residual))
-    information = rows.T @ np.linalg.solve(S, rows)
-    along = information[3, :3]
-    distance = information[3, 3] - along @ np.linalg.solve(information[:3, :3], along)
-    # The landmark taken out by least squares.
-    rest = np.eye(m) - H_f @ np.linalg.solve(H_f.T @ H_f, np.ascontiguousarray(H_f.T))
-    left, expected = rest @ residual, ((rest @ S) * rest).sum(axis=1)
+    # The landmark taken out by least squares, whose plane in the space of rows has the orthonormal basis U'.
+    of_rows = np.zeros((3, 3))
+    for row in range(m):
+        for a in range(3):
+            add(of_rows[a], H_f[row, a], H_f[row])
+    U = product(inverse_cholesky(of_rows), H_f.T)
+    U_r, U_S, U_S_U = np.zeros(3), np.zeros((3, m)), np.zeros((3, 3))
+    for a in range(3):
+        for row in range(m):
+            U_r[a] += U[a, row] * residual[row]
+            add(U_S[a], U[a, row], S[row])
+        for row in range(m):
+            add(U_S_U[a], U_S[a, row], U[:, row])
     variances = np.empty(m // 2)
     for i in range(m // 2):
-        x, y = left[2 * i], left[2 * i + 1]
-        squared = 2.0 * (x * x + y * y) / (expected[2 * i] + expected[2 * i + 1])
-        variances[i] = variance * (1.0 + squared / (cauchy * cauchy))
-    return distance, variances
+        squared = expected = 0.0
+        for row in range(2 * i, 2 * i + 2):
+            left = residual[row]
+            expected += S[row, row]
+            for a in range(3):
+                left -= U[a, row] * U_r[a]
+                expected -= 2.0 * U[a, row] * U_S[a, row]
+                for b in range(3):
+                    expected += U[a, row] * U_S_U[a, b] * U[b, row]
+            squared += left * left
+        variances[i] = variance * (1.0 + 2.0 * squared / expected / (cauchy * cauchy))
+    # By S what the landmark explains is the projection onto three whitened columns.
+    white = np.empty((m, 4))
+    set_matrix(white[:, :3], H_f)
+    set_vector(white[:, 3], residual)
+    whiten(S, white)
+    information = np.zeros((4, 4))
+    for row in range(m):
+        for a in range(4):
+            add(information[a], white[row, a], white[row])
+    along = information[:3, 3:].copy()
+    whiten(information[:3, :3], along)
+    return information[3, 3] - along[0, 0] ** 2 - along[1, 0] ** 2 - along[2, 0] ** 2, variances
 
 
-@kernel
+@kernel(inlined=True)
 def reduced_track(w, xy, xy_normalised, seen, P, pixel_sigma, cauchy):
     """One track (C,): whether it was triangulated, p_WF, H, H_f, residual, and its squared Mahalanobis distance.
 
@@ -275,8 +314,10 @@ def reduced_track(w, xy, xy_normalised, seen, P, pixel_sigma, cauchy):
         for i in range(len(variances)):
             scale = pixel_sigma / np.sqrt(variances[i])
             for row in range(2 * i, 2 * i + 2):
-                H[row] *= scale
-                H_f[row] *= scale
+                for c in range(H.shape[1]):
+                    H[row, c] *= scale
+                for c in range(3):
+                    H_f[row, c] *= scale
                 residual[row] *= scale
         reduce_landmark(H, H_f, residual)
     return ok, p_WF, H, H_f, residual, distance
@@ -315,19 +356,20 @@ def msckf_rows(w, xy, xy_normalised, seen, P, pixel_sigma, cauchy, gate):
     verdict = np.empty(F, dtype=np.int64)
     rows = 0
     for f in range(F):
-        ok, p_WF[f], H, H_f, residual, squares[f] = reduced_track(
-            w, xy[f], xy_normalised[f], seen[f], P, pixel_sigma, cauchy
-        )
+        ok, p, H, H_f, residual, squares[f] = reduced_track(w, xy[f], xy_normalised[f], seen[f], P, pixel_sigma, cauchy)
+        set_vector(p_WF[f], p)
         if not ok:
             verdict[f] = NOT_TRIANGULATED
             continue
         free = len(residual) - 3
-        if squares[f] > gate[free]:
+        if not squares[f] <= gate[free]:
             verdict[f] = GATED
             continue
         verdict[f] = ACCEPTED
-        H_of[f], T[f], residual_of[f] = H[:3], H_f[:3], residual[:3]
-        H_all[rows : rows + free] = H[3:]
-        r_all[rows : rows + free] = residual[3:]
+        set_matrix(H_of[f], H[:3])
+        set_matrix(T[f], H_f[:3])
+        set_vector(residual_of[f], residual[:3])
+        set_matrix(H_all[rows : rows + free], H[3:])
+        set_vector(r_all[rows : rows + free], residual[3:])
         rows += free
     return TrackRows(H_all[:rows], r_all[:rows], H_of, T, residual_of, p_WF, squares, verdict)

@@ -22,7 +22,7 @@ from vioframe.arrays import Float, Int
 from vioframe.estimation.inertial.gyro_path import GyroPath
 from vioframe.estimation.turns import Turn
 from vioframe.geometry import kernels, so3
-from vioframe.geometry.kernels import product
+from vioframe.geometry.kernels import product, set_matrix, set_vector
 from vioframe.jit import kernel
 from vioframe.types import NS_PER_S
 
@@ -224,14 +224,20 @@ def _linearise(
         turned = product(product(R_CB, R_B2B1.T), R_BC)
         least = np.inf
         for k in range(len(R_C1C2)):
-            off = whitener[k, p] @ (kernels.log(product(R_C1C2[k, p].T, turned)) - by_focal[k, p] * log_focal)
-            if off @ off < least:
-                least, which[p], r[p] = off @ off, k, off
-        D[:, 0:3] = -0.5 * dt[p] * (R_CB + product(R_CB, R_B2B1))
-        D[:, 3:6] = np.eye(3) - turned.T
-        D[:, 6] = R_CB @ (rate_2[p] - kernels.turned(R_B2B1, rate_1[p]))
-        D[:, 7] = -by_focal[which[p], p]
-        J[p] = whitener[which[p], p] @ D
+            beside = kernels.log(product(R_C1C2[k, p].T, turned)) - by_focal[k, p] * log_focal
+            off = kernels.turned(whitener[k, p], beside)
+            square = off[0] * off[0] + off[1] * off[1] + off[2] * off[2]
+            if square < least:
+                least, which[p] = square, k
+                set_vector(r[p], off)
+        R_CB1 = product(R_CB, R_B2B1)
+        by_shift = kernels.turned(R_CB, rate_2[p] - kernels.turned(R_B2B1, rate_1[p]))
+        for m in range(3):
+            for n in range(3):
+                D[m, n] = -0.5 * dt[p] * (R_CB[m, n] + R_CB1[m, n])
+                D[m, 3 + n] = (1.0 if m == n else 0.0) - turned[n, m]
+            D[m, 6], D[m, 7] = by_shift[m], -by_focal[which[p], p, m]
+        set_matrix(J[p], product(whitener[which[p], p], D))
     return r, J, which
 
 

@@ -105,12 +105,12 @@ def _turn(f: Float, g: Float, R: Float, sigma: float, stages: Float) -> tuple[Fl
             A = H[:3, :3].copy()
             for a in range(3):
                 A[a, a] += 1.0 / (_PRIOR * _PRIOR)
-            L = _inverse_cholesky(A)
-            step = -(L.T @ (L @ b[:3]))
-            length = math.sqrt(step @ step)
+            L = kernels.inverse_cholesky(A)
+            step = -kernels.turned(L.T, kernels.turned(L, b[:3]))
+            length = _length(step)
             if length > _LARGEST_STEP:
                 step *= _LARGEST_STEP / length
-            R = R @ kernels.exp(step)
+            R = kernels.product(R, kernels.exp(step))
             if length < _SETTLED:
                 break
     linearise_pair(f, g, common, R, weight, sigma, stages[-1, 1], H, b, distance)
@@ -159,15 +159,15 @@ def linearise_pair(
     t = _translation(f, y, R, weight, common)
 
     # Two directions across t.
-    u, v = np.zeros(3), np.zeros(3)
+    u = np.zeros(3)
     a = 0
     for k in range(1, 3):
         if abs(t[k]) < abs(t[a]):
             a = k
     u[a] = 1.0
     u -= t[a] * t
-    u /= math.sqrt(u @ u)
-    v[:] = kernels.cross(t, u)
+    u /= _length(u)
+    v = kernels.cross(t, u)
 
     E = np.zeros((6, 6))
     e = np.zeros(6)
@@ -232,7 +232,7 @@ def likeliest_translations(f: Float, y: Float, R_C1C2: Float, weight: Float, com
     t = np.zeros((len(f), 3))
     for p in range(len(f)):
         if (common[p] & (weight[p] > 0.0)).any():
-            t[p] = _translation(f[p], y[p], R_C1C2[p], weight[p], common[p])
+            kernels.set_vector(t[p], _translation(f[p], y[p], R_C1C2[p], weight[p], common[p]))
         else:
             t[p, 2] = 1.0
     return t
@@ -261,7 +261,7 @@ def _translation(f: Float, y: Float, R: Float, weight: Float, common: Bool) -> F
     return _likeliest(N, S_y, S_f, R)
 
 
-@kernel
+@kernel(inlined=True)
 def _likeliest(N: Float, S_y: Float, S_f: Float, R: Float) -> Float:
     """The unit t that minimises t' N t over t' noise t (Kanatani 2005), N the moments of the normals n = f x y.
 
@@ -274,32 +274,26 @@ def _likeliest(N: Float, S_y: Float, S_f: Float, R: Float) -> Float:
         S = S_f if second else S_y
         z = R[:, 2].copy() if second else np.array([0.0, 0.0, 1.0])
         Z = kernels.hat(z)
-        noise += (S[0, 0] + S[1, 1] + S[2, 2]) * np.eye(3) - S - Z @ S @ Z.T
+        Z_S_Z = kernels.product(kernels.product(Z, S), Z.T)
+        for i in range(3):
+            noise[i, i] += S[0, 0] + S[1, 1] + S[2, 2]
+            for j in range(3):
+                noise[i, j] -= S[i, j] + Z_S_Z[i, j]
     trace = noise[0, 0] + noise[1, 1] + noise[2, 2]
     for k in range(3):
         noise[k, k] += 1e-6 * trace
-    W = _inverse_cholesky(noise)
-    t = W.T @ _least_eigenvector(W @ N @ W.T)
-    out: Float = t / math.sqrt(t @ t)
+    W = kernels.inverse_cholesky(noise)
+    t = kernels.turned(W.T, _least_eigenvector(kernels.product(kernels.product(W, N), W.T)))
+    out: Float = t / _length(t)
     return out
 
 
-@kernel
-def _inverse_cholesky(A: Float) -> Float:
-    """The inverse of the lower Cholesky factor of a positive definite A (3, 3)."""
-    l00 = math.sqrt(A[0, 0])
-    l10, l20 = A[1, 0] / l00, A[2, 0] / l00
-    l11 = math.sqrt(A[1, 1] - l10 * l10)
-    l21 = (A[2, 1] - l20 * l10) / l11
-    l22 = math.sqrt(A[2, 2] - l20 * l20 - l21 * l21)
-    out = np.zeros((3, 3))
-    out[0, 0], out[1, 1], out[2, 2] = 1.0 / l00, 1.0 / l11, 1.0 / l22
-    out[1, 0], out[2, 1] = -l10 * out[0, 0] * out[1, 1], -l21 * out[1, 1] * out[2, 2]
-    out[2, 0] = -(l20 * out[0, 0] + l21 * out[1, 0]) * out[2, 2]
-    return out
+@kernel(inlined=True)
+def _length(v: Float) -> float:
+    return math.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
 
 
-@kernel
+@kernel(inlined=True)
 def _least_eigenvector(A: Float) -> Float:
     """(3,) of the least eigenvalue of a symmetric A (3, 3), by Jacobi's rotations (Golub, Van Loan, 8.5)."""
     A, V = A.copy(), np.eye(3)

@@ -1,4 +1,4 @@
-"""Compiled scalar twins of :mod:`so3`, which tests hold equal to it, and the lenses of :mod:`cameras`.
+"""Compiled scalar twins of :mod:`so3`, which tests hold equal to it, small matrices, and the lenses of :mod:`cameras`.
 
 Importing this module loads numba.
 """
@@ -12,6 +12,25 @@ from vioframe.jit import kernel
 
 RADTAN, EQUIDISTANT = 0, 1
 """Numbers of the models, as :func:`cameras.intrinsics_of` gives them."""
+
+
+# Kernels set parts of arrays by the next two: for ``out[:] = v`` numba compiles what writes a message about shapes that
+# differ into each, which takes longer than all the rest.
+
+
+@kernel(inlined=True)
+def set_vector(out: Float, v: Float) -> None:
+    """Fill ``out`` (n,) with ``v`` (n,)."""
+    for i in range(len(out)):
+        out[i] = v[i]
+
+
+@kernel(inlined=True)
+def set_matrix(out: Float, M: Float) -> None:
+    """Fill ``out`` (m, n) with ``M`` (m, n)."""
+    for i in range(out.shape[0]):
+        for j in range(out.shape[1]):
+            out[i, j] = M[i, j]
 
 
 @kernel
@@ -51,6 +70,43 @@ def turned(R: Float, v: Float) -> Float:
 
 
 @kernel
+def inverse_cholesky(A: Float) -> Float:
+    """The inverse of the lower Cholesky factor of ``A`` (3, 3); where it is not positive definite, NaN or infinite."""
+    l00 = math.sqrt(A[0, 0])
+    l10, l20 = A[1, 0] / l00, A[2, 0] / l00
+    l11 = math.sqrt(A[1, 1] - l10 * l10)
+    l21 = (A[2, 1] - l20 * l10) / l11
+    l22 = math.sqrt(A[2, 2] - l20 * l20 - l21 * l21)
+    out = np.zeros((3, 3))
+    out[0, 0], out[1, 1], out[2, 2] = 1.0 / l00, 1.0 / l11, 1.0 / l22
+    out[1, 0], out[2, 1] = -l10 * out[0, 0] * out[1, 1], -l21 * out[1, 1] * out[2, 2]
+    out[2, 0] = -(l20 * out[0, 0] + l21 * out[1, 0]) * out[2, 2]
+    return out
+
+
+@kernel
+def whiten(A: Float, B: Float) -> None:
+    """``B`` (n, m) becomes L^-1 B, with L the lower Cholesky factor of ``A`` (n, n), which is used up.
+
+    Where ``A`` is not positive definite, NaN.
+    """
+    n, m = B.shape
+    for j in range(n):
+        above, of_above = A[j], B[j]
+        scale = 1.0 / math.sqrt(above[j])
+        for k in range(j, n):
+            above[k] *= scale
+        for k in range(m):
+            of_above[k] *= scale
+        for i in range(j + 1, n):
+            factor, row, of_row = above[i], A[i], B[i]
+            for k in range(i, n):
+                row[k] -= factor * above[k]
+            for k in range(m):
+                of_row[k] -= factor * of_above[k]
+
+
+@kernel
 def exp(phi: Float) -> Float:
     """(3,) rad -> (3, 3) rotation."""
     a2 = phi[0] * phi[0] + phi[1] * phi[1] + phi[2] * phi[2]
@@ -72,7 +128,7 @@ def turned_by(R: Float, phi: Float) -> Float:
     """R_k Exp(phi_k) of (N, 3, 3) and (N, 3) rad."""
     out = np.empty((len(R), 3, 3))
     for k in range(len(R)):
-        out[k] = product(R[k], exp(phi[k]))
+        set_matrix(out[k], product(R[k], exp(phi[k])))
     return out
 
 

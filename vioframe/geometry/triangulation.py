@@ -5,7 +5,7 @@ import math
 import numpy as np
 
 from vioframe.arrays import Float
-from vioframe.geometry.kernels import product, turned
+from vioframe.geometry.kernels import inverse_cholesky, product, set_matrix, set_vector, turned
 from vioframe.jit import kernel
 
 MIN_DEPTH_M, MAX_DEPTH_M = 0.1, 60.0
@@ -22,12 +22,13 @@ def triangulate(R_WC: Float, p_WC: Float, xy: Float, sigma: float) -> tuple[bool
     """
     m = len(xy)
     A = np.zeros((3, 3))
-    b = np.zeros(3)
-    rays = np.empty((m, 3))
+    b, ray = np.zeros(3), np.empty(3)
     for i in range(m):
-        ray = xy[i, 0] * R_WC[i, :, 0] + xy[i, 1] * R_WC[i, :, 1] + R_WC[i, :, 2]
-        ray /= math.sqrt(ray[0] * ray[0] + ray[1] * ray[1] + ray[2] * ray[2])
-        rays[i] = ray
+        for r in range(3):
+            ray[r] = xy[i, 0] * R_WC[i, r, 0] + xy[i, 1] * R_WC[i, r, 1] + R_WC[i, r, 2]
+        length = math.sqrt(ray[0] * ray[0] + ray[1] * ray[1] + ray[2] * ray[2])
+        for r in range(3):
+            ray[r] /= length
         along = ray[0] * p_WC[i, 0] + ray[1] * p_WC[i, 1] + ray[2] * p_WC[i, 2]
         for r in range(3):
             b[r] += p_WC[i, r] - ray[r] * along
@@ -35,10 +36,12 @@ def triangulate(R_WC: Float, p_WC: Float, xy: Float, sigma: float) -> tuple[bool
                 A[r, c] -= ray[r] * ray[c]
             A[r, r] += 1.0
     p: Float = np.zeros(3)
-    eigenvalues = np.linalg.eigvalsh(A)
-    if eigenvalues[0] <= 1e-12 * eigenvalues[2]:
+    # Of nearly parallel rays A has two equal eigenvalues and a small one, which its determinant tells.
+    W = inverse_cholesky(A)
+    larger = 0.5 * (A[0, 0] + A[1, 1] + A[2, 2])
+    if not (W[0, 0] * W[1, 1] * W[2, 2]) ** 2 * larger**3 < 1e12:
         return False, p
-    p = np.asarray(np.linalg.solve(A, b), np.float64)
+    p = turned(W.T, turned(W, b))
 
     first = turned(R_WC[0].T, p - p_WC[0])
     if first[2] < MIN_DEPTH_M or first[2] > MAX_DEPTH_M:
@@ -49,8 +52,8 @@ def triangulate(R_WC: Float, p_WC: Float, xy: Float, sigma: float) -> tuple[bool
     R = np.empty((m, 3, 3))
     t = np.empty((m, 3))
     for i in range(m):
-        R[i] = product(R_WC[i].T, R_WC[0])
-        t[i] = turned(R_WC[i].T, p_WC[0] - p_WC[i])
+        set_matrix(R[i], product(R_WC[i].T, R_WC[0]))
+        set_vector(t[i], turned(R_WC[i].T, p_WC[0] - p_WC[i]))
     damping = 1e-3
     cost, N, g = _normal_equations(R, t, xy, theta)
     if cost == np.inf:  # behind one of the cameras: nothing to start from
@@ -59,8 +62,8 @@ def triangulate(R_WC: Float, p_WC: Float, xy: Float, sigma: float) -> tuple[bool
         damped = N.copy()
         for k in range(3):
             damped[k, k] *= 1.0 + damping
-        step = np.linalg.solve(damped, g)
-        trial = theta - step
+        W = inverse_cholesky(damped)
+        trial = theta - turned(W.T, turned(W, g))
         trial_cost, trial_N, trial_g = _normal_equations(R, t, xy, trial)
         if trial_cost < cost:
             converged = cost - trial_cost < 1e-6 * cost
@@ -77,7 +80,8 @@ def triangulate(R_WC: Float, p_WC: Float, xy: Float, sigma: float) -> tuple[bool
     for i in range(1, m):
         if R[i, 2, 0] * first[0] + R[i, 2, 1] * first[1] + R[i, 2, 2] * first[2] + t[i, 2] < MIN_DEPTH_M:
             return False, p
-    if theta[2] < sigma * math.sqrt(np.linalg.inv(N)[2, 2]):
+    # The last of the inverse's diagonal is the square of that of its factor.
+    if not theta[2] >= sigma * inverse_cholesky(N)[2, 2]:
         return False, p
     return True, turned(R_WC[0], first) + p_WC[0]
 
@@ -88,10 +92,11 @@ def _normal_equations(R: Float, t: Float, xy: Float, theta: Float) -> tuple[floa
     N = np.zeros((3, 3))
     g = np.zeros(3)
     cost = 0.0
-    J = np.empty((2, 3))
+    J, q = np.empty((2, 3)), np.empty(3)
     for i in range(len(xy)):
         # rho * p_Ci, so that the projection needs no division by the inverse depth.
-        q = theta[0] * R[i, :, 0] + theta[1] * R[i, :, 1] + R[i, :, 2] + theta[2] * t[i]
+        for k in range(3):
+            q[k] = theta[0] * R[i, k, 0] + theta[1] * R[i, k, 1] + R[i, k, 2] + theta[2] * t[i, k]
         if q[2] < 1e-6:
             return np.inf, N, g
         x, y = q[0] / q[2], q[1] / q[2]

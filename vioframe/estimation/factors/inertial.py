@@ -147,8 +147,9 @@ def difference(states: States, others: States) -> Float:
     count = len(states[0])
     out = np.empty((count, 15))
     for k in range(count):
-        out[k, 0:3] = log(product(others[0][k].T, states[0][k]))
+        turn = log(product(others[0][k].T, states[0][k]))
         for m in range(3):
+            out[k, m] = turn[m]
             out[k, 3 + m] = states[1][k, m] - others[1][k, m]
             out[k, 6 + m] = states[2][k, m] - others[2][k, m]
             out[k, 9 + m] = states[3][k, m] - others[3][k, m]
@@ -159,13 +160,14 @@ def difference(states: States, others: States) -> Float:
 @kernel
 def retract(states: States, step: Float) -> States:
     """``states`` moved by ``step`` (K, 15)."""
-    return (
-        turned_by(states[0], step[:, 0:3]),
-        states[1] + step[:, 3:6],
-        states[2] + step[:, 6:9],
-        states[3] + step[:, 9:12],
-        states[4] + step[:, 12:15],
-    )
+    p_WB, v_WB, bias_gyro_B, bias_accel_B = states[1].copy(), states[2].copy(), states[3].copy(), states[4].copy()
+    for k in range(len(step)):
+        for m in range(3):
+            p_WB[k, m] += step[k, 3 + m]
+            v_WB[k, m] += step[k, 6 + m]
+            bias_gyro_B[k, m] += step[k, 9 + m]
+            bias_accel_B[k, m] += step[k, 12 + m]
+    return turned_by(states[0], step[:, 0:3]), p_WB, v_WB, bias_gyro_B, bias_accel_B
 
 
 @kernel

@@ -9,6 +9,7 @@ import numpy as np
 from vioframe.arrays import Bool, Float, Int
 from vioframe.estimation.factors.inertial import StateArrays
 from vioframe.estimation.factors.reprojection import GLOBAL_SHUTTER, Calibrated, Shutter, camera_at_row
+from vioframe.geometry.kernels import product, set_matrix, set_vector, turned
 from vioframe.geometry.triangulation import MIN_DEPTH_M, triangulate
 from vioframe.jit import kernel
 
@@ -134,11 +135,12 @@ def _triangulate_all(
             for j in range(len(views)):
                 f = views[j] // len(cameras.p_BC)
                 camera_at_row(cameras, shutter, i, views[j], R_rowC, p_rowC)
-                R_views[j], p_views[j] = R_WB[f] @ R_rowC, R_WB[f] @ p_rowC + p_WB[f]
+                set_matrix(R_views[j], product(R_WB[f], R_rowC))
+                set_vector(p_views[j], turned(R_WB[f], p_rowC) + p_WB[f])
         ok, p_WF = triangulate(R_views, p_views, xy[i][views], sigma)
         if ok:
             host = views[0]
-            p_C = R_WC[host].T @ (p_WF - p_WC[host])
+            p_C = turned(R_WC[host].T, p_WF - p_WC[host])
             known[i] = True
             landmarks[i, 0], landmarks[i, 1], landmarks[i, 2] = p_C[0] / p_C[2], p_C[1] / p_C[2], 1.0 / p_C[2]
     return known, landmarks

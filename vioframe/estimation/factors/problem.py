@@ -30,7 +30,7 @@ from vioframe.estimation.factors.reprojection import (
     relative_poses,
 )
 from vioframe.estimation.standstill import Standstill
-from vioframe.geometry.kernels import exp, log, product
+from vioframe.geometry.kernels import exp, log, product, set_matrix
 from vioframe.jit import kernel
 from vioframe.types import NavState
 
@@ -200,7 +200,7 @@ def _moved(states: States, cameras: Calibrated, step: Float) -> tuple[States, Ca
     offset_s, readout_s = cameras.offset_s.copy(), cameras.readout_s.copy()
     for c in range(len(p_BC)):
         d = step[n + CALIBRATION_SIZE * c : n + CALIBRATION_SIZE * (c + 1)]
-        R_BC[c] = product(R_BC[c], exp(d[:3]))
+        set_matrix(R_BC[c], product(R_BC[c], exp(d[:3])))
         for k in range(3):
             p_BC[c, k] += d[3 + k]
         for k in range(8):
@@ -265,19 +265,21 @@ def _normal_equations(
     return H, b, V, W, c, cost + visual_cost, errors, columns
 
 
-@kernel
+@kernel(inlined=True)
 def _with_those_of(others: States, states: States, where: Bool) -> States:
     """What :meth:`StateArrays.with_those_of` gives."""
     R_WB, p_WB, v_WB = states[0].copy(), states[1].copy(), states[2].copy()
     bias_gyro_B, bias_accel_B = states[3].copy(), states[4].copy()
     for k in range(len(where)):
         if where[k]:
-            R_WB[k], p_WB[k], v_WB[k] = others[0][k], others[1][k], others[2][k]
-            bias_gyro_B[k], bias_accel_B[k] = others[3][k], others[4][k]
+            set_matrix(R_WB[k], others[0][k])
+            for m in range(3):
+                p_WB[k, m], v_WB[k, m] = others[1][k, m], others[2][k, m]
+                bias_gyro_B[k, m], bias_accel_B[k, m] = others[3][k, m], others[4][k, m]
     return R_WB, p_WB, v_WB, bias_gyro_B, bias_accel_B
 
 
-@kernel
+@kernel(inlined=True)
 def _add_readings(readings: ImuFactors, states: States, first: States, frozen: Bool, H: Float, b: Float) -> float:
     """Add to the upper half of ``H`` and to ``b``; returns the cost. Jacobians are taken at ``first``."""
     cost = 0.0
@@ -322,7 +324,8 @@ def _reduced(
     S, g = H.copy(), b.copy()
     for u in range(len(b)):
         S[u, u] *= 1.0 + damping
-    S_visual, g_visual, eliminated = eliminate(seen, cameras, *landmarks, damping)
+    V, W, c = landmarks
+    S_visual, g_visual, eliminated = eliminate(seen, cameras, V, W, c, damping)
     for u in range(len(columns)):
         g[columns[u]] -= g_visual[u]
         own, visual = S[columns[u]], S_visual[u]
@@ -355,7 +358,8 @@ def pose_columns(K: int, N: int) -> NDArray[np.intp]:
     out = np.empty(6 * K + CALIBRATION_SIZE * N, np.intp)
     for u in range(6 * K):
         out[u] = STATE_SIZE * (u // 6) + u % 6
-    out[6 * K :] = STATE_SIZE * K + np.arange(CALIBRATION_SIZE * N)
+    for u in range(CALIBRATION_SIZE * N):
+        out[6 * K + u] = STATE_SIZE * K + u
     return out
 
 

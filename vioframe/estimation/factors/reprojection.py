@@ -22,7 +22,7 @@ import numpy as np
 
 from vioframe.arrays import Bool, Float, Int
 from vioframe.geometry.cameras import intrinsics_of
-from vioframe.geometry.kernels import distort, exp, intrinsics_jacobian
+from vioframe.geometry.kernels import distort, exp, intrinsics_jacobian, set_matrix, set_vector
 from vioframe.jit import kernel
 from vioframe.types import CameraOnBody
 
@@ -179,7 +179,7 @@ def pixels_by_residual(model: int, k: Float, xy: Float, on_sphere: bool) -> Floa
             for j in range(2):
                 S[0, j], S[1, j] = length * (T[j, 0] - x * T[j, 2]), length * (T[j, 1] - y * T[j, 2])
             J = J @ S
-        out[i] = J
+        set_matrix(out[i], J)
     return out
 
 
@@ -194,11 +194,11 @@ def pixels_by_intrinsics(model: Int, k: Float, xy: Float, seen: Bool) -> Float:
         for v in range(seen.shape[1]):
             if seen[i, v]:
                 c = v % len(k)
-                out[i, v] = intrinsics_jacobian(model[c], k[c], xy[i, v, 0], xy[i, v, 1])
+                set_matrix(out[i, v], intrinsics_jacobian(model[c], k[c], xy[i, v, 0], xy[i, v, 1]))
     return out
 
 
-@kernel
+@kernel(inlined=True)
 def eliminate(
     seen: Bool, cameras: int, V: Float, W: Float, c: Float, damping: float
 ) -> tuple[Float, Float, tuple[Float, Float, Float]]:
@@ -237,7 +237,7 @@ def eliminate(
     return S, g, (Y, z, inverse)
 
 
-@kernel
+@kernel(inlined=True)
 def _add_squares(seen: Bool, cameras: int, Y: Float, z: Float, S: Float, g: Float) -> None:
     """Add Y^T Y to the upper half of ``S`` (n, n) and Y^T z to ``g`` (n,), two landmarks at a time.
 
@@ -270,7 +270,7 @@ def _add_squares(seen: Bool, cameras: int, Y: Float, z: Float, S: Float, g: Floa
                 )  # fmt: skip
 
 
-@kernel
+@kernel(inlined=True)
 def _in_body(R_BC: Float, p_BC: Float, m: Float, q: Float) -> None:
     """``q`` (3,): rho times the landmark's position in the host's body."""
     for i in range(3):
@@ -338,7 +338,7 @@ def _add_lens(lens: Lens, i: int, v: int, intrinsics: Float, r: Float) -> None:
         r[1] += lens.px[i, v, 1, k] * change
 
 
-@kernel
+@kernel(inlined=True)
 def _residual_jacobian(
     X: Float, vx: float, vy: float, to_px: Float, on_sphere: bool, T: Float, D: Float, by_offset: Float
 ) -> None:
@@ -440,7 +440,8 @@ def linearise(poses: Poses, first: Poses, cameras: Calibrated, s: Sightings, lan
             apart = moved or across or rolling
             filled = 0
             R_fh, t_fh, R_BW = first.R_fh[f, h], first.t_fh[f, h], first.R_WB[f].T
-            R_rowC[:], p_rowC[:] = R_BC, p_BC
+            set_matrix(R_rowC, R_BC)
+            set_vector(p_rowC, p_BC)
             _view(poses.R_fh[f, h], poses.t_fh[f, h], R_rowC, p_rowC, R_BD, p_BD, now)
             _view(R_fh, t_fh, R_rowC, p_rowC, R_BD, p_BD, then)
             M, B, t = then
@@ -582,7 +583,7 @@ def _sorted(keys: Int, most: int) -> tuple[Int, Int]:
     return order, begins
 
 
-@kernel
+@kernel(inlined=True)
 def _squared(rows: Float, count: int, width: int, out: Float) -> None:
     """Upper half of J^T [J r], J of ``width`` columns, of the first ``count`` rows, an even number, four at a time."""
     if count % 4:
@@ -623,7 +624,7 @@ def _direction(view: View, x: float, y: float, rho: float, X: Float) -> None:
         X[i] = R_CD[i, 0] * x + R_CD[i, 1] * y + R_CD[i, 2] + rho * t_C[i]
 
 
-@kernel
+@kernel(inlined=True)
 def _add_own(own: Float, h: int, f: int, at_host: int, at_camera: int, H: Float, g: Float) -> None:
     """Add what :func:`_squared` makes of a view's sightings of a host's landmarks; of ``H`` the upper half.
 

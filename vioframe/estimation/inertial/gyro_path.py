@@ -34,8 +34,11 @@ def _between(at_s: Float, rate_B: Float, R_B0B: Float, t_s: Float) -> tuple[Floa
     for j in range(len(t_s)):
         k = min(max(np.searchsorted(at_s, t_s[j], side="right") - 1, 0), len(at_s) - 2)
         after = t_s[j] - at_s[k]
-        rates[j] = rate_B[k] + (rate_B[k + 1] - rate_B[k]) * (after / (at_s[k + 1] - at_s[k]))
-        R[j] = R_B0B[k] @ kernels.exp((rate_B[k] + rates[j]) * (0.5 * after))
+        share = after / (at_s[k + 1] - at_s[k])
+        for m in range(3):
+            rates[j, m] = rate_B[k, m] + (rate_B[k + 1, m] - rate_B[k, m]) * share
+        turn = kernels.exp((rate_B[k] + rates[j]) * (0.5 * after))
+        kernels.set_matrix(R[j], kernels.product(R_B0B[k], turn))
     return R, rates
 
 

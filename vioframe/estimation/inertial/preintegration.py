@@ -108,7 +108,8 @@ def _integrate(dt: Float, gyro: Float, accel: Float, variance: Float) -> tuple[F
     """
     R, p, v = np.eye(3), np.zeros(3), np.zeros(3)
     cov, bias_jacobian = np.zeros((15, 15)), np.zeros((15, 6))
-    bias_jacobian[9:15] = np.eye(6)
+    for k in range(6):
+        bias_jacobian[9 + k, k] = 1.0
     by_theta, by_biases = np.zeros((6, 3)), np.zeros((9, 6))
     for i in range(len(dt)):
         h = dt[i]
@@ -124,10 +125,13 @@ def _integrate(dt: Float, gyro: Float, accel: Float, variance: Float) -> tuple[F
         a_by_theta = -0.5 * product(R, hat(a_0)) + product(a_by_theta_next, dR.T)
         a_by_gyro = product(a_by_theta_next, theta_by_gyro)
         a_by_accel = -0.5 * (R + R_next)
-        by_theta[0:3], by_theta[3:6] = 0.5 * h * h * a_by_theta, h * a_by_theta
-        by_biases[0:3, 0:3] = theta_by_gyro
-        by_biases[3:6, 0:3], by_biases[3:6, 3:6] = 0.5 * h * h * a_by_gyro, 0.5 * h * h * a_by_accel
-        by_biases[6:9, 0:3], by_biases[6:9, 3:6] = h * a_by_gyro, h * a_by_accel
+        for m in range(3):
+            for n in range(3):
+                by_theta[m, n], by_theta[3 + m, n] = 0.5 * h * h * a_by_theta[m, n], h * a_by_theta[m, n]
+                by_biases[m, n] = theta_by_gyro[m, n]
+                by_biases[3 + m, n], by_biases[6 + m, n] = 0.5 * h * h * a_by_gyro[m, n], h * a_by_gyro[m, n]
+                by_biases[3 + m, 3 + n] = 0.5 * h * h * a_by_accel[m, n]
+                by_biases[6 + m, 3 + n] = h * a_by_accel[m, n]
 
         move(dR, by_theta, by_biases, h, bias_jacobian)
         move_covariance(dR, by_theta, by_biases, h, cov)

@@ -87,14 +87,15 @@ def _integrate(
         dp = (h * h / 6.0) * (f_0 + 2.0 * f_m)
 
         # Error transition over the interval, with the errors of the biases constant in it.
-        by_theta[0:3] = -product(hat(dp), R)
-        by_theta[3:6] = -product(hat(dv), R)
-        force = product(R_half, hat(a_m))
-        by_biases[0:3, 0:3] = -h * right_jacobian(phi)
-        by_biases[3:6, 0:3] = (h**3 / 6.0) * force
-        by_biases[6:9, 0:3] = (h**2 / 2.0) * force
-        by_biases[3:6, 3:6] = -(h**2 / 2.0) * R_half
-        by_biases[6:9, 3:6] = -h * R_half
+        dp_by_theta, dv_by_theta = product(hat(dp), R), product(hat(dv), R)
+        force, J_r = product(R_half, hat(a_m)), right_jacobian(phi)
+        for m in range(3):
+            for n in range(3):
+                by_theta[m, n], by_theta[3 + m, n] = -dp_by_theta[m, n], -dv_by_theta[m, n]
+                by_biases[m, n] = -h * J_r[m, n]
+                by_biases[3 + m, n], by_biases[6 + m, n] = (h**3 / 6.0) * force[m, n], (h**2 / 2.0) * force[m, n]
+                by_biases[3 + m, 3 + n] = -(h**2 / 2.0) * R_half[m, n]
+                by_biases[6 + m, 3 + n] = -h * R_half[m, n]
         move(dR, by_theta, by_biases, h, Phi)
         move_covariance(dR, by_theta, by_biases, h, Q)
         for k in range(3):

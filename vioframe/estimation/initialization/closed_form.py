@@ -32,7 +32,7 @@ from vioframe.estimation.factors.inertial import StateArrays
 from vioframe.estimation.inertial.preintegration import Preintegrated
 from vioframe.estimation.initialization.window import Window, refuse_unless
 from vioframe.estimation.turns import linearise_pairs
-from vioframe.geometry.kernels import exp, product, right_jacobian, turned
+from vioframe.geometry.kernels import exp, product, right_jacobian, set_matrix, turned
 from vioframe.jit import kernel
 from vioframe.types import GRAVITY_M_S2
 
@@ -112,17 +112,17 @@ def _relative_rotations(dR: Float, by_bias: Float, change: Float, first: Int, se
     is now another by ``change`` (3,); ``first`` and ``second`` (P,) are the frames of each pair.
     """
     R_0, J_0 = np.zeros((len(dR) + 1, 3, 3)), np.zeros((len(dR) + 1, 3, 3))
-    R_0[0] = np.eye(3)
+    set_matrix(R_0[0], np.eye(3))
     for k in range(len(dR)):
         correction = turned(by_bias[k], change)
         step = product(dR[k], exp(correction))
-        R_0[k + 1] = product(R_0[k], step)
-        J_0[k + 1] = product(step.T, J_0[k]) + product(right_jacobian(correction), by_bias[k])
+        set_matrix(R_0[k + 1], product(R_0[k], step))
+        set_matrix(J_0[k + 1], product(step.T, J_0[k]) + product(right_jacobian(correction), by_bias[k]))
     R, J = np.empty((len(first), 3, 3)), np.empty((len(first), 3, 3))
     for p in range(len(first)):
         i, j = first[p], second[p]
-        R[p] = product(R_0[i].T, R_0[j])
-        J[p] = J_0[j] - product(R[p].T, J_0[i])
+        set_matrix(R[p], product(R_0[i].T, R_0[j]))
+        set_matrix(J[p], J_0[j] - product(R[p].T, J_0[i]))
     return R, J
 
 
