@@ -82,13 +82,15 @@ def _row(w, c, y):
 
 
 @kernel
-def _camera_at(w, k, c, y):
-    """Camera ``c`` as seen from the body at clone ``k``, (3, 3) and (3,), when it saw a pixel at the height ``y``."""
+def _camera_at(w, k, c, y, R_lateC, p_lateC):
+    """Camera ``c`` as seen from the body at clone ``k`` when it saw a pixel at the height ``y``; fills (3, 3), (3,)."""
+    R_BC, p_BC, velocity_B = w.R_BC[c], w.p_BC[c], w.velocity_B[k]
     late_s = w.offset_s[c] + w.readout_s[c] * _row(w, c, y)
-    if late_s == 0.0:
-        return w.R_BC[c], w.p_BC[c]
     turn = exp(late_s * w.rate_B[k])
-    return product(turn, w.R_BC[c]), turned(turn, w.p_BC[c]) + late_s * w.velocity_B[k]
+    for i in range(3):
+        for j in range(3):
+            R_lateC[i, j] = turn[i, 0] * R_BC[0, j] + turn[i, 1] * R_BC[1, j] + turn[i, 2] * R_BC[2, j]
+        p_lateC[i] = turn[i, 0] * p_BC[0] + turn[i, 1] * p_BC[1] + turn[i, 2] * p_BC[2] + late_s * velocity_B[i]
 
 
 # Vectors as tuples, for which nothing is allocated.
@@ -146,9 +148,9 @@ def _observe(w, k, c, R_lateC, p_lateC, p_WF, p_WF_first, xy, block, residual):
     p_late = turned_C[0] + p_BC[0], turned_C[1] + p_BC[1], turned_C[2] + p_BC[2]
     moved_late = _cross(w.rate_B[k], p_late)
     row = _row(w, c, xy[1])
-    set_matrix(block[:, 7:15], intrinsics_jacobian(model, intrinsics, x, y))
+    intrinsics_jacobian(model, intrinsics, x, y, block[:, 7:15])
     for i in range(2):
-        J = D[i, 0] / p_C[2], D[i, 1] / p_C[2], -(D[i, 0] * x + D[i, 1] * y) / p_C[2]
+        J = D[i][0] / p_C[2], D[i][1] / p_C[2], -(D[i][0] * x + D[i][1] * y) / p_C[2]
         J_late, J_B = _by(R_BC, J), _by(R_lateC, J)
         J_W, by_turn_BC, by_turn_WB = _by(R_first, J_B), _cross(J, p_C), _cross(J_B, p_B)
         by_offset = -_dot(J_late, moved_late) - _dot(J_B, w.velocity_B[k])
@@ -165,9 +167,10 @@ def observations(w, clone, cameras, p_WF, p_WF_first, xy):
     m = len(xy)
     blocks = np.empty((m, 2, 25))
     residual = np.empty((m, 2))
+    R_lateC, p_lateC = np.empty((3, 3)), np.empty(3)
     for i in range(m):
         c = cameras[i]
-        R_lateC, p_lateC = _camera_at(w, clone, c, xy[i, 1])
+        _camera_at(w, clone, c, xy[i, 1], R_lateC, p_lateC)
         _observe(w, clone, c, R_lateC, p_lateC, p_WF[i], p_WF_first[i], xy[i], blocks[i], residual[i])
     return blocks, residual
 
@@ -184,11 +187,9 @@ def track_rows(w, xy, xy_normalised, seen, pixel_sigma):
     for i in range(m):
         v = views[i]
         k, c = v // N, v % N
-        R, p = _camera_at(w, k, c, xy[v, 1])
-        set_matrix(R_lateC[i], R)
-        set_vector(p_lateC[i], p)
-        set_matrix(R_WC[i], product(w.R_WB[k], R))
-        set_vector(p_WC[i], turned(w.R_WB[k], p) + w.p_WB[k])
+        _camera_at(w, k, c, xy[v, 1], R_lateC[i], p_lateC[i])
+        set_matrix(R_WC[i], product(w.R_WB[k], R_lateC[i]))
+        set_vector(p_WC[i], turned(w.R_WB[k], p_lateC[i]) + w.p_WB[k])
         points[i, 0], points[i, 1] = undistort(
             w.camera_models[c], w.intrinsics[c], xy[v, 0], xy[v, 1], xy_normalised[v, 0], xy_normalised[v, 1]
         )

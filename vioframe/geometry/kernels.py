@@ -10,6 +10,8 @@ import numpy as np
 from vioframe.arrays import Float
 from vioframe.jit import kernel
 
+_Pair = tuple[float, float]
+
 RADTAN, EQUIDISTANT = 0, 1
 """Numbers of the models, as :func:`cameras.intrinsics_of` gives them."""
 
@@ -190,19 +192,17 @@ def right_jacobian_inverse(phi: Float) -> Float:
 
 
 @kernel
-def distort(model: int, k: Float, x: float, y: float) -> tuple[Float, Float]:
-    """A point on the z = 1 plane -> pixel (2,) and its Jacobian d px / d (x, y) (2, 2)."""
+def distort(model: int, k: Float, x: float, y: float) -> tuple[_Pair, tuple[_Pair, _Pair]]:
+    """A point on the z = 1 plane -> pixel and its Jacobian d px / d (x, y); for tuples nothing is allocated."""
     r2 = x * x + y * y
-    xy = np.empty(2)
-    J = np.empty((2, 2))
     if model == RADTAN:
         radial = 1.0 + r2 * (k[4] + k[5] * r2)
         slope = 2.0 * (k[4] + 2.0 * k[5] * r2)
         u = x * radial + 2.0 * k[6] * x * y + k[7] * (r2 + 2.0 * x * x)
         v = y * radial + k[6] * (r2 + 2.0 * y * y) + 2.0 * k[7] * x * y
-        J[0, 0] = radial + slope * x * x + 2.0 * k[6] * y + 6.0 * k[7] * x
-        J[1, 1] = radial + slope * y * y + 6.0 * k[6] * y + 2.0 * k[7] * x
-        J[0, 1] = J[1, 0] = slope * x * y + 2.0 * k[6] * x + 2.0 * k[7] * y
+        u_x = radial + slope * x * x + 2.0 * k[6] * y + 6.0 * k[7] * x
+        v_y = radial + slope * y * y + 6.0 * k[6] * y + 2.0 * k[7] * x
+        across = slope * x * y + 2.0 * k[6] * x + 2.0 * k[7] * y
     else:
         r = math.sqrt(r2)
         t = math.atan(r)
@@ -214,19 +214,15 @@ def distort(model: int, k: Float, x: float, y: float) -> tuple[Float, Float]:
             d_t = 1.0 + t2 * (3.0 * k[4] + t2 * (5.0 * k[5] + t2 * (7.0 * k[6] + t2 * 9.0 * k[7])))
             slope = (d_t / (1.0 + r2) - scale) / r2
         u, v = x * scale, y * scale
-        J[0, 0], J[1, 1] = scale + slope * x * x, scale + slope * y * y
-        J[0, 1] = J[1, 0] = slope * x * y
-    xy[0], xy[1] = k[0] * u + k[2], k[1] * v + k[3]
-    for j in range(2):
-        J[0, j] *= k[0]
-        J[1, j] *= k[1]
-    return xy, J
+        u_x, v_y, across = scale + slope * x * x, scale + slope * y * y, slope * x * y
+    px = k[0] * u + k[2], k[1] * v + k[3]
+    return px, ((u_x * k[0], across * k[0]), (across * k[1], v_y * k[1]))
 
 
 @kernel
-def intrinsics_jacobian(model: int, k: Float, x: float, y: float) -> Float:
-    """d px / d [fx fy cx cy d1 d2 d3 d4] at a point of the z = 1 plane, (2, 8)."""
-    J = np.zeros((2, 8))
+def intrinsics_jacobian(model: int, k: Float, x: float, y: float, J: Float) -> None:
+    """Fill ``J`` (2, 8) with d px / d [fx fy cx cy d1 d2 d3 d4] at a point of the z = 1 plane."""
+    J[:] = 0.0
     r2 = x * x + y * y
     if model == RADTAN:
         radial = 1.0 + r2 * (k[4] + k[5] * r2)
@@ -248,7 +244,6 @@ def intrinsics_jacobian(model: int, k: Float, x: float, y: float) -> Float:
             power *= t2
             J[0, 4 + i], J[1, 4 + i] = k[0] * x * power * over_r, k[1] * y * power * over_r
     J[0, 2] = J[1, 3] = 1.0
-    return J
 
 
 @kernel
@@ -259,9 +254,9 @@ def undistort(model: int, k: Float, px: float, py: float, x: float, y: float) ->
         ex, ey = xy[0] - px, xy[1] - py
         if abs(ex) + abs(ey) < 1e-6:
             break
-        det = J[0, 0] * J[1, 1] - J[0, 1] * J[1, 0]
-        x -= (J[1, 1] * ex - J[0, 1] * ey) / det
-        y -= (J[0, 0] * ey - J[1, 0] * ex) / det
+        det = J[0][0] * J[1][1] - J[0][1] * J[1][0]
+        x -= (J[1][1] * ex - J[0][1] * ey) / det
+        y -= (J[0][0] * ey - J[1][0] * ex) / det
     return x, y
 
 
@@ -271,7 +266,7 @@ def distorted(model: int, k: Float, xy_normalised: Float) -> Float:
     out = np.empty(xy_normalised.shape)
     for i in range(len(out)):
         px, _ = distort(model, k, xy_normalised[i, 0], xy_normalised[i, 1])
-        out[i, 0], out[i, 1] = px[0], px[1]
+        out[i, 0], out[i, 1] = px
     return out
 
 
@@ -294,11 +289,11 @@ def undistorted(model: int, k: Float, xy: Float) -> Float:
         for _ in range(20):
             uv, J = distort(model, plane, x, y)
             ex, ey = uv[0] - u, uv[1] - v
-            det = J[0, 0] * J[1, 1] - J[0, 1] * J[1, 0]
+            det = J[0][0] * J[1][1] - J[0][1] * J[1][0]
             if abs(ex) < 1e-12 and abs(ey) < 1e-12:
                 break
-            x -= (J[1, 1] * ex - J[0, 1] * ey) / det
-            y -= (J[0, 0] * ey - J[1, 0] * ex) / det
+            x -= (J[1][1] * ex - J[0][1] * ey) / det
+            y -= (J[0][0] * ey - J[1][0] * ex) / det
         # Past the fold of the distortion the image is mirrored: a solution there is not where the camera looks.
         solved = abs(ex) < 1e-6 and abs(ey) < 1e-6 and det > 0.0
         out[i, 0], out[i, 1] = (x, y) if solved else (math.nan, math.nan)

@@ -170,16 +170,18 @@ def pixels_by_residual(model: int, k: Float, xy: Float, on_sphere: bool) -> Floa
     T = np.empty((2, 3))
     for i in range(len(xy)):
         x, y = xy[i]
-        _, J = distort(model, k, x, y)
+        _, D = distort(model, k, x, y)
         if on_sphere:
             # A step across the ray, seen on the plane: |m| (T_xy - m_xy T_z).
             _tangents(x, y, T)
             length = math.sqrt(1.0 + x * x + y * y)
-            S = np.empty((2, 2))
             for j in range(2):
-                S[0, j], S[1, j] = length * (T[j, 0] - x * T[j, 2]), length * (T[j, 1] - y * T[j, 2])
-            J = J @ S
-        set_matrix(out[i], J)
+                u, v = length * (T[j, 0] - x * T[j, 2]), length * (T[j, 1] - y * T[j, 2])
+                for a in range(2):
+                    out[i, a, j] = D[a][0] * u + D[a][1] * v
+        else:
+            for a in range(2):
+                out[i, a, 0], out[i, a, 1] = D[a]
     return out
 
 
@@ -194,7 +196,7 @@ def pixels_by_intrinsics(model: Int, k: Float, xy: Float, seen: Bool) -> Float:
         for v in range(seen.shape[1]):
             if seen[i, v]:
                 c = v % len(k)
-                set_matrix(out[i, v], intrinsics_jacobian(model[c], k[c], xy[i, v, 0], xy[i, v, 1]))
+                intrinsics_jacobian(model[c], k[c], xy[i, v, 0], xy[i, v, 1], out[i, v])
     return out
 
 
