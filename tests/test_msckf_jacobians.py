@@ -12,9 +12,13 @@ from vioframe.geometry import so3
 from vioframe.geometry.cameras import Camera, intrinsics_of
 from vioframe.types import FrameTracks
 from vioframe_msckf.measurement import (
+    ACCEPTED,
+    GATED,
+    NOT_TRIANGULATED,
     Window,
     distance_and_variances,
     landmark_blocks,
+    msckf_rows,
     observations,
     reduce_landmark,
     track_rows,
@@ -171,6 +175,16 @@ def test_distance_of_a_track_is_that_of_what_is_free_of_the_landmark():
     free = null_space(H_f.T)
     expected = residual @ free @ np.linalg.inv(free.T @ (S + 0.3 * np.eye(10)) @ free) @ free.T @ residual
     assert distance_and_variances(S, H_f, residual, 0.3, 1.0)[0] == pytest.approx(expected, rel=1e-9)
+
+
+def test_no_track_is_believed_where_the_covariance_is_none():
+    """What is not positive definite says nothing of how far off a track may be."""
+    state, table = seeing_state()
+    P = np.ascontiguousarray(state.cov[IMU:, IMU:])
+    window, gate = Window.of(state, True), np.full(100, 1e9)
+    for cov, verdict in ((P, ACCEPTED), (-1e6 * P, GATED)):
+        seen = table.xy, table.xy_normalised, table.seen
+        assert set(msckf_rows(window, *seen, cov, 0.2, 3.0, gate).verdict) == {verdict, NOT_TRIANGULATED}
 
 
 def test_sightings_that_do_not_fit_get_cauchys_variance():
