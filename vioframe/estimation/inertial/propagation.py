@@ -87,11 +87,11 @@ def _integrate(
         dp = (h * h / 6.0) * (f_0 + 2.0 * f_m)
 
         # Error transition over the interval, with the errors of the biases constant in it.
-        dp_by_theta, dv_by_theta = product(hat(dp), R), product(hat(dv), R)
+        cross_dp, cross_dv = product(hat(dp), R), product(hat(dv), R)
         force, J_r = product(R_half, hat(a_m)), right_jacobian(phi)
         for m in range(3):
             for n in range(3):
-                by_theta[m, n], by_theta[3 + m, n] = -dp_by_theta[m, n], -dv_by_theta[m, n]
+                by_theta[m, n], by_theta[3 + m, n] = -cross_dp[m, n], -cross_dv[m, n]
                 by_biases[m, n] = -h * J_r[m, n]
                 by_biases[3 + m, n], by_biases[6 + m, n] = (h**3 / 6.0) * force[m, n], (h**2 / 2.0) * force[m, n]
                 by_biases[3 + m, 3 + n] = -(h**2 / 2.0) * R_half[m, n]
