@@ -31,6 +31,8 @@ import click
 from common import HERE, SHARED_DATA, present
 
 from vioframe.bench import Row
+from vioframe.parts import registry
+from vioframe.parts.config import parse_part
 
 COLUMNS = {
     "data": "",
@@ -60,7 +62,9 @@ _OF_A_RUN = ("frames_s", "real_time", "first_s")
 @click.command()
 @click.option("--record", "keep", is_flag=True, help="Write the results to benchmarks/results.")
 @click.option("--rounds", default=5, show_default=True, help="Runs of each, in turn.")
-@click.option("--run", "runs", multiple=True, default=RUNS, show_default=True, metavar="DETECTOR[:KEY=VALUE]+BACKEND")
+@click.option(
+    "--run", "runs", multiple=True, default=RUNS, show_default=True, metavar="DETECTOR[:KEY=VALUE,...]+BACKEND"
+)
 @click.option("--against", type=click.Path(exists=True, file_okay=False, path_type=Path), metavar="CHECKOUT")
 @click.option("--data", type=click.Path(exists=True, path_type=Path), default=SHARED_DATA / "euroc/MH_01_easy_15s")
 def main(keep: bool, rounds: int, runs: tuple[str, ...], against: Path | None, data: Path) -> None:
@@ -124,11 +128,12 @@ def _yardstick(data: Path, copies: int) -> Row:
 
 def _run(data: Path, run: str, checkout: Path | None, cores: int, out: Path) -> Row:
     """One run of the command line, by the code of ``checkout``."""
-    detector, backend = run.split("+")
-    detector, *options = detector.split(":")
-    command = [sys.executable, "-m", "vioframe", "run", str(data), "--detector", detector, "--backend", backend]
-    command += ["-o", "cameras=cam0", *(part for option in options for part in ("-o", f"detector.{option}"))]
-    command += ["--quiet", "--out", str(out)]
+    spec, backend = run.split("+")
+    detector = parse_part(spec, registry.DETECTOR, registry.load())
+    command = [sys.executable, "-m", "vioframe", "run", str(data), "--detector", detector.name, "--backend", backend]
+    for key, value in detector.options.items():
+        command += ["-o", f"detector.{key}={value}"]
+    command += ["-o", "cameras=cam0", "--quiet", "--out", str(out)]
     code = {}
     if checkout is not None:  # its own, though another vioframe may lie in the folder that this was begun in
         code = {"PYTHONPATH": f"{checkout}{os.pathsep}{checkout / 'plugins'}", "PYTHONSAFEPATH": "1"}

@@ -2,26 +2,22 @@
 
 import numpy as np
 import pytest
+from msckf_helpers import random_covariance
 
 from vioframe.geometry.kernels import inverse_cholesky, set_matrix, set_vector, whiten
-
-
-def positive(rng, n):
-    A = rng.normal(size=(n, n))
-    return A @ A.T + np.eye(n)
 
 
 @pytest.mark.parametrize(("n", "m"), [(1, 1), (3, 1), (17, 4)])
 def test_what_is_whitened_has_the_factor_taken_off(n, m):
     rng = np.random.default_rng(n)
-    A, B = positive(rng, n), rng.normal(size=(n, m))
+    A, B = random_covariance(rng, n), rng.normal(size=(n, m))
     expected = np.linalg.solve(np.linalg.cholesky(A), B)
     whiten(A.copy(), B)
     np.testing.assert_allclose(B, expected, rtol=1e-9)
 
 
 def test_the_inverse_of_a_factor():
-    A = positive(np.random.default_rng(0), 3)
+    A = random_covariance(np.random.default_rng(0), 3)
     np.testing.assert_allclose(inverse_cholesky(A), np.linalg.inv(np.linalg.cholesky(A)), rtol=1e-9)
 
 

@@ -15,8 +15,8 @@ from typing import NamedTuple
 import numpy as np
 
 from vioframe.geometry.kernels import (
+    camera_later,
     distort,
-    exp,
     intrinsics_jacobian,
     inverse_cholesky,
     product,
@@ -84,13 +84,8 @@ def _row(w, c, y):
 @kernel
 def _camera_at(w, k, c, y, R_lateC, p_lateC):
     """Camera ``c`` as seen from the body at clone ``k`` when it saw a pixel at the height ``y``; fills (3, 3), (3,)."""
-    R_BC, p_BC, velocity_B = w.R_BC[c], w.p_BC[c], w.velocity_B[k]
     late_s = w.offset_s[c] + w.readout_s[c] * _row(w, c, y)
-    turn = exp(late_s * w.rate_B[k])
-    for i in range(3):
-        for j in range(3):
-            R_lateC[i, j] = turn[i, 0] * R_BC[0, j] + turn[i, 1] * R_BC[1, j] + turn[i, 2] * R_BC[2, j]
-        p_lateC[i] = turn[i, 0] * p_BC[0] + turn[i, 1] * p_BC[1] + turn[i, 2] * p_BC[2] + late_s * velocity_B[i]
+    camera_later(w.R_BC[c], w.p_BC[c], late_s, w.rate_B[k], w.velocity_B[k], R_lateC, p_lateC)
 
 
 # Vectors as tuples, for which nothing is allocated.

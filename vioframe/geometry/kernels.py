@@ -95,11 +95,11 @@ def whiten(A: Float, B: Float) -> None:
     n, m = B.shape
     for j in range(n):
         above, of_above = A[j], B[j]
-        scale = 1.0 / math.sqrt(above[j])
+        root = math.sqrt(above[j])
         for k in range(j, n):
-            above[k] *= scale
+            above[k] /= root
         for k in range(m):
-            of_above[k] *= scale
+            of_above[k] /= root
         for i in range(j + 1, n):
             factor, row, of_row = above[i], A[i], B[i]
             for k in range(i, n):
@@ -132,6 +132,18 @@ def turned_by(R: Float, phi: Float) -> Float:
     for k in range(len(R)):
         set_matrix(out[k], product(R[k], exp(phi[k])))
     return out
+
+
+@kernel
+def camera_later(
+    R_BC: Float, p_BC: Float, late_s: float, rate_B: Float, velocity_B: Float, R_lateC: Float, p_lateC: Float
+) -> None:
+    """Fill ``R_lateC`` (3, 3) and ``p_lateC`` (3,) with a camera ``late_s`` after a stamp, seen from the body at it."""
+    turn = exp(late_s * rate_B)
+    for i in range(3):
+        p_lateC[i] = turn[i, 0] * p_BC[0] + turn[i, 1] * p_BC[1] + turn[i, 2] * p_BC[2] + late_s * velocity_B[i]
+        for j in range(3):
+            R_lateC[i, j] = turn[i, 0] * R_BC[0, j] + turn[i, 1] * R_BC[1, j] + turn[i, 2] * R_BC[2, j]
 
 
 @kernel

@@ -5,7 +5,6 @@ Forster et al. (T-RO 2017), numbers in brackets. Shared by the initialisation an
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -14,7 +13,16 @@ import numpy as np
 
 from vioframe.arrays import Bool
 from vioframe.estimation.inertial.preintegration import Preintegrated
-from vioframe.geometry.kernels import exp, log, product, right_jacobian, right_jacobian_inverse, turned, turned_by
+from vioframe.geometry.kernels import (
+    exp,
+    log,
+    product,
+    right_jacobian,
+    right_jacobian_inverse,
+    turned,
+    turned_by,
+    whiten,
+)
 from vioframe.jit import kernel
 from vioframe.types import Float, Int, NavState, g_W
 
@@ -123,21 +131,10 @@ class ImuFactors(NamedTuple):
 def _whitening(cov: Float) -> Float:
     """(K, 15, 15) inverses of the Cholesky factors of covariances (K, 15, 15)."""
     out = np.zeros(cov.shape)
-    L = np.zeros((15, 15))
     for k in range(len(cov)):
         for i in range(15):
-            for j in range(i + 1):
-                rest = cov[k, i, j]
-                for m in range(j):
-                    rest -= L[i, m] * L[j, m]
-                L[i, j] = math.sqrt(rest) if i == j else rest / L[j, j]
-        for j in range(15):
-            out[k, j, j] = 1.0 / L[j, j]
-            for i in range(j + 1, 15):
-                rest = 0.0
-                for m in range(j, i):
-                    rest -= L[i, m] * out[k, m, j]
-                out[k, i, j] = rest / L[i, i]
+            out[k, i, i] = 1.0
+        whiten(cov[k].copy(), out[k])
     return out
 
 

@@ -22,7 +22,7 @@ import numpy as np
 
 from vioframe.arrays import Bool, Float, Int
 from vioframe.geometry.cameras import intrinsics_of
-from vioframe.geometry.kernels import distort, exp, intrinsics_jacobian, set_matrix, set_vector
+from vioframe.geometry.kernels import camera_later, distort, intrinsics_jacobian, set_matrix, set_vector
 from vioframe.jit import kernel
 from vioframe.types import CameraOnBody
 
@@ -294,14 +294,8 @@ def _in_camera(R_fh: Float, t_fh: Float, R_BC: Float, p_BC: Float, rho: float, q
 def camera_at_row(cameras: Calibrated, shutter: Shutter, i: int, v: int, R_rowC: Float, p_rowC: Float) -> None:
     """``R_rowC`` (3, 3) and ``p_rowC`` (3,): the camera of view v, seen from the body, when it saw landmark i."""
     f, c = v // len(cameras.p_BC), v % len(cameras.p_BC)
-    R_BC, p_BC = cameras.R_BC[c], cameras.p_BC[c]
     late_s = cameras.readout_s[c] * shutter.row[i, v]
-    turn = exp(late_s * shutter.rate_B[f])
-    for j in range(3):
-        p_rowC[j] = late_s * shutter.velocity_B[f, j]
-        for k in range(3):
-            p_rowC[j] += turn[j, k] * p_BC[k]
-            R_rowC[j, k] = turn[j, 0] * R_BC[0, k] + turn[j, 1] * R_BC[1, k] + turn[j, 2] * R_BC[2, k]
+    camera_later(cameras.R_BC[c], cameras.p_BC[c], late_s, shutter.rate_B[f], shutter.velocity_B[f], R_rowC, p_rowC)
 
 
 @kernel
