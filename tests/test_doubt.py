@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -14,12 +15,15 @@ from vioframe.estimation.factors.reprojection import INTRINSICS, OFFSET, Calibra
 from vioframe.estimation.inertial.noise import noise_over, roughness
 from vioframe.estimation.initialization import InitialEstimate, Initializer, dynamic
 from vioframe.estimation.initialization.found import found_by
+from vioframe.estimation.initialization.sensors import SensorCheck
 from vioframe.estimation.initialization.window import ContradictedError, RefusalError, UnsureError
 from vioframe.estimation.lifecycle import LifeCycle
 from vioframe.geometry import so3
+from vioframe.incidents import Incidents
 from vioframe.io.calibration import packaged_calibration
+from vioframe.io.synchronise import Synchroniser, synchronise
 from vioframe.simulation import TrackSequence, simulated_sequence
-from vioframe.types import Calibration, ImuSegment, Status
+from vioframe.types import Calibration, FrameSet, FrameTracks, ImuSegment, Measurement, Status
 from vioframe_msckf.backend import Msckf
 
 EUROC = packaged_calibration("euroc", cameras=["cam0"])
@@ -117,27 +121,50 @@ def test_motion_ends_the_doubt_of_a_flight_from_rest():
     assert not doubted[-1]
 
 
-@pytest.mark.parametrize("offset_s", [-0.05, 0.05])
-def test_with_another_time_offset_the_readings_of_the_newest_frame_may_be_still_to_come(offset_s: float, monkeypatch):
-    s, asked = hovering(), []
+@pytest.mark.parametrize("offset_ms", [-50, 50])
+def test_frames_that_were_cut_before_another_time_offset_was_found(offset_ms: int, monkeypatch):
+    """No start is made of them, and they are as if they had been cut by it."""
+    s, asked = hovering(), [0]
 
     def contradicted_once(packets, *_, **__):
         asked.append(packets[-1][1].t_ns)
         if len(asked) > 1:
             raise RefusalError("enough")
-        camera = Calibrated(*TestFoundBy.other(offset_s=offset_s))
+        camera = Calibrated(*TestFoundBy.other(offset_s=1e-3 * offset_ms))
         raise ContradictedError(camera, TestFoundBy.COV)
 
     monkeypatch.setattr(dynamic, "initialise", contradicted_once)
-    initializer = Initializer(s.calibration)
-    for imu, tracks in s.packets:
-        assert initializer.add(imu, tracks) is None
-        if asked:
-            break
-    assert initializer.calibration.cameras[0].time_offset_ns == round(offset_s * 1e9)
-    # Later readings are not there yet, earlier ones are.
-    assert len(asked) == (1 if offset_s > 0.0 else 2)
-    assert set(asked) == {tracks.t_ns}
+    monkeypatch.setattr(SensorCheck, "judge", lambda *_: None)  # to which the offset given looked right
+    offset_ns, tracks = 1_000_000 * offset_ms, {tracks.t_ns: tracks for _, tracks in s.packets}
+    at_once = Initializer(s.calibration.with_camera(0, time_offset_ns=offset_ns))
+    for measured in synchronise(readings_and_frames(s), Incidents(), time_offset_ns=offset_ns):
+        at_once.add(measured[0], tracks[measured[1].t_ns])
+    asked.clear()
+
+    synchroniser, initializer, since = Synchroniser(Incidents(), wait_ms=0.0), Initializer(s.calibration), []
+    for measurement in readings_and_frames(s):
+        for imu, frame in synchroniser.add(measurement):
+            cut_by_ns = 0 if len(since) < 4 else offset_ns
+            assert initializer.add(imu, tracks[frame.t_ns], cut_by_ns) is None
+            if asked:
+                since.append((frame.t_ns, len(asked)))
+            if len(since) == 4:
+                synchroniser.retime(offset_ns)
+    assert initializer.calibration.cameras[0].time_offset_ns == offset_ns
+    assert [attempts for _, attempts in since[:4]] == [1, 1, 1, 1]
+    assert since[-1][1] > 2
+    # From the first frame on that had been cut before.
+    waited = [packet for packet in initializer._packets if packet[1].t_ns > since[0][0]]
+    due = {packet.t_ns: imu for imu, packet in at_once._packets}
+    assert len(waited) > 20
+    for imu, packet in waited:
+        np.testing.assert_array_equal(imu.t_ns, due[packet.t_ns].t_ns)
+        np.testing.assert_allclose(imu.gyro_B, due[packet.t_ns].gyro_B, rtol=0.0, atol=1e-12)
+
+
+def readings_and_frames(sequence: TrackSequence) -> Iterator[Measurement]:
+    for measured in sequence.measurements():
+        yield FrameSet(measured.t_ns, ()) if isinstance(measured, FrameTracks) else measured
 
 
 class TestFoundBy:

@@ -279,27 +279,13 @@ def test_what_cannot_be_believed_is_lost_and_begun_anew(say, event):
     np.testing.assert_array_equal(backend.starts[1].state.p_WB, backend.starts[0].state.p_WB)
 
 
-def test_frames_keep_the_calibration_until_the_first_flight_where_no_start_can_find_another():
-    """After a flight what was learned is forgotten with the next start, whenever that is."""
-    fails = []
-
-    def say(estimate: Estimate) -> Estimate:
-        return replace(estimate, status=Status.LOST, state=None) if fails else estimate
-
-    packets = flight().packets
-    life = LifeCycle(Scripted(say), CALIBRATION)
-    for imu, tracks in packets[:10]:
-        assert life.process(imu, tracks).status is Status.INITIALISING
-    assert life.keeps_calibration(packets[10][1].t_ns)
-    assert not life.keeps_calibration(packets[-1][1].t_ns)  # long enough for a start in motion
-    life = begun(Scripted(say))
-    assert not life.keeps_calibration(packets[1][1].t_ns)
-    life.process(*packets[1])
-    fails.append(True)
-    assert life.process(*packets[2]).status is Status.LOST
-    for imu, tracks in packets[3:13]:
-        life.process(imu, tracks)
-    assert not life.keeps_calibration(packets[13][1].t_ns)
+def test_points_that_were_undistorted_by_another_lens_are_undistorted_anew():
+    """As of frames that were begun before it was found."""
+    other = CALIBRATION.with_camera(0, model=CALIBRATION.cameras[0].model.zoomed(1.1))
+    life, (imu, tracks) = begun(backend := Scripted()), flight().packets[1]
+    life.process(imu, tracks.undistorted(*other.lenses), other)
+    expected = tracks.undistorted(*CALIBRATION.lenses).xy_normalised
+    np.testing.assert_array_equal(backend.given[-1][1].xy_normalised, expected)
 
 
 def test_a_backend_that_says_so_is_lost():

@@ -161,9 +161,9 @@ def test_two_processes_give_the_bytes_of_one(backend: str):
         """The next frame finds the camera to be another one, and begins anew."""
         life, process = odometry._life, odometry._life.process
 
-        def lost(imu: ImuSegment, tracks: FrameTracks) -> Estimate:
+        def lost(imu: ImuSegment, tracks: FrameTracks, by: Calibration) -> Estimate:
             life.process = process
-            process(imu, tracks)
+            process(imu, tracks, by)
             (camera,) = life.calibration.cameras
             initializer = life._initializer
             initializer._calibration = life.calibration.with_camera(
@@ -181,31 +181,28 @@ def test_two_processes_give_the_bytes_of_one(backend: str):
     assert sum(step.estimate.status is Status.LOST for step in alone) == 1
 
 
-def test_the_next_frame_is_begun_before_the_last_is_estimated():
-    """Unless that may find another calibration."""
+def test_the_next_frames_are_begun_before_one_is_estimated():
+    """While starting as in flight."""
     odometry = Odometry(CALIBRATION, "shi_tomasi", "msckf", pipelined=True, installed=INSTALLED)
     begun, ahead = 0, {Status.INITIALISING: [], Status.TRACKING: []}
     begin, life = odometry._frontend.begin, odometry._life
-    process, keeps, doubtful = life.process, life.keeps_calibration, []
+    process = life.process
 
     def counted(imu: ImuSegment, frames: FrameSet, calibration: Calibration) -> None:
         nonlocal begun
         begun += 1
-        if begun == 8:
-            doubtful.append(frames.t_ns)
         begin(imu, frames, calibration)
 
-    def estimated(imu: ImuSegment, tracks: FrameTracks) -> Estimate:
-        estimate = process(imu, tracks)
+    def estimated(imu: ImuSegment, tracks: FrameTracks, by: Calibration) -> Estimate:
+        estimate = process(imu, tracks, by)
         ahead[estimate.status].append(begun - sum(map(len, ahead.values())) - 1)
         return estimate
 
     odometry._frontend.begin, life.process = counted, estimated
-    life.keeps_calibration = lambda t_ns: t_ns not in doubtful and keeps(t_ns)
     list(odometry.follow(short_flight()))
     starting, flying = ahead[Status.INITIALISING], ahead[Status.TRACKING]
-    assert max(starting) == max(flying) == FRAMES_AHEAD
-    assert starting[7] == 0
+    assert set(starting) == {FRAMES_AHEAD}
+    assert flying == [FRAMES_AHEAD] * (len(flying) - FRAMES_AHEAD) + list(reversed(range(FRAMES_AHEAD)))
     assert begun == len(starting) + len(flying)
 
 

@@ -42,7 +42,6 @@ from vioframe.types import (
     LoopClosure,
     Measurement,
     NavState,
-    Status,
     Step,
 )
 from vioframe.warming import warm_up
@@ -50,11 +49,12 @@ from vioframe.warming import warm_up
 
 @dataclass(frozen=True, slots=True)
 class _Seen:
-    """A frame's points, and the seconds that they took by stage."""
+    """A frame's points, and the seconds that they took by stage; ``by`` has cut the readings, and undistorted them."""
 
     imu: ImuSegment
     frames: FrameSet
     tracks: FrameTracks
+    by: Calibration
     stage_seconds: Mapping[str, float]
 
 
@@ -146,7 +146,6 @@ class Odometry:
         self._given = calibration.lenses
         self.calibration = calibration
         """What is known of the rig by now: as given at first, then as the back-end has learned it."""
-        self._tracking, self._since_flight = False, FRAMES_AHEAD
         known = _Known(calibration, self._life.calibration)
         # After the newest estimate, and those before it.
         self._known = deque([known] * (FRAMES_AHEAD + 1), maxlen=FRAMES_AHEAD + 1)
@@ -229,11 +228,8 @@ class Odometry:
         yield from self._synchroniser.finish()
 
     def _follow_ahead(self, packets: Iterator[Packet], frontend: FrontendProcess) -> Iterator[Step]:
-        """Each step when the points of the next frames are already being followed.
-
-        Not where these depend on what comes of it: a start may find another calibration.
-        """
-        ahead: deque[Packet] = deque()
+        """Each step when the points of the next frames are already being followed."""
+        ahead: deque[tuple[ImuSegment, FrameSet, Calibration]] = deque()
         failure: Exception | None = None
         while True:
             self._use(len(ahead))
@@ -245,8 +241,8 @@ class Odometry:
                 failure = error
                 break
             frontend.begin(*packet, self._using.rig)
-            ahead.append(packet)
-            while len(ahead) > (FRAMES_AHEAD if self._tracking or self._life.keeps_calibration(packet[1].t_ns) else 0):
+            ahead.append((*packet, self._using.following))
+            if len(ahead) > FRAMES_AHEAD:
                 yield self._estimate(self._seen(*ahead.popleft(), frontend.end()))
         while ahead:
             yield self._estimate(self._seen(*ahead.popleft(), frontend.end()))
@@ -264,30 +260,24 @@ class Odometry:
             tracks = self._waiting_tracks.pop(frames.t_ns, None)
             # Those before it belong to frames that were dropped.
             self._waiting_tracks = {t_ns: kept for t_ns, kept in self._waiting_tracks.items() if t_ns > frames.t_ns}
+            by = self._using.following
             if tracks is None:
-                return self._seen(imu, frames, self._frontend.track(imu, frames, self._using.rig))
-            lenses = self._using.following.lenses
-            return _Seen(imu, frames, tracks if lenses == self._given else tracks.undistorted(*lenses), {})
+                return self._seen(imu, frames, by, self._frontend.track(imu, frames, self._using.rig))
+            return _Seen(imu, frames, tracks if by.lenses == self._given else tracks.undistorted(*by.lenses), by, {})
 
-    def _seen(self, imu: ImuSegment, frames: FrameSet, tracks: FrameTracks) -> _Seen:
+    def _seen(self, imu: ImuSegment, frames: FrameSet, by: Calibration, tracks: FrameTracks) -> _Seen:
         """What the front-end has just given for a frame."""
-        return _Seen(imu, frames, tracks, self._frontend.stage_seconds)
+        return _Seen(imu, frames, tracks, by, self._frontend.stage_seconds)
 
     def _estimate(self, seen: _Seen) -> Step:
         """Estimate from one frame that was seen."""
-        in_flight = self._tracking
         with limited_threads(), self._registry.blaming():
             begin_s = working_s()
-            estimate = self._life.process(seen.imu, seen.tracks)
+            estimate = self._life.process(seen.imu, seen.tracks, seen.by)
             backend_s = working_s() - begin_s
-        self._tracking = estimate.status is Status.TRACKING
         if estimate.calibration is not None:
             self.calibration = estimate.calibration.calibration
-        self._since_flight = 0 if in_flight else self._since_flight + 1
-        known = _Known(self.calibration, self._life.calibration)
-        # While starting another time offset or focal length may be found, and counts from the next frame on. In flight
-        # the next frames may have been cut, and their points followed, by now, with one process as with two.
-        self._known.extend([known] * (FRAMES_AHEAD + 1 if self._since_flight >= FRAMES_AHEAD else 1))
+        self._known.append(_Known(self.calibration, self._life.calibration))
         within = {f"backend.{stage}": seconds for stage, seconds in estimate.stage_seconds.items()}
         step = Step(seen.frames, seen.tracks, estimate, {**seen.stage_seconds, "backend": backend_s, **within})
         return step if self._loop_closer is None else self._corrected(step, self._loop_closer)
@@ -305,7 +295,8 @@ class Odometry:
     def _use(self, ahead: int) -> None:
         """Cut the next frame, and follow its points, by what was known ``FRAMES_AHEAD`` + 1 frames before it.
 
-        That is so with any number ``ahead`` of frames that were begun and are still to be estimated from.
+        That is so with any number ``ahead`` of frames that were begun and are still to be estimated from, so that two
+        processes give what one does.
         """
         using, self._using = self._using, self._known[ahead]
         if self._using is not using:

@@ -70,29 +70,25 @@ class LifeCycle:
 
     @property
     def calibration(self) -> Calibration:
-        """That which the next frame must come with: other than given, where something else was found while starting.
-
-        The readings count with its first camera's time offset, and reach back to where those of the frame before ended;
-        its cameras have undistorted the points.
-        """
+        """That which frames are to come with: other than given, where something else was found while starting."""
         return self._initializer.calibration
 
-    def keeps_calibration(self, t_ns: int) -> bool:
-        """Whether, ahead of the first flight, what comes of frames up to ``t_ns`` leaves the calibration as it is.
+    def process(self, imu: ImuSegment, tracks: FrameTracks, by: Calibration | None = None) -> Estimate:
+        """Begin, or follow one frame; where that fails it says so, and begins anew from where it was.
 
-        A start after a flight does not: what was learned is forgotten.
+        The readings count with the time offset of the first camera of ``by``, and reach back to where those of the
+        frame before ended; its cameras have undistorted the points. It is the :attr:`calibration`, or that of a while
+        ago where the frame has been waiting since.
         """
-        return not self._following and self._last is None and not self._initializer.may_find(t_ns)
-
-    def process(self, imu: ImuSegment, tracks: FrameTracks) -> Estimate:
-        """Begin, or follow one frame; where that fails it says so, and begins anew from where it was."""
-        tracks = tracks.finite()
+        known = self.calibration
+        by = by or known
+        tracks = (tracks if by.lenses == known.lenses else tracks.undistorted(*known.lenses)).finite()
         apart = tracks.by_others_alone and self._initial_state is None
         still = (
             not apart and self._standstill.sees_standstill(tracks.of_camera(0)) and self._options.zero_velocity_update
         )
         if not self._following:
-            return self._begin(imu, tracks)
+            return self._begin(imu, tracks, by.cameras[0].time_offset_ns)
         if self._initializer.in_doubt and self._initializer.follow(imu, tracks, still):
             self._following = False
             return Estimate(
@@ -139,14 +135,14 @@ class LifeCycle:
             self._last, self._settled = estimate.state, estimate
         return estimate
 
-    def _begin(self, imu: ImuSegment, tracks: FrameTracks) -> Estimate:
+    def _begin(self, imu: ImuSegment, tracks: FrameTracks, time_offset_ns: int) -> Estimate:
         if self._initial_state is not None:
             state, self._initial_state = self._initial_state, None
             if state.t_ns != tracks.t_ns:
                 raise ConfigError(f"the initial state is of {state.t_ns} ns, the first frame of {tracks.t_ns} ns")
             return self._begun(self._start(state, imu, tracks), Stopwatch(), "state given")
         watch = Stopwatch()
-        initial = self._initializer.add(imu, tracks)
+        initial = self._initializer.add(imu, tracks, time_offset_ns)
         watch.lap("initialise")
         if initial is None:
             refusal = self._initializer.refusal

@@ -109,12 +109,6 @@ class Initializer:
         """Why the last attempt of each method came to nothing, in one line; "" before the first and after a success."""
         return "; ".join(f"{method}: {reason}" for method, reason in self._refusals.items())
 
-    def may_find(self, t_ns: int) -> bool:
-        """Whether a frame at ``t_ns`` may change the :attr:`calibration`, or begin with one that was found before."""
-        if self._found is not None or not self._packets:
-            return True
-        return t_ns >= max(self._next_attempt_ns, self._packets[0][1].t_ns + round(_SHORTEST_WINDOW_S * NS_PER_S))
-
     def reset(self) -> None:
         """Forget everything seen, but not what was found of the calibration."""
         self._sensors.reset()
@@ -126,13 +120,18 @@ class Initializer:
         self.in_doubt = False
         self._begin_waiting()
 
-    def add(self, imu: ImuSegment, tracks: FrameTracks) -> InitialEstimate | None:
+    def add(self, imu: ImuSegment, tracks: FrameTracks, time_offset_ns: int | None = None) -> InitialEstimate | None:
         """Take one frame; an estimate whose newest state is at this frame, or None as long as none can be trusted.
 
-        Where :attr:`calibration` has another time offset after it, ``imu`` of the next call must count with it, and
-        begin where that of this call ended on the IMU's own clock, or earlier. At a frame that the first camera has no
-        part in nothing begins.
+        ``imu`` counts with ``time_offset_ns``, or with that of :attr:`calibration`, and begins where that of the call
+        before ended on the IMU's own clock, or earlier. Nothing begins at a frame whose readings still count with
+        another time offset than that, nor at one that the first camera has no part in.
         """
+        due_ns = self._calibration.cameras[0].time_offset_ns
+        late_ns = 0 if time_offset_ns is None else due_ns - time_offset_ns
+        if late_ns:
+            self._take(replace(imu, t_ns=imu.t_ns - late_ns), tracks)
+            return None
         taken = self._take(imu, tracks)
         if taken or tracks.by_others_alone:
             self._take_of_rig(imu, tracks)
@@ -236,7 +235,7 @@ class Initializer:
         return stereo.initialise(packets, calibration, known, doubted_cov)
 
     def _dynamic(self) -> InitialEstimate | None:
-        newest_ns = self._packets[-1][1].t_ns
+        newest_ns, time_offset_ns = self._packets[-1][1].t_ns, self._calibration.cameras[0].time_offset_ns
         if newest_ns < self._next_attempt_ns or _duration_s(self._packets) < _SHORTEST_WINDOW_S:
             return None
         self._wait_s = min(self._wait_s + _LATER_S, _LATEST_S)
@@ -245,8 +244,8 @@ class Initializer:
             self._take_over(found)
         try:
             for _ in range(_MOST_CONTRADICTIONS):
-                if self._packets[-1][1].t_ns != newest_ns:
-                    return None  # with another time offset, its readings are still to come
+                if self._calibration.cameras[0].time_offset_ns != time_offset_ns:
+                    return None  # the next frames may have been cut already
                 known = np.diag(self._sigma(_WITHOUT_ITS_FRAMES).stacked() ** 2)
                 calibration = replace(self._calibration, imu=self._noise_in_motion())
                 try:
