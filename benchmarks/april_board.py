@@ -12,15 +12,20 @@ from pathlib import Path
 import numpy as np
 
 from vioframe.errors import DatasetError, TrajectoryError
+from vioframe.estimation.inertial.preintegration import join_segments, preintegrate
 from vioframe.geometry import so3
 from vioframe.geometry.cameras import Camera
 from vioframe.geometry.trajectory import Trajectory
+from vioframe.geometry.two_view import rays
 from vioframe.io.calibration import packaged_calibration
 from vioframe.simulation import TrackSequence, cut_segments
 from vioframe.simulation.scenario import interpolate_poses
 from vioframe.types import Calibration, Float, FrameTracks, Int
 
 CORNERS_PER_TAG = 4
+# Neighbouring images are alike: a lens is fitted to every so many.
+_VIEWS_APART = 8
+_FRAMES_TURNED = 4
 _HALF_WINDOW_S = 0.5
 _STEP_S = 0.005
 
@@ -35,12 +40,15 @@ class BoardView:
     p_A: Float
 
 
-def april_sequence(folder: Path, calibration: Calibration | None = None) -> TrackSequence:
+def april_sequence(
+    folder: Path, calibration: Calibration | None = None, *, truth_as_calibrated: bool = False
+) -> TrackSequence:
     """The recording in ``folder``, which holds ``cam0_corners.csv.gz`` and ``imu0.csv.gz``.
 
-    ``calibration`` is EuRoC's as published unless given; it fits the corners to 0.4 px. A corner that comes back into
-    view gets a new id, as it would from any tracker; ids of one corner differ by multiples of :func:`corner_count`.
-    Raises :class:`DatasetError` where a file is missing.
+    ``calibration`` is EuRoC's as published unless given, and is what an estimator is told. Truth is by the lens that
+    fits the corners best or, ``truth_as_calibrated``, by that of ``calibration``, whose own error is then in it. A
+    corner that comes back into view gets a new id, as it would from any tracker; ids of one corner differ by multiples
+    of :func:`corner_count`. Raises :class:`DatasetError` where a file is missing.
     """
     calibration = calibration or packaged_calibration("euroc", cameras=["cam0"])
     imu_ns, imu = _read(folder / "imu0.csv.gz", range(1, 7))
@@ -50,8 +58,11 @@ def april_sequence(folder: Path, calibration: Calibration | None = None) -> Trac
     segments = cut_segments(imu_ns, gyro_B, accel_B, frames_ns)
     tracks = _tracks(views, calibration.cameras[0].model)
 
-    R_AC, p_AC = board_poses(views, calibration.cameras[0].model)
-    R_AB = R_AC @ calibration.cameras[0].R_BC.T
+    lens, R_CF = calibration.cameras[0].model, np.eye(3)
+    if not truth_as_calibrated:
+        lens, R_CF = fitted_lens(views, lens)
+    R_AF, p_AC = board_poses(views, lens)
+    R_AB = R_AF @ R_CF.T @ calibration.cameras[0].R_BC.T
     p_AB = p_AC - R_AB @ calibration.cameras[0].p_BC
     g_A = gravity_in_frame(Trajectory(frames_ns, R_AB, p_AB), imu_ns, accel_B)
     R_WA = rotation_to_vertical(g_A)
@@ -74,21 +85,40 @@ def corner_count(views: list[BoardView]) -> int:
     return 1 + max(int(view.corner.max()) for view in views)
 
 
-def board_poses(views: list[BoardView], camera: Camera) -> tuple[Float, Float]:
-    """Camera poses on the board, ``R_AC`` (N, 3, 3) and ``p_AC`` (N, 3) m.
+def fitted_lens(views: list[BoardView], camera: Camera) -> tuple[Camera, Float]:
+    """The radtan lens F that explains the corners of some ``views`` best, from ``camera`` on, and R_CF (3, 3) to that.
 
-    Infinitesimal plane-based pose estimation (Collins and Bartoli 2014) gives the two candidates that a plane allows;
-    the one with the smaller reprojection error is refined by Levenberg-Marquardt.
+    A lens that is off to one side and a camera that is turned to the other look nearly alike: R_CF is what brings the
+    rays of both together. (Zhang, "A flexible new technique for camera calibration", PAMI 2000.)
     """
     import cv2
 
-    R_AC, p_AC = np.empty((len(views), 3, 3)), np.empty((len(views), 3))
+    some = views[::_VIEWS_APART]
+    points, pixels = ([np.float32(a) for a in seen] for seen in ([v.p_A for v in some], [v.xy for v in some]))
+    k1_to_p2 = np.append(camera.distortion, 0.0)  # and k3, which stays zero
+    flags = cv2.CALIB_USE_INTRINSIC_GUESS | cv2.CALIB_FIX_K3
+    _, K, distortion, _, _ = cv2.calibrateCamera(points, pixels, camera.resolution, camera.K, k1_to_p2, flags=flags)
+    fitted = camera.with_intrinsics(np.append(K[[0, 1, 0, 1], [0, 1, 2, 2]], distortion.ravel()[:4]))
+    rays_C, rays_F = (rays(lens.undistort(np.concatenate([v.xy for v in some]))) for lens in (camera, fitted))
+    rays_C, rays_F = (seen / np.linalg.norm(seen, axis=1, keepdims=True) for seen in (rays_C, rays_F))
+    return fitted, so3.project(rays_C.T @ rays_F)
+
+
+def board_poses(views: list[BoardView], camera: Camera) -> tuple[Float, Float]:
+    """Poses on the board of a ``camera`` with a radtan lens, ``R_AC`` (N, 3, 3) and ``p_AC`` (N, 3) m.
+
+    Infinitesimal plane-based pose estimation (Collins and Bartoli 2014) gives the two candidates that a plane allows;
+    the one with the smaller reprojection error is refined by Levenberg-Marquardt, in pixels.
+    """
+    import cv2
+
+    R_AC, p_AC, distortion = np.empty((len(views), 3, 3)), np.empty((len(views), 3)), np.array(camera.distortion)
     for k, view in enumerate(views):
         points = np.ascontiguousarray(view.p_A)
-        rays = camera.undistort(view.xy)
+        undistorted = camera.undistort(view.xy)
         # Candidates come ordered by reprojection error.
-        _, rvecs, tvecs, _ = cv2.solvePnPGeneric(points, rays, np.eye(3), None, flags=cv2.SOLVEPNP_IPPE)
-        rvec, tvec = cv2.solvePnPRefineLM(points, rays, np.eye(3), np.zeros(4), rvecs[0], tvecs[0])
+        _, rvecs, tvecs, _ = cv2.solvePnPGeneric(points, undistorted, np.eye(3), None, flags=cv2.SOLVEPNP_IPPE)
+        rvec, tvec = cv2.solvePnPRefineLM(points, view.xy, camera.K, distortion, rvecs[0], tvecs[0])
         R_AC[k] = so3.exp(rvec.ravel()).T
         p_AC[k] = -R_AC[k] @ tvec.ravel()
     return R_AC, p_AC
@@ -98,6 +128,20 @@ def reprojection_px(views: list[BoardView], camera: Camera, R_AC: Float, p_AC: F
     """(N,) distances in px between all corners as seen and as projected from these poses."""
     errors = [camera.project((v.p_A - p) @ R) - v.xy for v, R, p in zip(views, R_AC, p_AC, strict=True)]
     return np.asarray(np.linalg.norm(np.concatenate(errors), axis=1))
+
+
+def turned_otherwise(sequence: TrackSequence) -> float:
+    """The median angle, rad, by which truth and gyroscope disagree over 0.2 s, the bias taken out as the mean.
+
+    The gyroscope has no part in the truth, and an error of the lens none in the gyroscope.
+    """
+    R_WB, segments = sequence.ground_truth.R_WB, [imu for imu, _ in sequence.packets]
+    off = []
+    for k in range(0, len(R_WB) - _FRAMES_TURNED, _FRAMES_TURNED):
+        readings = join_segments(segments[k + 1 : k + 1 + _FRAMES_TURNED])
+        turn = preintegrate(readings, np.zeros(3), np.zeros(3), sequence.calibration.imu).dR
+        off.append(so3.log(R_WB[k + _FRAMES_TURNED].T @ R_WB[k] @ turn))
+    return float(np.median(np.linalg.norm(off - np.mean(off, axis=0), axis=1)))
 
 
 def gravity_in_frame(poses: Trajectory, imu_ns: Int, accel_B: Float) -> Float:

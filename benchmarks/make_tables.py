@@ -252,11 +252,13 @@ def april() -> str:
     shown = [
         {
             "back-end": f"`{row.backend}`",
-            "path": f"{row.path_m:.1f} m",
             "initialised after": f"{row.initialised_s:.2f} s",
             "resets": f"{row.resets}",
-            "ATE": length(row.ate_m),
             "ms a frame, tracks given": f"{row.cpu_ms:.1f}",
+            "truth by the lens": row.lens,
+            "fits the corners to": f"{row.pnp_px:.2f} px",
+            "turns unlike the gyroscope by": f"{row.turned_deg:.2f} deg",
+            "ATE": length(row.ate_m),
         }
         for row in rows.itertuples()
     ]

@@ -152,7 +152,7 @@ def test_vicon_room_at_rest(shared_data, tmp_path, backend, limit_m):
     assert drift_m <= limit_m
 
 
-@pytest.mark.parametrize(("backend", "limit_m"), [("msckf", 0.016), ("sliding_window", 0.016)])
+@pytest.mark.parametrize(("backend", "limit_m"), [("msckf", 0.013), ("sliding_window", 0.013)])
 def test_april_grid_under_strong_motion(shared_data, backend, limit_m):
     row = fly_tracks(april_sequence(shared_data / "euroc_imu_april"), backend)
     assert row["completion"] == 1.0

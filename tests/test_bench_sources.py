@@ -1,6 +1,7 @@
 """Track sources of the benchmarks, and what is made of a back-end's run on them."""
 
 import json
+from dataclasses import replace
 from io import StringIO
 
 import numpy as np
@@ -10,10 +11,12 @@ from april_board import (
     april_sequence,
     board_poses,
     corner_count,
+    fitted_lens,
     gravity_in_frame,
     read_board_views,
     reprojection_px,
     rotation_to_vertical,
+    turned_otherwise,
 )
 from common import table
 from trajectory_helpers import run_of
@@ -21,6 +24,7 @@ from trajectory_helpers import run_of
 from vioframe.bench import backend_row, record
 from vioframe.errors import DatasetError, TrajectoryError
 from vioframe.geometry import so3
+from vioframe.geometry.cameras import intrinsics_of
 from vioframe.geometry.trajectory import Trajectory
 from vioframe.io.calibration import packaged_calibration
 from vioframe.simulation import simulated_sequence
@@ -99,14 +103,33 @@ def test_board_poses_recover_a_known_camera():
     )
 
 
-def test_april_corners_fit_the_published_calibration(april, april_tracks):
-    views = read_board_views(april)
+def test_a_lens_is_found_from_a_board_and_how_it_is_turned():
+    """One whose centre is 6 px aside, seen in views that the published lens begins with."""
+    rng, published = np.random.default_rng(1), CALIBRATION.cameras[0].model
+    true = replace(published, cx=published.cx - 6.0, fx=published.fx - 2.0, distortion=(-0.31, 0.1, 0.0, 0.0003))
+    p_A = 0.06 * np.array([[x, y, 0.0] for y in range(12) for x in range(12)])
+    views = []
+    for k in range(160):
+        R_AC = so3.exp(rng.uniform(-0.5, 0.5, 3))
+        p_AC = np.array([0.33, 0.33, 0.0]) - R_AC @ [*rng.uniform(-0.2, 0.2, 2), rng.uniform(0.7, 1.3)]
+        xy = true.project((p_A - p_AC) @ R_AC)
+        keep = true.contains(xy)
+        views.append(BoardView(k, np.flatnonzero(keep), xy[keep], p_A[keep]))
+    fitted, R_CF = fitted_lens(views, published)
+    np.testing.assert_allclose(intrinsics_of(fitted)[1], intrinsics_of(true)[1], rtol=1e-4, atol=1e-4)
+    # What the published lens sees 6 px to the right of its centre lies straight ahead of a camera turned that way.
+    assert so3.log(R_CF) @ [0.0, 1.0, 0.0] == pytest.approx(-6.0 / published.fx, abs=2e-3)
+
+
+def test_april_corners_fit_the_published_calibration_and_a_lens_of_their_own(april, april_tracks):
+    views, published = read_board_views(april), CALIBRATION.cameras[0].model
     assert len(views) == 720
-    R_AC, p_AC = board_poses(views, CALIBRATION.cameras[0].model)
-    assert np.sqrt(np.mean(reprojection_px(views, CALIBRATION.cameras[0].model, R_AC, p_AC) ** 2)) < 0.42
+    fitted, _ = fitted_lens(views, published)
+    for lens, limit_px in ((published, 0.42), (fitted, 0.37)):
+        assert np.sqrt(np.mean(reprojection_px(views, lens, *board_poses(views, lens)) ** 2)) < limit_px
     # The first image is 15 ms older than the first reading.
     assert len(april_tracks.packets) == 719
-    assert april_tracks.ground_truth.path_length_m == pytest.approx(20.0, abs=0.1)
+    assert april_tracks.ground_truth.path_length_m == pytest.approx(19.77, abs=0.1)
 
 
 def test_april_ids_are_corners_and_new_after_every_absence(april, april_tracks):
@@ -126,20 +149,12 @@ def test_april_ids_are_corners_and_new_after_every_absence(april, april_tracks):
     assert returned > 100
 
 
-def test_april_truth_agrees_with_the_gyroscope_and_the_vertical(april_tracks):
-    """Rotation over 0.2 s by PnP and by gyroscope, and the mean specific force, which must point up."""
-    R_WB, step = april_tracks.ground_truth.R_WB, 4
-    bias = np.array([-0.0022, 0.0250, 0.0762])
-    residual, turned = [], []
-    for k in range(0, len(R_WB) - step, step):
-        turn = np.eye(3)
-        for imu, _ in april_tracks.packets[k + 1 : k + 1 + step]:
-            for rate, dt in zip(0.5 * (imu.gyro_B[1:] + imu.gyro_B[:-1]) - bias, imu.dt, strict=True):
-                turn = turn @ so3.exp(rate * dt)
-        turned.append(np.linalg.norm(so3.log(turn)))
-        residual.append(np.linalg.norm(so3.log(R_WB[k + step].T @ R_WB[k] @ turn)))
-    assert np.median(residual) < 5e-3
-    assert max(turned) > 0.25
+def test_april_truth_agrees_with_the_gyroscope_and_the_vertical(april, april_tracks):
+    """Over 0.2 s, by more than a quarter radian at times; by the published lens it does so less well."""
+    R_WB = april_tracks.ground_truth.R_WB
+    assert max(np.linalg.norm(so3.log(a.T @ b)) for a, b in zip(R_WB, R_WB[4:], strict=False)) > 0.25
+    by_published = turned_otherwise(april_sequence(april, truth_as_calibrated=True))
+    assert turned_otherwise(april_tracks) < 0.75 * by_published < 2.5e-3
     force_W = np.mean([R @ imu.accel_B[-1] for R, (imu, _) in zip(R_WB, april_tracks.packets, strict=True)], axis=0)
     assert np.degrees(np.arccos(force_W[2] / np.linalg.norm(force_W))) < 2.0
 
