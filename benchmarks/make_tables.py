@@ -254,7 +254,6 @@ def april() -> str:
             "back-end": f"`{row.backend}`",
             "initialised after": f"{row.initialised_s:.2f} s",
             "resets": f"{row.resets}",
-            "ms a frame, tracks given": f"{row.cpu_ms:.1f}",
             "truth by the lens": row.lens,
             "fits the corners to": f"{row.pnp_px:.2f} px",
             "turns unlike the gyroscope by": f"{row.turned_deg:.2f} deg",
