@@ -10,8 +10,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from position_clock import position_clock
 
-from vioframe.errors import DatasetError, TrajectoryError
+from vioframe.errors import DatasetError
 from vioframe.estimation.inertial.preintegration import join_segments, preintegrate
 from vioframe.geometry import so3
 from vioframe.geometry.cameras import Camera
@@ -26,8 +27,7 @@ CORNERS_PER_TAG = 4
 # Neighbouring images are alike: a lens is fitted to every so many.
 _VIEWS_APART = 8
 _FRAMES_TURNED = 4
-_HALF_WINDOW_S = 0.5
-_STEP_S = 0.005
+_STEP_NS = 5_000_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -145,34 +145,10 @@ def turned_otherwise(sequence: TrackSequence) -> float:
 
 
 def gravity_in_frame(poses: Trajectory, imu_ns: Int, accel_B: Float) -> Float:
-    """Gravity (3,) m/s^2 in the frame A of ``poses`` (R_AB, p_AB), from the accelerometer's (N, 3) readings.
-
-    Over a window of half-width h the second difference of position is the triangle-weighted mean of the acceleration:
-
-        (p(t + h) - 2 p(t) + p(t - h)) / h^2 = sum_i w_i R_AB(t_i) (accel_B(t_i) - ba) + g_A,
-
-    which is linear in the constant bias ``ba`` and in ``g_A``. Nothing is differentiated: at h = 0.5 s a millimetre of
-    position noise counts as 10 mm/s^2, and a least-squares solution over the recording takes the mean of that.
-    """
-    half = round(_HALF_WINDOW_S / _STEP_S)
-    begin, end = max(poses.t_ns[0], imu_ns[0]), min(poses.t_ns[-1], imu_ns[-1])
-    grid_ns = np.arange(begin, end, round(_STEP_S * 1e9))
-    if len(grid_ns) <= 4 * half:
-        raise TrajectoryError(f"finding the vertical needs more than {4 * _HALF_WINDOW_S:g} s of motion")
-    R_AB, p_AB = interpolate_poses(poses.t_ns, poses.R_WB, poses.p_WB, grid_ns)
-    seconds = (imu_ns - imu_ns[0]) * 1e-9
-    grid_s = (grid_ns - imu_ns[0]) * 1e-9
-    accel = np.column_stack([np.interp(grid_s, seconds, column) for column in accel_B.T])
-
-    weights = half - np.abs(np.arange(-half, half + 1.0))
-    weights /= weights.sum()
-    measured = (p_AB[2 * half :] - 2.0 * p_AB[half:-half] + p_AB[: -2 * half]) / _HALF_WINDOW_S**2
-    mean_accel = _weighted(np.einsum("nij,nj->ni", R_AB, accel), weights)
-    mean_R = _weighted(R_AB.reshape(-1, 9), weights).reshape(-1, 3, 3)
-    # measured - mean_accel = -mean_R ba + g
-    A = np.concatenate([-mean_R, np.tile(np.eye(3), (len(mean_R), 1, 1))], axis=2)
-    solution = np.linalg.lstsq(A.reshape(-1, 6), (measured - mean_accel).ravel(), rcond=None)[0]
-    return np.asarray(solution[3:])
+    """Gravity (3,) m/s^2 in the frame A of ``poses`` (R_AB, p_AB), from the accelerometer's (N, 3) readings."""
+    often_ns = np.arange(poses.t_ns[0], poses.t_ns[-1], _STEP_NS)
+    often = Trajectory(often_ns, *interpolate_poses(poses.t_ns, poses.R_WB, poses.p_WB, often_ns))
+    return position_clock(often, imu_ns, accel_B).g_W
 
 
 def rotation_to_vertical(g_A: Float) -> Float:
@@ -205,8 +181,3 @@ def _read(path: Path, columns: range) -> tuple[Int, Float]:
         raise DatasetError(f"{path} is missing; the AprilGrid recording is cam0_corners.csv.gz and imu0.csv.gz")
     t_ns = np.loadtxt(path, delimiter=",", usecols=0, dtype=np.int64)
     return t_ns, np.loadtxt(path, delimiter=",", usecols=columns, ndmin=2)
-
-
-def _weighted(values: Float, weights: Float) -> Float:
-    """Running mean (N - K + 1, C) of ``values`` (N, C) under ``weights`` (K,)."""
-    return np.column_stack([np.convolve(column, weights, "valid") for column in values.T])

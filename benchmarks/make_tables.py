@@ -264,6 +264,26 @@ def april() -> str:
     return markdown(shown) + source(rows)
 
 
+def truth_clocks() -> str:
+    """How late positions of the truth are, and the clip that was flown against it as stamped and on time."""
+    rows = recorded("truth_clocks.json")
+    shown = [
+        {
+            "recording": row["recording"],
+            "positions late by": f"{row['late_ms']:.1f} ± {row['sigma_ms']:.1f} ms",
+            "at its speed": length(1e-3 * row["late_ms"] * row["speed_m_s"]),
+            **{
+                f"`{backend}`": "-"
+                if pd.isna(row[f"{backend}.ate_mm"])
+                else " -> ".join(length(1e-3 * row[f"{backend}.{name}"]) for name in ("ate_mm", "on_time_mm"))
+                for backend in ("msckf", "sliding_window")
+            },
+        }
+        for row in rows.to_dict("records")
+    ]
+    return markdown(shown) + source(rows)
+
+
 def rolling_shutter() -> str:
     """ATE with a rolling shutter over that with a global one, and the readout that was estimated."""
     rows = recorded("rolling_shutter_*.json")
@@ -622,6 +642,7 @@ FIGURES: dict[str, Callable[[], str]] = {
             take_off,
             loops,
             april,
+            truth_clocks,
             frontend,
             tracks,
             whole_runs,

@@ -19,6 +19,7 @@ from april_board import (
     turned_otherwise,
 )
 from common import table
+from position_clock import position_clock, with_positions_of_later
 from trajectory_helpers import run_of
 
 from vioframe.bench import backend_row, record
@@ -28,6 +29,7 @@ from vioframe.geometry.cameras import intrinsics_of
 from vioframe.geometry.trajectory import Trajectory
 from vioframe.io.calibration import packaged_calibration
 from vioframe.simulation import simulated_sequence
+from vioframe.simulation.scenario import interpolate_poses
 from vioframe.types import Estimate, NavState, Status, g_W
 
 CALIBRATION = packaged_calibration("euroc", cameras=["cam0"])
@@ -62,6 +64,36 @@ def test_gravity_is_found_in_a_turned_frame(seed):
     assert np.linalg.norm(g_A) == pytest.approx(9.81, abs=0.03)
     assert np.degrees(np.arccos(g_A @ (R_AW @ g_W) / np.linalg.norm(g_A) / 9.81)) < 0.1
     np.testing.assert_allclose(rotation_to_vertical(g_A) @ g_A, [0, 0, -np.linalg.norm(g_A)], atol=1e-12)
+
+
+@pytest.mark.parametrize("late_ms", [-20.0, 0.0, 7.0])
+def test_the_clock_of_positions_is_found_and_its_error_is_as_it_says(late_ms):
+    """Of noisy positions and of noisy, biased readings."""
+    off = []
+    for seed in range(8):
+        sequence = simulated_sequence("figure_eight", seed=seed, max_points=1, bias_accel_B=np.array([0.2, -0.1, 0.15]))
+        truth, (t_ns, _, accel_B) = sequence.ground_truth, rows_of([imu for imu, _ in sequence.packets[1:]])
+        often_ns = np.arange(truth.t_ns[0], truth.t_ns[-1], 5_000_000)
+        R_WB, p_WB = interpolate_poses(truth.t_ns, truth.R_WB, truth.p_WB, often_ns)
+        noisy = p_WB + np.random.default_rng(seed).normal(0.0, 2e-3, p_WB.shape)
+        moved_ns = often_ns + round(late_ms * 1e6)
+        seen = (often_ns >= moved_ns[0]) & (often_ns <= moved_ns[-1])
+        late = np.column_stack([np.interp(often_ns[seen], moved_ns, column) for column in noisy.T])
+        clock = position_clock(Trajectory(often_ns[seen], R_WB[seen], late), t_ns, accel_B)
+        off.append((1e3 * clock.late_s - late_ms) / (1e3 * clock.sigma_s))
+        assert 1e3 * clock.sigma_s < 1.0
+        on_time = with_positions_of_later(Trajectory(often_ns[seen], R_WB[seen], late), clock.late_s)
+        due = np.column_stack([np.interp(on_time.t_ns, often_ns, column) for column in p_WB.T])
+        assert np.sqrt(((on_time.p_WB - due) ** 2).sum(axis=1).mean()) < 5e-3
+    assert np.sqrt(np.mean(np.square(off))) < 1.7
+
+
+def test_positions_far_off_in_time_have_no_clock():
+    """By 0.3 s."""
+    sequence = simulated_sequence("figure_eight", max_points=1)
+    truth, (t_ns, _, accel_B) = sequence.ground_truth, rows_of([imu for imu, _ in sequence.packets[1:]])
+    with pytest.raises(TrajectoryError, match="stamps and axes"):
+        position_clock(Trajectory(truth.t_ns[6:], truth.R_WB[6:], truth.p_WB[:-6]), t_ns, accel_B)
 
 
 def test_gravity_needs_some_motion():
