@@ -271,7 +271,7 @@ def truth_clocks() -> str:
         {
             "recording": row["recording"],
             "positions late by": f"{row['late_ms']:.1f} ± {row['sigma_ms']:.1f} ms",
-            "at its speed": length(1e-3 * row["late_ms"] * row["speed_m_s"]),
+            "at its speed": length(1e-3 * abs(row["late_ms"]) * row["speed_m_s"]),
             **{
                 f"`{backend}`": "-"
                 if pd.isna(row[f"{backend}.ate_mm"])
