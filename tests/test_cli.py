@@ -111,6 +111,19 @@ def test_nothing_heavy_is_loaded_before_it_is_needed(statement):
     assert not loaded & (HEAVY if statement in WITHOUT_NUMPY else HEAVY - {"numpy"})
 
 
+def test_what_scipy_copies_of_numpy_is_loaded_when_somebody_looks_into_it():
+    code = """
+import sys, vioframe.pipeline
+assert "scipy.linalg" in sys.modules
+assert not {"numpy.f2py.f2py2e", "numpy.testing._private.utils", "unittest"} & set(sys.modules)
+import numpy.f2py
+from numpy.testing import assert_array_equal
+assert_array_equal([1], [1])
+assert callable(numpy.f2py.main)
+"""
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
 def test_module_and_script_are_the_same():
     done = subprocess.run([sys.executable, "-m", "vioframe", "--version"], check=True, capture_output=True, text=True)
     assert done.stdout == f"vioframe, version {vioframe.__version__}\n"
