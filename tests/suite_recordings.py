@@ -28,10 +28,10 @@ from vioframe.types import Estimate, NavState, Status
 usual = LifeCycle.process
 
 
-def from_the_first_frame(self, imu, tracks):
+def from_the_first_frame(self, imu, tracks, by=None):
     # There is too little in small images to begin with, and it is no matter here.
     if not isinstance(self._backend, Counting):
-        return usual(self, imu, tracks)
+        return usual(self, imu, tracks, by)
     return replace(self._backend.process(imu, tracks, False), calibration=self._known)
 
 
