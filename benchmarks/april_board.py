@@ -24,7 +24,7 @@ from vioframe.simulation.scenario import interpolate_poses
 from vioframe.types import Calibration, Float, FrameTracks, Int
 
 CORNERS_PER_TAG = 4
-# Neighbouring images are alike: a lens is fitted to every so many. Few see the board at the edge, where a lens bends most.
+# A lens is fitted to every so many views: neighbours are alike, but few see the board at the edge of the image.
 _VIEWS_APART = 4
 _FRAMES_TURNED = 4
 _STEP_NS = 5_000_000
