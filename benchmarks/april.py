@@ -15,6 +15,7 @@ from april_board import april_sequence, board_poses, fitted_lens, read_board_vie
 from common import BACKEND_COLUMNS, backend_rows, benchmark, present
 
 from vioframe.bench import Row
+from vioframe.io.calibration import packaged_calibration
 from vioframe.simulation import TrackSequence
 
 
@@ -24,15 +25,13 @@ def main(data: Path, backend: str, assignments: tuple[str, ...], keep: bool) -> 
     folder = data / "euroc_imu_april"
 
     def sequences() -> Iterator[tuple[Row, TrackSequence]]:
-        views = read_board_views(folder)
-        for lens in ("published", "fitted"):
-            sequence = april_sequence(folder, truth_as_calibrated=lens == "published")
-            camera = sequence.calibration.cameras[0].model
-            if lens == "fitted":
-                camera, _ = fitted_lens(views, camera)
-            pixels = reprojection_px(views, camera, *board_poses(views, camera))
+        views, published = read_board_views(folder), packaged_calibration("euroc", cameras=["cam0"]).cameras[0].model
+        lenses = {"published": (published, np.eye(3)), "fitted": fitted_lens(views, published)}
+        for name, lens in lenses.items():
+            sequence = april_sequence(folder, truth_by=lens)
+            pixels = reprojection_px(views, lens[0], *board_poses(views, lens[0]))
             pnp_px, turned_deg = float(np.sqrt(np.mean(pixels**2))), float(np.rad2deg(turned_otherwise(sequence)))
-            yield {"lens": lens, "pnp_px": pnp_px, "turned_deg": turned_deg}, sequence
+            yield {"lens": name, "pnp_px": pnp_px, "turned_deg": turned_deg}, sequence
 
     of_truth = {"lens": "", "pnp_px": ".3f", "turned_deg": ".3f"}
     present(

@@ -41,26 +41,25 @@ class BoardView:
 
 
 def april_sequence(
-    folder: Path, calibration: Calibration | None = None, *, truth_as_calibrated: bool = False
+    folder: Path, calibration: Calibration | None = None, truth_by: tuple[Camera, Float] | None = None
 ) -> TrackSequence:
     """The recording in ``folder``, which holds ``cam0_corners.csv.gz`` and ``imu0.csv.gz``.
 
-    ``calibration`` is EuRoC's as published unless given, and is what an estimator is told. Truth is by the lens that
-    fits the corners best or, ``truth_as_calibrated``, by that of ``calibration``, whose own error is then in it. A
-    corner that comes back into view gets a new id, as it would from any tracker; ids of one corner differ by multiples
-    of :func:`corner_count`. Raises :class:`DatasetError` where a file is missing.
+    ``calibration`` is EuRoC's as published unless given, and is what an estimator is told. Truth is by the
+    :func:`fitted_lens` or by another, ``truth_by``, with R_CF likewise. A corner that comes back into view gets a new
+    id, as it would from any tracker; ids of one corner differ by multiples of :func:`corner_count`. Raises
+    :class:`DatasetError` where a file is missing.
     """
     calibration = calibration or packaged_calibration("euroc", cameras=["cam0"])
     imu_ns, imu = _read(folder / "imu0.csv.gz", range(1, 7))
     gyro_B, accel_B = imu[:, :3], imu[:, 3:]
-    views = [v for v in read_board_views(folder) if imu_ns[0] <= v.t_ns <= imu_ns[-1]]
+    views = read_board_views(folder)
+    lens, R_CF = truth_by or fitted_lens(views, calibration.cameras[0].model)
+    views = [v for v in views if imu_ns[0] <= v.t_ns <= imu_ns[-1]]
     frames_ns = np.array([view.t_ns for view in views], np.int64)
     segments = cut_segments(imu_ns, gyro_B, accel_B, frames_ns)
     tracks = _tracks(views, calibration.cameras[0].model)
 
-    lens, R_CF = calibration.cameras[0].model, np.eye(3)
-    if not truth_as_calibrated:
-        lens, R_CF = fitted_lens(views, lens)
     R_AF, p_AC = board_poses(views, lens)
     R_AB = R_AF @ R_CF.T @ calibration.cameras[0].R_BC.T
     p_AB = p_AC - R_AB @ calibration.cameras[0].p_BC
@@ -93,7 +92,7 @@ def fitted_lens(views: list[BoardView], camera: Camera) -> tuple[Camera, Float]:
     """
     import cv2
 
-    some = views[::_VIEWS_APART]
+    some = views[1::_VIEWS_APART]  # the first is older than any reading
     points, pixels = ([np.float32(a) for a in seen] for seen in ([v.p_A for v in some], [v.xy for v in some]))
     k1_to_p2 = np.append(camera.distortion, 0.0)  # and k3, which stays zero
     flags = cv2.CALIB_USE_INTRINSIC_GUESS | cv2.CALIB_FIX_K3

@@ -17,6 +17,7 @@ import numpy as np
 
 from vioframe.errors import TrajectoryError
 from vioframe.geometry.trajectory import Trajectory
+from vioframe.simulation.scenario import linear
 from vioframe.types import NS_PER_S, Float, Int
 
 # Within shorter windows a truth that was smoothed with the IMU's help follows the IMU, whatever its positions do.
@@ -43,14 +44,13 @@ def position_clock(truth: Trajectory, imu_ns: Int, accel_B: Float) -> PositionCl
     positions seem to be off by more than a tenth of a second: then something else is wrong.
     """
     half = round(_HALF_WINDOW_S / _STEP_S)
-    margin_ns = round(_LARGEST_S * NS_PER_S)
+    margin_ns = round((_LARGEST_S + _STEP_S) * NS_PER_S)
     begin, end = max(truth.t_ns[0], imu_ns[0]) + margin_ns, min(truth.t_ns[-1], imu_ns[-1]) - margin_ns
     grid_ns = np.arange(begin, end, round(_STEP_S * NS_PER_S))
     if len(grid_ns) <= 4 * half:
         raise TrajectoryError(f"the clock of positions needs more than {4 * _HALF_WINDOW_S:g} s of motion")
     R_WB = truth.at(grid_ns).R_WB
-    grid_s, imu_s, truth_s = ((t_ns - grid_ns[0]) * 1e-9 for t_ns in (grid_ns, imu_ns, truth.t_ns))
-    force_W = (R_WB @ _columns(grid_s, imu_s, accel_B)[..., None])[..., 0]
+    force_W = (R_WB @ linear(imu_ns, accel_B, grid_ns)[..., None])[..., 0]
 
     triangle = half - np.abs(np.arange(-half, half + 1.0))
     triangle /= triangle.sum()
@@ -58,7 +58,7 @@ def position_clock(truth: Trajectory, imu_ns: Int, accel_B: Float) -> PositionCl
     eye = np.broadcast_to(np.eye(3), turned.shape)
     late_s = 0.0
     for _ in range(_STEPS):
-        p_W, before, after = (_columns(grid_s + late_s + d, truth_s, truth.p_WB) for d in (0.0, -_STEP_S, _STEP_S))
+        p_W, before, after = (truth.at(_later(grid_ns, late_s + d)).p_WB for d in (0.0, -_STEP_S, _STEP_S))
         # seen + by_lateness step = felt - turned bias + gravity
         seen, by_lateness = (_second_difference(a, half) for a in (p_W, (after - before) / (2.0 * _STEP_S)))
         A = np.concatenate([-turned, eye, -by_lateness[..., None]], axis=2).reshape(-1, 7)
@@ -75,9 +75,8 @@ def position_clock(truth: Trajectory, imu_ns: Int, accel_B: Float) -> PositionCl
     return PositionClock(late_s, sigma_s, np.asarray(x[3:6]))
 
 
-def _columns(at_s: Float, t_s: Float, values: Float) -> Float:
-    """``values`` (N, D), which are those at ``t_s`` (N,), at ``at_s`` (M,): (M, D)."""
-    return np.column_stack([np.interp(at_s, t_s, column) for column in values.T])
+def _later(t_ns: Int, seconds: float) -> Int:
+    return t_ns + round(seconds * NS_PER_S)
 
 
 def _weighted(values: Float, weights: Float) -> Float:
@@ -93,6 +92,6 @@ def _second_difference(values: Float, half: int) -> Float:
 
 def with_positions_of_later(truth: Trajectory, late_s: float) -> Trajectory:
     """Each pose with the position of ``late_s`` after it in its place; those are gone that have none."""
-    at_ns = truth.t_ns + round(late_s * NS_PER_S)
-    kept = truth.select(truth.covers(at_ns))
-    return replace(kept, p_WB=truth.at(at_ns[truth.covers(at_ns)]).p_WB)
+    at_ns = _later(truth.t_ns, late_s)
+    kept = truth.covers(at_ns)
+    return replace(truth.select(kept), p_WB=truth.at(at_ns[kept]).p_WB)

@@ -29,7 +29,7 @@ from vioframe.geometry.cameras import intrinsics_of
 from vioframe.geometry.trajectory import Trajectory
 from vioframe.io.calibration import packaged_calibration
 from vioframe.simulation import simulated_sequence
-from vioframe.simulation.scenario import interpolate_poses
+from vioframe.simulation.scenario import interpolate_poses, linear
 from vioframe.types import Estimate, NavState, Status, g_W
 
 CALIBRATION = packaged_calibration("euroc", cameras=["cam0"])
@@ -78,12 +78,12 @@ def test_the_clock_of_positions_is_found_and_its_error_is_as_it_says(late_ms):
         noisy = p_WB + np.random.default_rng(seed).normal(0.0, 2e-3, p_WB.shape)
         moved_ns = often_ns + round(late_ms * 1e6)
         seen = (often_ns >= moved_ns[0]) & (often_ns <= moved_ns[-1])
-        late = np.column_stack([np.interp(often_ns[seen], moved_ns, column) for column in noisy.T])
+        late = linear(moved_ns, noisy, often_ns[seen])
         clock = position_clock(Trajectory(often_ns[seen], R_WB[seen], late), t_ns, accel_B)
         off.append((1e3 * clock.late_s - late_ms) / (1e3 * clock.sigma_s))
         assert 1e3 * clock.sigma_s < 1.0
         on_time = with_positions_of_later(Trajectory(often_ns[seen], R_WB[seen], late), clock.late_s)
-        due = np.column_stack([np.interp(on_time.t_ns, often_ns, column) for column in p_WB.T])
+        due = linear(often_ns, p_WB, on_time.t_ns)
         assert np.sqrt(((on_time.p_WB - due) ** 2).sum(axis=1).mean()) < 5e-3
     assert np.sqrt(np.mean(np.square(off))) < 1.7
 
@@ -110,20 +110,26 @@ def test_any_direction_can_be_brought_to_the_vertical(g_A):
     np.testing.assert_allclose(R_WA @ R_WA.T, np.eye(3), atol=1e-12)
 
 
+BOARD_CENTRE = np.array([0.33, 0.33, 0.0])
+
+
+def seen_board(camera, R_AC, p_AC):
+    """What a ``camera`` at the poses (N, 3, 3) and (N, 3) m sees of a board of 12 x 12 corners, without noise."""
+    p_A = 0.06 * np.array([[x, y, 0.0] for y in range(12) for x in range(12)])
+    views = []
+    for k, (R, p) in enumerate(zip(R_AC, p_AC, strict=True)):
+        xy = camera.project((p_A - p) @ R)
+        keep = camera.contains(xy)
+        views.append(BoardView(k, np.flatnonzero(keep), xy[keep], p_A[keep]))
+    return views
+
+
 def test_board_poses_recover_a_known_camera():
     """A synthetic board, seen without noise and with 0.3 px: exact, and within a few millimetres at 1.2 m."""
     rng = np.random.default_rng(0)
-    p_A = 0.06 * np.array([[x, y, 0.0] for y in range(12) for x in range(12)])
-    views, R_true, p_true = [], [], []
-    for k in range(20):
-        # Looking at the board's centre from its front, tilted by up to 30 deg.
-        R_AC = so3.exp(rng.uniform(-0.5, 0.5, 3))
-        p_AC = np.array([0.33, 0.33, 0.0]) - R_AC @ [0.0, 0.0, 1.2]
-        xy = CALIBRATION.cameras[0].model.project((p_A - p_AC) @ R_AC)
-        keep = CALIBRATION.cameras[0].model.contains(xy)
-        views.append(BoardView(k, np.flatnonzero(keep), xy[keep], p_A[keep]))
-        R_true.append(R_AC)
-        p_true.append(p_AC)
+    R_true = so3.exp(rng.uniform(-0.5, 0.5, (20, 3)))  # tilted by up to 30 deg
+    p_true = BOARD_CENTRE - R_true @ [0.0, 0.0, 1.2]
+    views = seen_board(CALIBRATION.cameras[0].model, R_true, p_true)
     R_AC, p_AC = board_poses(views, CALIBRATION.cameras[0].model)
     np.testing.assert_allclose(R_AC, R_true, atol=1e-6)
     np.testing.assert_allclose(p_AC, p_true, atol=1e-6)
@@ -139,14 +145,9 @@ def test_a_lens_is_found_from_a_board_and_how_it_is_turned():
     """One whose centre is 6 px aside, seen in views that the published lens begins with."""
     rng, published = np.random.default_rng(1), CALIBRATION.cameras[0].model
     true = replace(published, cx=published.cx - 6.0, fx=published.fx - 2.0, distortion=(-0.31, 0.1, 0.0, 0.0003))
-    p_A = 0.06 * np.array([[x, y, 0.0] for y in range(12) for x in range(12)])
-    views = []
-    for k in range(160):
-        R_AC = so3.exp(rng.uniform(-0.5, 0.5, 3))
-        p_AC = np.array([0.33, 0.33, 0.0]) - R_AC @ [*rng.uniform(-0.2, 0.2, 2), rng.uniform(0.7, 1.3)]
-        xy = true.project((p_A - p_AC) @ R_AC)
-        keep = true.contains(xy)
-        views.append(BoardView(k, np.flatnonzero(keep), xy[keep], p_A[keep]))
+    R_AC = so3.exp(rng.uniform(-0.5, 0.5, (160, 3)))
+    ahead_C = rng.uniform([-0.2, -0.2, 0.7], [0.2, 0.2, 1.3], (160, 3))
+    views = seen_board(true, R_AC, BOARD_CENTRE - (R_AC @ ahead_C[..., None])[..., 0])
     fitted, R_CF = fitted_lens(views, published)
     np.testing.assert_allclose(intrinsics_of(fitted)[1], intrinsics_of(true)[1], rtol=1e-4, atol=1e-4)
     # What the published lens sees 6 px to the right of its centre lies straight ahead of a camera turned that way.
@@ -185,7 +186,7 @@ def test_april_truth_agrees_with_the_gyroscope_and_the_vertical(april, april_tra
     """Over 0.2 s, by more than a quarter radian at times; by the published lens it does so less well."""
     R_WB = april_tracks.ground_truth.R_WB
     assert max(np.linalg.norm(so3.log(a.T @ b)) for a, b in zip(R_WB, R_WB[4:], strict=False)) > 0.25
-    by_published = turned_otherwise(april_sequence(april, truth_as_calibrated=True))
+    by_published = turned_otherwise(april_sequence(april, truth_by=(CALIBRATION.cameras[0].model, np.eye(3))))
     assert turned_otherwise(april_tracks) < 0.75 * by_published < 2.5e-3
     force_W = np.mean([R @ imu.accel_B[-1] for R, (imu, _) in zip(R_WB, april_tracks.packets, strict=True)], axis=0)
     assert np.degrees(np.arccos(force_W[2] / np.linalg.norm(force_W))) < 2.0

@@ -263,7 +263,7 @@ class Odometry:
             by = self._using.following
             if tracks is None:
                 return self._seen(imu, frames, by, self._frontend.track(imu, frames, self._using.rig))
-            return _Seen(imu, frames, tracks if by.lenses == self._given else tracks.undistorted(*by.lenses), by, {})
+            return _Seen(imu, frames, tracks.undistorted(*by.lenses, by=self._given), by, {})
 
     def _seen(self, imu: ImuSegment, frames: FrameSet, by: Calibration, tracks: FrameTracks) -> _Seen:
         """What the front-end has just given for a frame."""

@@ -143,8 +143,13 @@ class FrameTracks:
         """Whether cameras take turns, and this was not the first one's."""
         return bool(len(self.ids)) and bool(self.camera.all())
 
-    def undistorted(self, *lenses: Camera) -> FrameTracks:
-        """The same pixels as the ``lenses`` of the rig have them on the z = 1 plane."""
+    def undistorted(self, *lenses: Camera, by: tuple[Camera, ...] | None = None) -> FrameTracks:
+        """The same pixels as the ``lenses`` of the rig have them on the z = 1 plane.
+
+        Nothing changes where those ``by`` which they have been undistorted are the same.
+        """
+        if lenses == by:
+            return self
         xy_normalised = np.empty_like(self.xy)
         for c, lens in enumerate(lenses):
             xy_normalised[self.camera == c] = lens.undistort(self.xy[self.camera == c])

@@ -116,8 +116,7 @@ def run_backend(
         measurement = FrameSet(measured.t_ns, ()) if isinstance(measured, FrameTracks) else measured
         for imu, frame in synchroniser.add(measurement):
             begin, cpu_begin = working_s(), working_s(thread_time)
-            seen, lenses = tracks[frame.t_ns], life.calibration.lenses
-            estimates.append(life.process(imu, seen if lenses == given else seen.undistorted(*lenses)))
+            estimates.append(life.process(imu, tracks[frame.t_ns].undistorted(*life.calibration.lenses, by=given)))
             seconds.append(working_s() - begin)
             cpu_seconds.append(working_s(thread_time) - cpu_begin)
             t_ns.append(frame.t_ns)

@@ -82,7 +82,7 @@ class LifeCycle:
         """
         known = self.calibration
         by = by or known
-        tracks = (tracks if by.lenses == known.lenses else tracks.undistorted(*known.lenses)).finite()
+        tracks = tracks.undistorted(*known.lenses, by=by.lenses).finite()
         apart = tracks.by_others_alone and self._initial_state is None
         still = (
             not apart and self._standstill.sees_standstill(tracks.of_camera(0)) and self._options.zero_velocity_update

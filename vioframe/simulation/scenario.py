@@ -59,7 +59,7 @@ class Scenario:
         """The states at stamps (M,), biases linear between two of the truth; none where that is not known."""
         if self.truth.values.shape[1] < 16:
             return ()
-        biases = _linear(self.truth.t_ns, self.truth.values[:, 10:], t_ns)
+        biases = linear(self.truth.t_ns, self.truth.values[:, 10:], t_ns)
         columns = zip(t_ns.tolist(), *self.motion(t_ns), biases[:, :3], biases[:, 3:], strict=True)
         return tuple(NavState(*state) for state in columns)
 
@@ -145,7 +145,7 @@ def motion_along(truth: Trajectory) -> PosesAt:
 
     def motion(t_ns: Int) -> tuple[Float, Float, Float]:
         t_ns = np.clip(t_ns, truth.t_ns[0], truth.t_ns[-1])
-        return *interpolate_poses(truth.t_ns, truth.R_WB, truth.p_WB, t_ns), _linear(truth.t_ns, v_WB, t_ns)
+        return *interpolate_poses(truth.t_ns, truth.R_WB, truth.p_WB, t_ns), linear(truth.t_ns, v_WB, t_ns)
 
     return motion
 
@@ -197,7 +197,7 @@ def interpolate_poses(t_ns: Int, R_WB: Float, p_WB: Float, query_ns: Int) -> tup
     return R, np.einsum("mk,mki->mi", weights, p_WB[stencil])
 
 
-def _linear(t_ns: Int, values: Float, query_ns: Int) -> Float:
+def linear(t_ns: Int, values: Float, query_ns: Int) -> Float:
     """(Q, D) at ``query_ns`` (Q,) from ``values`` (K, D) at ``t_ns`` (K,)."""
     at_s, query_s = (t_ns - t_ns[0]) * 1e-9, (query_ns - t_ns[0]) * 1e-9
     return np.column_stack([np.interp(query_s, at_s, column) for column in values.T])
