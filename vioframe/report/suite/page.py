@@ -241,7 +241,7 @@ def _robustness(study: Study) -> Iterator[str]:
             yield (
                 f"{_named(study, duel.detector, duel.backend)} against {_titled(study, baseline)}, flight by flight"
                 f"{f' ({duel.data})' if kinds > 1 else ''}: {duel.won} won, {duel.lost} lost, {duel.tied} tied; where "
-                f"both have an error, {duel.ratio:.2f} times its ATE"
+                f"both are complete, {duel.ratio:.2f} times its ATE"
                 f"{f' (95 %: {low:.2f} to {high:.2f})' if low < high else ''}."
             )
 

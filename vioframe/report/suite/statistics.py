@@ -302,7 +302,7 @@ class Duel(NamedTuple):
 
     @property
     def both(self) -> int:
-        """How many pairs there are in which both have an ATE."""
+        """How many pairs there are in which both flights are complete."""
         return int(self.pairs["log_ratio"].count())
 
     @property
@@ -341,7 +341,9 @@ def duels(flights: pd.DataFrame, baseline: str) -> list[Duel]:
     gap_m = (pairs["ate_m_baseline"] - pairs["ate_m"]).astype(float)
     pairs["won"] = (standing > other) | ((standing == other) & (gap_m > _SAME_M))
     pairs["lost"] = (standing < other) | ((standing == other) & (gap_m < -_SAME_M))
-    pairs["log_ratio"] = np.log((pairs["ate_m"] / pairs["ate_m_baseline"]).astype(float))
+    # Of flights that were lost at different times, neither ATE is the other's measure.
+    both = pairs["complete"] & pairs["complete_baseline"]
+    pairs["log_ratio"] = np.log((pairs["ate_m"] / pairs["ate_m_baseline"]).where(both).astype(float))
     hard = groups(pairs[pairs["condition"] != CLEAR], ("data", *CONTENDER))
     return [
         *(Duel._make((*key, own)) for key, own in groups(pairs, ("data", "condition", *CONTENDER))),

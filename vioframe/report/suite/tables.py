@@ -262,7 +262,7 @@ def _duels(study: Study) -> Table | None:
     caption = (
         f"Flight by flight against {baseline}: same recording, condition, level, back-end and seed, the levels of a "
         "condition together. A complete flight wins against one that is not, an ATE against none, else the smaller "
-        "one; tied: equal, or neither has one. The ratio is of the pairs in which both have an ATE; below 1 is better "
+        "one; tied: equal, or neither has one. The ratio is of the pairs in which both are complete; below 1 is better "
         f"than {baseline}. Its interval is by the bootstrap over sequences and seeds, of which there must be "
         f"{ENOUGH_TO_DRAW_FROM}. The two-sided sign test takes the pairs for independent, which flights in one world "
         "are not quite; Holm's p counts that there are as many tests as rows, those over all degraded flights apart. "
