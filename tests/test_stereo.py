@@ -42,10 +42,14 @@ def shown(camera: CameraOnBody, moved_m: float = 0.0):
     return cv2.warpPerspective(SKY, camera.model.K @ plane @ wall_to_ray, camera.model.resolution)
 
 
-def play(calibration, sets, frontend=None, first: int = 1) -> list[FrameTracks]:
-    frontend = frontend or Frontend(ShiTomasi(), calibration, FrontendOptions(max_points=80), Incidents())
+# As many points in the second camera as in the first.
+OPTIONS = FrontendOptions(max_points=80, overlap_share=1.0)
+
+
+def play(calibration, sets, frontend=None, options=OPTIONS) -> list[FrameTracks]:
+    frontend = frontend or Frontend(ShiTomasi(), calibration, options, Incidents())
     steps = []
-    for k, images in enumerate(sets, start=first):
+    for k, images in enumerate(sets, start=1):
         t_ns = k * PERIOD_NS + np.linspace(-PERIOD_NS, 0, 11).astype(np.int64)
         imu = ImuSegment(t_ns, np.zeros((11, 3)), np.zeros((11, 3)))
         steps.append(frontend.track(imu, FrameSet(k * PERIOD_NS, images), calibration))
@@ -59,8 +63,8 @@ def pairs(tracks: FrameTracks):
     return ids, left.xy_normalised[i], right.xy_normalised[j]
 
 
-def flown(count: int, calibration=RIG):
-    return [tuple(shown(camera, 0.02 * k) for camera in calibration.cameras) for k in range(count)]
+def flown(count: int, calibration=RIG, step_m: float = 0.02):
+    return [tuple(shown(camera, step_m * k) for camera in calibration.cameras) for k in range(count)]
 
 
 @pytest.mark.parametrize(("model", "median_px"), [(CAMERA, 0.12), (SMALLER, 0.5)], ids=["alike", "smaller"])
@@ -147,6 +151,47 @@ def test_what_one_camera_saw_alone_is_taken_over_by_the_other():
     assert len(np.intersect1d(first.of_camera(1).ids, second.of_camera(0).ids)) > 20
 
 
+SHARED = FrontendOptions(max_points=80, overlap_share=0.25)
+
+
+def test_the_second_camera_follows_a_share_of_what_both_see():
+    tracks = play(RIG, flown(6), options=SHARED)[-1]
+    one, other = (len(tracks.of_camera(c).ids) for c in (0, 1))
+    assert 70 <= one <= 80
+    (_, pair) = overlapping(RIG)
+    assert (pair.first, pair.second) == (0, 1)
+    assert 0.7 < pair.overlap < 1.0
+    share = 1.0 - 0.75 * pair.overlap
+    assert 0.85 * 80 * share < other < 80 * share + 1.0
+    assert len(pairs(tracks)[0]) > 0.7 * other
+
+
+def test_of_what_comes_into_view_the_second_camera_follows_some_as_well():
+    """The first ones lie where they have gone by then: on the right."""
+    ids, _, right = pairs(play(RIG, flown(12, step_m=0.15), options=SHARED)[-1])
+    on_the_left = CAMERA.distort(right)[:, 0] < CAMERA.resolution[0] / 2
+    assert len(ids) > 20
+    assert on_the_left.sum() >= 3
+
+
+@pytest.mark.parametrize("why", ["black", "silent"])
+def test_the_second_camera_follows_as_many_as_it_can_once_the_first_shows_nothing(why):
+    images = flown(9)
+    images[3:] = [(np.zeros_like(left) if why == "black" else None, right) for left, right in images[3:]]
+    steps = play(RIG, images, options=SHARED)
+    assert len(steps[2].of_camera(1).ids) < 40
+    assert len(steps[-1].of_camera(1).ids) > 70
+
+
+def test_a_camera_that_sees_little_of_what_another_does_follows_points_of_its_own():
+    aside = rig(beside((0.0, 0.75, 0.0)))
+    (_, pair) = overlapping(aside)
+    assert 0.1 < pair.overlap < 0.35
+    images = (shown(LEFT), texture((240, 320), 7))
+    tracks = play(aside, [images, images], options=SHARED)[-1]
+    assert len(tracks.of_camera(1).ids) > 0.6 * 80
+
+
 def turned(camera: CameraOnBody, R_B1B2) -> CameraOnBody:
     """The camera, in B1, of a body that has turned to B2."""
     return replace(camera, R_BC=R_B1B2 @ camera.R_BC, p_BC=R_B1B2 @ camera.p_BC)
@@ -154,7 +199,7 @@ def turned(camera: CameraOnBody, R_B1B2) -> CameraOnBody:
 
 def one_after_the_other(rate_B, apart_s: float = 0.02, off_px: int = 0):
     """The left image, then the right one, of a body that turns at ``rate_B`` rad/s; and the cameras as they were."""
-    frontend = Frontend(ShiTomasi(), RIG, FrontendOptions(max_points=80), Incidents())
+    frontend = Frontend(ShiTomasi(), RIG, OPTIONS, Incidents())
     cameras = LEFT, turned(RIG.cameras[1], so3.exp(np.array(rate_B) * apart_s))
     right = np.roll(shown(cameras[1]), off_px, axis=0)
     steps, before_ns = [], 0

@@ -16,7 +16,10 @@ class FrontendOptions:
     """Options of :class:`vioframe.frontend.Frontend`; raises :class:`ConfigError` on a value out of range."""
 
     max_points: int = 150
-    """Tracks kept alive at once."""
+    """Tracks kept alive at once in a camera."""
+    overlap_share: float = 0.3
+    """Share of these that a camera follows where one ahead of it in the rig sees the same: it is there to tell how far
+    away things are, for which fewer points will do."""
     min_distance_px: float = 15.0
     """New points keep this far from every track and from each other; of two tracks that come within half of it, the
     younger is dropped."""
@@ -35,11 +38,12 @@ class FrontendOptions:
     rejection_px: float = 0.7
     """Largest distance of an inlier from the epipolar geometry, scaled by the focal length."""
     refill_below: float = 0.9
-    """The detector is asked for new points once fewer than this share of ``max_points`` is alive."""
+    """New points are looked for once fewer than this share of those that there should be is alive."""
 
     def __post_init__(self) -> None:
         for name, valid, remedy in (
             ("max_points", self.max_points >= 1, "at least 1"),
+            ("overlap_share", 0.0 < self.overlap_share <= 1.0, "in (0, 1]"),
             ("min_distance_px", self.min_distance_px >= 0.0, "zero or more"),
             ("equalisation", self.equalisation in get_args(Equalisation), " or ".join(get_args(Equalisation))),
             ("klt_window_px", self.klt_window_px >= 5 and self.klt_window_px % 2 == 1, "odd and at least 5"),

@@ -12,6 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from vioframe.frontend.flow import follow, projected, returns
+from vioframe.frontend.refill import spread
 from vioframe.frontend.view import FORWARD_BACKWARD_PX, View
 from vioframe.geometry.two_view import essential_matrix, inverse_depths, rays, sampson_distance
 from vioframe.types import Bool, Calibration, Float, Int
@@ -30,21 +31,27 @@ _GRID = 12
 
 
 class Pair:
-    """Two cameras whose images overlap; what the ``first`` follows is looked for in what the ``second`` sees."""
+    """Two cameras whose images overlap; what the ``first`` follows is looked for in what the ``second`` sees.
 
-    def __init__(self, first: int, second: int) -> None:
-        self.first, self.second = first, second
+    ``overlap`` is the part of the second's image in which the first can see the same.
+    """
+
+    def __init__(self, first: int, second: int, overlap: float) -> None:
+        self.first, self.second, self.overlap = first, second, overlap
         self._not_found: Int = np.empty(0, np.int64)
         self._images = 0
 
-    def match(self, views: tuple[View, ...], calibration: Calibration, R_B1B2: Float, apart_s: float) -> None:
+    def match(
+        self, views: tuple[View, ...], calibration: Calibration, R_B1B2: Float, apart_s: float, most: int
+    ) -> None:
         """Have the second camera follow what the first one does, and let go of what it only seemed to.
 
         ``R_B1B2`` (3, 3) is how the body turned in the ``apart_s`` between the image of the first and that of the
-        second.
+        second, which has ``most`` so many points to follow.
         """
         one, other = views[self.first], views[self.second]
-        if one.is_featureless or other.is_featureless:
+        lets_go = self.first < self.second  # of the two it is this one that does
+        if one.is_featureless or other.is_featureless or not (lets_go or other.wanted(most)):
             return
         self._images += 1
         if self._images % _AGAIN_IMAGES == 0:
@@ -56,20 +63,25 @@ class Pair:
         _, i, j = np.intersect1d(one.ids, other.ids, assume_unique=True, return_indices=True)
         right, rho = _agreement(one.xy_normalised[i], other.xy_normalised[j], R_C2C1, p_C2C1, nearest)
         wrong, typical = ~right, float(np.median(rho[right])) if right.any() else 0.0
-        if self.first < self.second and wrong.any():  # of the two it is this one that lets go
+        if lets_go and wrong.any():
             keep = np.ones(len(other.ids), bool)
             keep[j[wrong]] = False
             self._not_found = np.append(self._not_found, one.ids[i[wrong]])
             other.keep(keep)
 
+        wanted = other.wanted(most)
+        if not wanted:
+            return
         tried = np.isin(one.ids, self._not_found)
         tried[i] = True
         new = np.flatnonzero(~tried)
         p_C2 = rays(one.xy_normalised[new]) @ R_C2C1.T + max(typical, 0.0) * p_C2C1
         guess, in_view = projected(other.camera, p_C2)
         new, guess = new[in_view], guess[in_view]
-        if not len(new):
+        taken = spread(guess, other.xy, wanted, size=other.camera.resolution, min_distance_px=0.0)
+        if not len(taken):
             return
+        new, guess = new[taken], guess[taken]
         xy, found = follow(one.pyramid, other.pyramid, one.xy[new], guess)
         found &= returns(one.pyramid, other.pyramid, one.xy[new], xy, FORWARD_BACKWARD_PX)
         xy_normalised, usable = other.undistorted(xy)
@@ -83,7 +95,8 @@ class Pair:
 def overlapping(calibration: Calibration) -> tuple[Pair, ...]:
     """Of each camera, in the order of the rig, with all those that see a part of what it sees."""
     count = range(len(calibration.cameras))
-    return tuple(Pair(o, c) for c in count for o in count if o != c and _overlap(calibration, o, c))
+    pairs = (Pair(o, c, _seen_by(calibration, c, o)) for c in count for o in count if o != c)
+    return tuple(pair for pair in pairs if pair.overlap > _LEAST_OVERLAP)
 
 
 def _agreement(
@@ -99,13 +112,14 @@ def _agreement(
     return np.asarray(near & (rho > _FARTHEST) & (rho < _NEAREST)), rho
 
 
-def _overlap(calibration: Calibration, first: int, second: int) -> bool:
-    one, other = calibration.cameras[first], calibration.cameras[second]
-    if not (one.rotation_known and other.rotation_known):
-        return False
+def _seen_by(calibration: Calibration, camera: int, other: int) -> float:
+    """The part of the image of ``camera`` that ``other`` sees as well, at the distance where that is most."""
+    one, another = calibration.cameras[camera], calibration.cameras[other]
+    if not (one.rotation_known and another.rotation_known):
+        return 0.0
     width, height = one.model.resolution
     grid = np.meshgrid(np.linspace(0.0, width - 1.0, _GRID), np.linspace(0.0, height - 1.0, _GRID))
     xy_normalised = one.model.undistort(np.column_stack([axis.ravel() for axis in grid]))
-    R_C2C1, p_C2C1 = one.seen_from(other)
+    R_C2C1, p_C2C1 = one.seen_from(another)
     turned = rays(xy_normalised[np.isfinite(xy_normalised).all(axis=1)]) @ R_C2C1.T
-    return any(projected(other.model, turned + p_C2C1 / m)[1].mean() > _LEAST_OVERLAP for m in _DISTANCES_M)
+    return max(float(projected(another.model, turned + p_C2C1 / m)[1].mean()) for m in _DISTANCES_M)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from contextlib import suppress
 from dataclasses import dataclass
 
@@ -10,7 +11,7 @@ import numpy as np
 from vioframe.errors import DatasetError
 from vioframe.frontend.flow import body_rotation
 from vioframe.frontend.options import FrontendOptions
-from vioframe.frontend.stereo import MOST_APART_S, overlapping
+from vioframe.frontend.stereo import MOST_APART_S, Pair, overlapping
 from vioframe.frontend.view import Shown, View
 from vioframe.incidents import Incidents
 from vioframe.interfaces import Detector
@@ -77,15 +78,13 @@ class Frontend:
             self._views[c].advance(prepared.shown[c], R_C2C1, frames.t_ns, watch)
             self._turned[c], self._seen_ns[c] = np.eye(3), frames.t_ns
         for c in seeing:
-            for pair in self._pairs:
-                before_ns = self._seen_ns[pair.first]
-                if pair.second == c and before_ns is not None:
-                    apart_s = (frames.t_ns - before_ns) / NS_PER_S
-                    if apart_s <= MOST_APART_S:
-                        pair.match(self._views, calibration, self._turned[pair.first], apart_s)
-                        watch.lap("match")
+            pairs = self._pairs_with(c, frames.t_ns)
+            most = self._most_points(pairs)
+            for pair, apart_s in pairs:
+                pair.match(self._views, calibration, self._turned[pair.first], apart_s, most)
+                watch.lap("match")
             if not self._views[c].is_featureless:
-                self._next_id = self._views[c].refill(self._next_id, frames.t_ns)
+                self._next_id = self._views[c].refill(self._next_id, frames.t_ns, most)
                 watch.lap("detect")
         self.stage_seconds = watch.seconds
         views = [self._views[c] for c in seeing]
@@ -96,6 +95,18 @@ class Frontend:
             np.concatenate([view.xy for view in views]),
             np.concatenate([view.xy_normalised for view in views]),
         )
+
+    def _pairs_with(self, second: int, t_ns: int) -> list[tuple[Pair, float]]:
+        """Those of the camera ``second`` with others that brought an image shortly before ``t_ns``, and how long, s."""
+        before = [(pair, self._seen_ns[pair.first]) for pair in self._pairs if pair.second == second]
+        apart = [(pair, (t_ns - seen_ns) / NS_PER_S) for pair, seen_ns in before if seen_ns is not None]
+        return [(pair, apart_s) for pair, apart_s in apart if apart_s <= MOST_APART_S]
+
+    def _most_points(self, pairs: list[tuple[Pair, float]]) -> int:
+        """How many points the second camera of ``pairs`` is to follow: fewer where one ahead of it sees the same."""
+        shared = (p.overlap for p, _ in pairs if p.first < p.second and not self._views[p.first].is_featureless)
+        share = 1.0 - (1.0 - self._options.overlap_share) * max(shared, default=0.0)
+        return math.ceil(share * self._options.max_points)
 
     def recalibrate(self, calibration: Calibration) -> None:
         """Count with the lenses of ``calibration`` from the next images on."""

@@ -99,8 +99,12 @@ class View:
             self.camera = camera
             self.xy_normalised = camera.undistort(self.xy)
 
-    def refill(self, next_id: int, t_ns: int) -> int:
-        """Draw new points where there are fewest, once enough tracks are lost; returns the id of the next one.
+    def wanted(self, most: int) -> int:
+        """How many new points would make them ``most``; none until enough are lost."""
+        return most - len(self.ids) if len(self.ids) < self._options.refill_below * most else 0
+
+    def refill(self, next_id: int, t_ns: int, most: int) -> int:
+        """Draw new points where there are fewest, once too many of ``most`` are lost; returns the id of the next one.
 
         They are drawn, not the strongest taken: these lie on outlines more often than others, slide along them and are
         lost, only to be taken again. Of what is drawn, whatever can be followed stays. Of a detector whose score says
@@ -109,7 +113,8 @@ class View:
         options, camera, image = self._options, self.camera, self._image
         assert image is not None
         self.keep(thin(self.xy, self.ids, 0.5 * options.min_distance_px))
-        if len(self.ids) >= options.refill_below * options.max_points:
+        wanted = self.wanted(most)
+        if not wanted:
             return next_id
         candidates = self._candidates.ask(image, _CANDIDATES_PER_POINT * options.max_points, t_ns)
         if not self._candidates.best_first:
@@ -117,7 +122,7 @@ class View:
         taken = spread(
             candidates,
             self.xy,
-            options.max_points - len(self.ids),
+            wanted,
             size=camera.resolution,
             min_distance_px=options.min_distance_px,
         )
