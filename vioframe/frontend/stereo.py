@@ -47,7 +47,7 @@ class Pair:
         """Have the second camera follow what the first one does, and let go of what it only seemed to.
 
         ``R_B1B2`` (3, 3) is how the body turned in the ``apart_s`` between the image of the first and that of the
-        second, which has ``most`` so many points to follow.
+        second, which is to follow no more than ``most`` points.
         """
         one, other = views[self.first], views[self.second]
         lets_go = self.first < self.second  # of the two it is this one that does
