@@ -125,7 +125,7 @@ class _Set:
 
     def __init__(self, first: int, shown: Shown, view: View, t_ns: int, watch: Stopwatch) -> None:
         view.advance(shown, None, t_ns, watch)
-        count = view.refill(0, t_ns)
+        count = view.refill(0, t_ns, _POINTS)
         self.first, self.image = first, np.asarray(shown.image, np.uint8)
         self.xy: Float = np.full((count, IMAGES + 1, 2), np.nan)
         self.xy[view.ids, 0] = view.xy
