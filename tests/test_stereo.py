@@ -46,8 +46,8 @@ def shown(camera: CameraOnBody, moved_m: float = 0.0):
 OPTIONS = FrontendOptions(max_points=80, overlap_share=1.0)
 
 
-def play(calibration, sets, frontend=None, options=OPTIONS) -> list[FrameTracks]:
-    frontend = frontend or Frontend(ShiTomasi(), calibration, options, Incidents())
+def play(calibration, sets, options=OPTIONS) -> list[FrameTracks]:
+    frontend = Frontend(ShiTomasi(), calibration, options, Incidents())
     steps = []
     for k, images in enumerate(sets, start=1):
         t_ns = k * PERIOD_NS + np.linspace(-PERIOD_NS, 0, 11).astype(np.int64)

@@ -47,7 +47,7 @@ class Frontend:
         self._pairs = overlapping(calibration)
         # How the body has turned since each camera's last image, R_B1B2, and when that was.
         self._turned = [np.eye(3) for _ in self._views]
-        self._seen_ns: list[int | None] = [None for _ in self._views]
+        self._seen_ns: list[float] = [-math.inf for _ in self._views]
         self._next_id = 0
         self._prepared: dict[int, _Prepared] = {}
         self.stage_seconds: dict[str, float] = {}
@@ -98,8 +98,8 @@ class Frontend:
 
     def _pairs_with(self, second: int, t_ns: int) -> list[tuple[Pair, float]]:
         """Those of the camera ``second`` with others that brought an image shortly before ``t_ns``, and how long, s."""
-        before = [(pair, self._seen_ns[pair.first]) for pair in self._pairs if pair.second == second]
-        apart = [(pair, (t_ns - seen_ns) / NS_PER_S) for pair, seen_ns in before if seen_ns is not None]
+        pairs = [pair for pair in self._pairs if pair.second == second]
+        apart = [(pair, (t_ns - self._seen_ns[pair.first]) / NS_PER_S) for pair in pairs]
         return [(pair, apart_s) for pair, apart_s in apart if apart_s <= MOST_APART_S]
 
     def _most_points(self, pairs: list[tuple[Pair, float]]) -> int:
