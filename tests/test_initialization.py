@@ -16,6 +16,7 @@ from vioframe.frontend import Frontend, FrontendOptions
 from vioframe.geometry import so3
 from vioframe.geometry.trajectory import Trajectory
 from vioframe.incidents import Incidents
+from vioframe.io.calibration import packaged_calibration
 from vioframe.io.synchronise import synchronise
 from vioframe.io.trajectories import load_trajectory
 from vioframe.simulation import Packet, TrackSequence, real_motion_sequence, simulated_sequence
@@ -235,7 +236,26 @@ class TestBadInput:
         packets = [(imu, without_points(tracks)) for imu, tracks in sequence.packets[:60]]
         estimate, initializer = first_estimate(packets, sequence.calibration)
         assert estimate is None
-        assert "0 tracks are long enough" in initializer.refusal
+        assert "dynamic: points were followed through the last 0.0 s alone" in initializer.refusal
+
+    @pytest.mark.parametrize("cameras", [["cam0"], ["cam0", "cam1"]])
+    def test_frames_from_before_the_camera_was_black_have_no_part_in_a_start(self, cameras: list[str]):
+        calibration = packaged_calibration("euroc", cameras=cameras)
+        sequence = simulated_sequence("figure_eight", duration_s=7.0, calibration=calibration)
+        begin, end = (20, 24) if len(cameras) == 1 else (4, 8)
+        packets = [
+            (imu, without_points(tracks) if begin <= k < end else replace(tracks, ids=2 * tracks.ids + (k < begin)))
+            for k, (imu, tracks) in enumerate(sequence.packets)
+        ]
+        estimate, _ = first_estimate(packets, calibration)
+        alone, _ = first_estimate(packets[end:], calibration)
+        assert estimate is not None
+        assert alone is not None
+        assert estimate.method == alone.method == ("dynamic" if len(cameras) == 1 else "stereo")
+        assert_sound(estimate)
+        assert estimate.states[0].t_ns >= packets[end][1].t_ns
+        assert estimate.states[-1].t_ns <= alone.states[-1].t_ns + 0.3e9
+        assert judge(estimate, Motion.of(sequence), packets[0][1].t_ns).velocity < 0.1
 
     def test_points_that_cannot_be_undistorted_are_left_out(self, sequence: TrackSequence):
         packets = []

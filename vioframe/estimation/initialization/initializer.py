@@ -22,6 +22,8 @@ from vioframe.estimation.initialization.window import (
     Packet,
     RefusalError,
     UnsureError,
+    linked,
+    refuse_unless,
     seen_anew,
     unrolled,
 )
@@ -79,6 +81,7 @@ class Initializer:
         self._refusals: dict[str, str] = {}
         self._readings = Readings()
         self._packets: list[Packet] = []
+        self._linked_ns = 0
         self._waiting: list[FrameTracks] = []
         self._of_rig: list[Packet] = []
         self.in_doubt = False
@@ -199,6 +202,8 @@ class Initializer:
         while self._waiting and self._readings.cover(self._waiting[0].t_ns, self._waiting[0].t_ns):
             tracks = self._waiting.pop(0)
             begin_ns = self._packets[-1][1].t_ns if self._packets else tracks.t_ns
+            if not (self._packets and linked(self._packets[-1][1], tracks)):
+                self._linked_ns = tracks.t_ns
             self._packets.append((self._readings.between(begin_ns, tracks.t_ns), tracks))
         if self._packets:
             self._packets = self._last(_LONGEST_WINDOW_S)
@@ -211,10 +216,10 @@ class Initializer:
         return static.initialise(packets, self._calibration.imu)
 
     def _take_of_rig(self, imu: ImuSegment, tracks: FrameTracks) -> None:
-        """Take a frame for a start by stereo, if it follows that before."""
+        """Take a frame for a start by stereo, where one that is not linked to that before is the first."""
         if len(self._given.cameras) == 1:
             return
-        if self._of_rig and imu.t_ns[0] != self._of_rig[-1][0].t_ns[-1]:
+        if self._of_rig and not (imu.t_ns[0] == self._of_rig[-1][0].t_ns[-1] and linked(self._of_rig[-1][1], tracks)):
             self._of_rig.clear()
         self._of_rig.append((imu, tracks))
         oldest_ns = tracks.t_ns - round(_LONGEST_STEREO_S * NS_PER_S)
@@ -238,6 +243,9 @@ class Initializer:
         newest_ns, time_offset_ns = self._packets[-1][1].t_ns, self._calibration.cameras[0].time_offset_ns
         if newest_ns < self._next_attempt_ns or _duration_s(self._packets) < _SHORTEST_WINDOW_S:
             return None
+        linked_s = _duration_s(self._linked(_LONGEST_WINDOW_S))
+        why = f"points were followed through the last {linked_s:.1f} s alone, {_SHORTEST_WINDOW_S} s are needed"
+        refuse_unless(linked_s >= _SHORTEST_WINDOW_S, why)
         self._wait_s = min(self._wait_s + _LATER_S, _LATEST_S)
         self._next_attempt_ns = newest_ns + round((self._wait_s - 1e-3) * NS_PER_S)
         if (found := self._sensors.judge(self._readings, self._calibration)) is not None:
@@ -249,7 +257,7 @@ class Initializer:
                 known = np.diag(self._sigma(_WITHOUT_ITS_FRAMES).stacked() ** 2)
                 calibration = replace(self._calibration, imu=self._noise_in_motion())
                 try:
-                    packets, doubted = self._last(self._window_s), self._doubted(known)
+                    packets, doubted = self._linked(self._window_s), self._doubted(known)
                     bias, was_found = self._sensors.bias_gyro_B, self._found is not None
                     estimate = dynamic.initialise(packets, calibration, known, doubted, bias, found=was_found)
                     return self._settled(estimate)
@@ -315,6 +323,10 @@ class Initializer:
         """The frames of the last ``seconds``."""
         oldest_ns = self._packets[-1][1].t_ns - seconds * 1e9
         return [packet for packet in self._packets if packet[1].t_ns >= oldest_ns]
+
+    def _linked(self, seconds: float) -> list[Packet]:
+        """Those of the last ``seconds`` since one showed nothing of what the one before did, as after a black one."""
+        return [packet for packet in self._last(seconds) if packet[1].t_ns >= self._linked_ns]
 
 
 def _duration_s(packets: list[Packet]) -> float:

@@ -26,6 +26,8 @@ BIAS_GYRO_SIGMA, BIAS_ACCEL_SIGMA = BIAS_SIGMA, 0.15
 """Priors of the biases about zero, rad/s and m/s^2; those of EuRoC's IMU are 0.08 and 0.13."""
 LARGEST_IMU_GAP_S = 0.1
 """A longer stretch without readings begins everything anew."""
+# Tracks that two frames must have in common. Four unknowns, the way between them and the unit of length, are theirs.
+_FEWEST_LINKS = 8
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,6 +117,11 @@ def unrolled(tracks: FrameTracks, camera: CameraOnBody, rate_B: Float) -> FrameT
 def seen_anew(tracks: FrameTracks, camera: CameraOnBody, rate_B: Float) -> FrameTracks:
     """``tracks`` as ``camera`` saw them, which is another than the one they were undistorted and unrolled for."""
     return unrolled(tracks.undistorted(camera.model).finite(), camera, rate_B)
+
+
+def linked(before: FrameTracks, after: FrameTracks) -> bool:
+    """Whether enough of what one frame shows is in the other for the way between them, and its unit, to be known."""
+    return len(np.intersect1d(before.ids, after.ids)) >= _FEWEST_LINKS
 
 
 def build_window(
