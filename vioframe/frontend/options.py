@@ -17,7 +17,7 @@ class FrontendOptions:
 
     max_points: int = 150
     """Tracks kept alive at once in a camera."""
-    overlap_share: float = 0.3
+    overlap_share: float = 0.2
     """Share of these that a camera follows where one ahead of it in the rig sees the same: it is there to tell how far
     away things are, for which fewer points will do."""
     min_distance_px: float = 15.0
