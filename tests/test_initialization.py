@@ -190,6 +190,16 @@ class TestSimulatedFlights:
         assert errors.nees < 3.0
         np.testing.assert_allclose(estimate.states[-1].bias_gyro_B, BIAS_GYRO, atol=0.01)
 
+    def test_soon_wherever_a_flight_with_fast_turns_begins(self):
+        sequence = simulated_sequence("aggressive", seed=50, duration_s=14.0)
+        for start in range(0, 220, 20):
+            estimate, errors, refusal = attempt(sequence, start, 60)
+            assert estimate is not None, (start, refusal)
+            assert errors is not None
+            assert errors.velocity < 0.2
+            assert errors.tilt_deg < 1.5
+            assert abs(errors.scale) < 0.05
+
     def test_landmarks_are_where_they_are(self):
         sequence = simulated_sequence("figure_eight", duration_s=5.0, pixel_sigma=0.2)
         estimate, _, refusal = attempt(sequence, 0, 100)

@@ -353,7 +353,7 @@ class TestStatic:
 
 
 class TestWindow:
-    def test_longest_tracks_first_and_readings_joined(self):
+    def test_longest_tracks_and_readings_joined(self):
         t_ns = np.arange(4) * 100_000_000
         seen = ([0, 1, 2], [0, 1, 2], [0, 1], [0, 3])
         packets = []
@@ -373,6 +373,20 @@ class TestWindow:
         np.testing.assert_allclose(window.xy[1, 1], [0.1, 0.2])
         np.testing.assert_array_equal(window.segments[0].t_ns, [0, 100_000_000, 200_000_000])
         np.testing.assert_array_equal(build_window(packets, [0, 2, 3], 2, 1).ids, [0])
+
+    def test_no_view_is_left_out_for_longer_tracks(self):
+        """Of thirty through the first ten frames, and ten through the six that come then, a dozen."""
+        early, late = list(range(30)), list(range(30, 40))
+        packets = []
+        for k in range(14):
+            ids = np.array((early if k < 10 else []) + (late if k >= 8 else []))
+            stamps, xy = np.array([k, k + 1]) * 100_000_000, np.zeros((len(ids), 2))
+            tracks = FrameTracks(int(stamps[1]), ids, np.zeros(len(ids), np.int64), xy, xy)
+            packets.append((ImuSegment(stamps, np.zeros((2, 3)), np.zeros((2, 3))), tracks))
+        window = build_window(packets, range(14), 4, 12)
+        assert len(window.ids) == 12
+        assert (window.seen.sum(axis=1) >= 4).all()
+        np.testing.assert_array_equal(window.ids[:5], early[:5])
 
     def test_indices_spread_over_time_not_over_frames(self):
         t_ns = np.array([0, 1, 2, 3, 4, 100, 200]) * 1_000_000

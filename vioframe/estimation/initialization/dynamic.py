@@ -58,7 +58,7 @@ _MIN_VIEWS = 4
 # Tracks farther off than this are not noise: standard deviations, typical over all views.
 _EPIPOLAR_LIMIT, _STRUCTURE_LIMIT, _ADJUSTED_LIMIT = 3.0, 10.0, 3.0
 _FARTHEST_M = 200.0
-# Frames of the window that are estimated, tracks that are used, the longest first, and how few refuse the attempt.
+# Frames of the window that are estimated, most tracks that are used, and how few refuse the attempt.
 _KEYFRAMES, _MOST_LANDMARKS, _FEWEST_LANDMARKS = 14, 100, 20
 # Where images are dropped there may be hardly any but the newest: so many must be older.
 _FEWEST_FRAMES = 4

@@ -47,7 +47,7 @@ from vioframe.geometry.so3 import level_rotation
 from vioframe.geometry.two_view import inverse_depths, rays
 from vioframe.types import NS_PER_S, Calibration, CameraOnBody
 
-# Frames of the window that are estimated, tracks that are used, the longest first, views each of them needs.
+# Frames of the window that are estimated, most tracks that are used, views each of them needs.
 _KEYFRAMES, _MOST_LANDMARKS, _MIN_VIEWS = 8, 80, 4
 # Frames that there must be, and those at the end that the rest has to predict.
 _FEWEST_FRAMES, _HELD_OUT = 6, 2

@@ -127,20 +127,35 @@ def linked(before: FrameTracks, after: FrameTracks) -> bool:
 def build_window(
     packets: Sequence[Packet], chosen: Sequence[int], min_views: int, max_landmarks: int, cameras: int = 1
 ) -> Window:
-    """The frames ``chosen``, ascending indices of ``packets``, and the tracks that ``min_views`` or more see."""
+    """The frames ``chosen``, ascending indices of ``packets``, and the best of the tracks in ``min_views`` or more."""
     tracks = [packets[k][1] for k in chosen]
     segments = tuple(join_segments([imu for imu, _ in packets[a + 1 : b + 1]]) for a, b in pairwise(chosen))
     table = TrackTable(cameras)
     for frame in tracks:
         table.add_frame(frame)
-    # The longest first; the older id where they are equally long.
-    views = table.lengths()
-    order = np.argsort(-views, kind="stable")
-    rows = np.sort(order[views[order] >= min_views][:max_landmarks])
+    rows = np.flatnonzero(table.lengths() >= min_views)
+    rows = rows[_most_telling(table.seen[rows], max_landmarks)]
     seen = table.seen[rows].T
     xy = np.where(seen[..., None], np.swapaxes(table.xy_normalised[rows], 0, 1), np.nan)
     xy_px = np.swapaxes(table.xy[rows], 0, 1)
     return Window(np.array([t.t_ns for t in tracks]), segments, table.ids[rows], xy, seen, xy_px, cameras)
+
+
+def _most_telling(seen: Bool, count: int) -> Int:
+    """At most ``count`` ascending rows of ``seen`` (L, V): long tracks, and those in views that few others are in.
+
+    The longest alone would leave views out where the body turns fast. So a view is worth the less to a track the more
+    of those taken before are in it, and the track that is worth most is taken next; the older of equals.
+    """
+    if len(seen) <= count:
+        return np.arange(len(seen))
+    left, tracks = seen.astype(np.float64), np.zeros(seen.shape[1])
+    rows = []
+    for _ in range(count):
+        rows.append(int((left @ (1.0 / (1.0 + tracks))).argmax()))
+        tracks += left[rows[-1]]
+        left[rows[-1]] = 0.0
+    return np.sort(rows)
 
 
 def spread_indices(t_ns: Int, count: int) -> list[int]:
