@@ -53,7 +53,8 @@ def _scrambled(image: Image) -> NDArray[np.float32]:
     bits = around[1:-1, 1:-1] + (around[1:-1, 2:] << 8) + (around[2:, 1:-1] << 16) + (around[:-2, :-2] << 24)
     for factor in (0x9E3779B1, 0x85EBCA6B):
         bits = (bits ^ bits >> 15) * np.uint32(factor)
-    return ((bits >> 8) / np.float32(1 << 24)).astype(np.float32)
+    numbers: NDArray[np.float32] = ((bits >> 8) / np.float32(1 << 24)).astype(np.float32)
+    return numbers
 
 
 @hookimpl

@@ -173,7 +173,7 @@ class RosbagDataset:
             return there[:1]
         as_eurocs = [topic for topic in topics if topic in _EUROC_CAMERA_TOPICS and self._imu_topic == _EUROC_IMU_TOPIC]
         _, first = next(self._deserialized(reader, *as_eurocs), (None, None))
-        if hasattr(first, "height") and (first.height, first.width) == _EUROC_SHAPE:
+        if first is not None and hasattr(first, "height") and (first.height, first.width) == _EUROC_SHAPE:
             _log.warning(
                 "%s brings no calibration and looks like EuRoC: using EuRoC's published calibration", self._path.name
             )
@@ -233,7 +233,7 @@ def _bound_decompression() -> None:
 
         return decompress
 
-    zstd = mcap.zstd
+    zstd = vars(mcap)["zstd"]
 
     @contextmanager
     def bounded_file(stream: BinaryIO, mode: str) -> Iterator[_Bounded]:
@@ -243,7 +243,7 @@ def _bound_decompression() -> None:
     by_lz4, by_zstd = bounded(LZ4FrameDecompressor), bounded(zstd.ZstdDecompressor)
     ros1.decompressors |= {"bz2": bounded(bz2.BZ2Decompressor), "lz4": by_lz4}
     mcap.DECOMPRESSORS |= {"lz4": by_lz4, "zstd": by_zstd}
-    ros2.zstd = SimpleNamespace(decompress=by_zstd, open=bounded_file)
+    vars(ros2)["zstd"] = SimpleNamespace(decompress=by_zstd, open=bounded_file)
 
 
 class _Bounded:

@@ -100,7 +100,7 @@ class VideoDataset:
             return gray
         width, height = self.calibration.cameras[0].model.resolution
         whole = gray[: height * self._shrink, : width * self._shrink]
-        small: Image = cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA)
+        small = cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA).astype(np.uint8, copy=False)
         small.flags.writeable = False
         return small
 

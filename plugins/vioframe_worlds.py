@@ -62,10 +62,10 @@ def mesh(
     plane = np.array([[1, 2], [0, 2], [0, 1]])[axis]
     uv = np.take_along_axis(corners, plane[:, None, :], axis=2) / tile_m
     # Faces that look the same way are one surface.
-    _, surface = np.unique(
+    _, facing = np.unique(
         np.round(normals / np.linalg.norm(normals, axis=1, keepdims=True), 2), axis=0, return_inverse=True
     )
-    surface = surface.ravel().astype(np.int32)
+    surface = facing.ravel().astype(np.int32)
     texture = rng.integers(len(textures), size=surface.max() + 1).astype(np.int32)
     return MeshWorld(Mesh(corners, uv, texture[surface], surface), textures)
 

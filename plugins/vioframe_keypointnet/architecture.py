@@ -88,7 +88,7 @@ class Architecture:
 
     def halves(self, block: int) -> bool:
         """Whether the resolution is halved before the ``block``, or folding has made it as low already."""
-        return 2 ** (block - 1) > self.fold
+        return 1 << (block - 1) > self.fold
 
     @property
     def encoder(self) -> dict[int, tuple[Layer, ...]]:

@@ -95,11 +95,11 @@ def model(weights: Weights, shape: tuple[int, int], *, descriptors: bool = False
         found = _convolve(output, _convolve(hidden, x, ranges), ranges).node
     if not descriptors:
         return openvino.Model([found], [image], "keypointnet")
-    for layer in (_convolution(tensors, "Fa"), _convolution(tensors, "Fb", activated=False)):
-        x = _convolve(layer, x, ranges)
+    for convolution in (_convolution(tensors, "Fa"), _convolution(tensors, "Fb", activated=False)):
+        x = _convolve(convolution, x, ranges)
     x = _Values(ops.concat([ops.depth_to_space(x.node, "depth_first", 2), after[3].node], axis=1))
-    for layer in (_convolution(tensors, "Faa"), _convolution(tensors, "Fbb")):
-        x = _convolve(layer, x, ranges)
+    for convolution in (_convolution(tensors, "Faa"), _convolution(tensors, "Fbb")):
+        x = _convolve(convolution, x, ranges)
     return openvino.Model([found, x.node], [image], "keypointnet")
 
 

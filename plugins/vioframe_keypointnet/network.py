@@ -134,8 +134,17 @@ def of_weights(weights: Weights) -> KeypointNet:
     network.eval()
     for name, layer in list(network.named_children()):
         if isinstance(layer, nn.Sequential):
-            network.add_module(name, fuse_conv_bn_eval(layer[0], layer[1]))
-    return network.to(memory_format=torch.channels_last)
+            convolution, norm = layer
+            assert isinstance(convolution, nn.Conv2d)
+            assert isinstance(norm, nn.BatchNorm2d)
+            network.add_module(name, fuse_conv_bn_eval(convolution, norm))
+    return in_channels_last(network)
+
+
+def in_channels_last(network: KeypointNet) -> KeypointNet:
+    """The ``network`` itself, its weights laid out as convolutions on a processor like them best."""
+    network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # which torch's stubs do not know
+    return network
 
 
 def locally_normalised(images: Tensor) -> Tensor:

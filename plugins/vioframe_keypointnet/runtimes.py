@@ -136,7 +136,7 @@ def _by_cuda(weights: Weights, half: bool, options: KeypointNetOptions) -> Run:
 
         find = torch.compile(found, dynamic=False) if options.compiled else found
 
-        aside, graph = torch.cuda.Stream(), torch.cuda.CUDAGraph()
+        aside, graph = torch.cuda.Stream(), torch.cuda.CUDAGraph()  # type: ignore[no-untyped-call]
         # In full precision TF32 would round to ten bits. To try cuDNN's algorithms one after the other gains nothing.
         with torch.inference_mode(), torch.backends.cudnn.flags(enabled=True, allow_tf32=half):
             with torch.cuda.stream(aside):

@@ -115,7 +115,7 @@ def by_pixels(found: Array) -> Array:
     h, w, values = found.shape
     f = isqrt(values)
     # The pixels of a row that one place holds are moved as one number, which is several times as fast.
-    rows = np.ascontiguousarray(found).view(_ROW_OF[f]).swapaxes(1, 2)
+    rows: NDArray[np.generic] = np.ascontiguousarray(found).view(_ROW_OF[f]).swapaxes(1, 2)
     return np.ascontiguousarray(rows).reshape(f * h, w).view(np.float32)
 
 
@@ -236,7 +236,7 @@ def _first_varied(image: Image, at: Int | Array, height: int, width: int, min_co
         if count == most:
             break
         x, y = at[k, 0], at[k, 1]
-        column, row = np.int64(np.rint(x)), np.int64(np.rint(y))
+        column, row = int(np.rint(x)), int(np.rint(y))
         if x <= width - 1 and y <= height - 1 and _varies(image, column, row, height, width, min_contrast):
             kept[count] = k
             count += 1

@@ -28,11 +28,13 @@ from vioframe.geometry.kernels import (
 )
 from vioframe.geometry.triangulation import triangulate
 from vioframe.jit import kernel
-from vioframe.types import Float, Int
+from vioframe.types import Bool, Float, Int
 from vioframe_msckf.covariance import add
 from vioframe_msckf.state import FilterState
 
 ACCEPTED, NOT_TRIANGULATED, GATED = 0, 1, 2
+
+_Vector = tuple[float, float, float]
 
 
 class Window(NamedTuple):
@@ -76,13 +78,14 @@ def landmark_blocks(
 
 
 @kernel
-def _row(w, c, y):
+def _row(w: Window, c: int, y: float) -> float:
     """Where the row ``y`` px is between the first of camera ``c`` and its last, from -1/2 to 1/2."""
-    return (y + 0.5) / w.image_heights[c] - 0.5
+    place: float = (y + 0.5) / w.image_heights[c] - 0.5
+    return place
 
 
 @kernel
-def _camera_at(w, k, c, y, R_lateC, p_lateC):
+def _camera_at(w: Window, k: int, c: int, y: float, R_lateC: Float, p_lateC: Float) -> None:
     """Camera ``c`` as seen from the body at clone ``k`` when it saw a pixel at the height ``y``; fills (3, 3), (3,)."""
     late_s = w.offset_s[c] + w.readout_s[c] * _row(w, c, y)
     camera_later(w.R_BC[c], w.p_BC[c], late_s, w.rate_B[k], w.velocity_B[k], R_lateC, p_lateC)
@@ -92,7 +95,7 @@ def _camera_at(w, k, c, y, R_lateC, p_lateC):
 
 
 @kernel(inlined=True)
-def _by(R, v):
+def _by(R: Float, v: _Vector) -> _Vector:
     """R v."""
     return (
         R[0, 0] * v[0] + R[0, 1] * v[1] + R[0, 2] * v[2],
@@ -102,7 +105,7 @@ def _by(R, v):
 
 
 @kernel(inlined=True)
-def _back(R, a, b):
+def _back(R: Float, a: Float | _Vector, b: Float) -> _Vector:
     """R^T (a - b)."""
     x, y, z = a[0] - b[0], a[1] - b[1], a[2] - b[2]
     return (
@@ -113,17 +116,28 @@ def _back(R, a, b):
 
 
 @kernel(inlined=True)
-def _cross(a, b):
+def _cross(a: Float | _Vector, b: _Vector) -> _Vector:
     return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
 
 
 @kernel(inlined=True)
-def _dot(a, b):
+def _dot(a: _Vector, b: Float | _Vector) -> float:
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 @kernel
-def _observe(w, k, c, R_lateC, p_lateC, p_WF, p_WF_first, xy, block, residual):
+def _observe(
+    w: Window,
+    k: int,
+    c: int,
+    R_lateC: Float,
+    p_lateC: Float,
+    p_WF: Float,
+    p_WF_first: Float,
+    xy: Float,
+    block: Float,
+    residual: Float,
+) -> None:
     """One sighting, by the camera ``R_lateC``, ``p_lateC`` (:func:`_camera_at`): ``residual`` (2,) px and ``block``.
 
     The latter (2, 25) is over [camera 16, clone 6, landmark 3].
@@ -157,7 +171,7 @@ def _observe(w, k, c, R_lateC, p_lateC, p_WF, p_WF_first, xy, block, residual):
 
 
 @kernel
-def observations(w, clone, cameras, p_WF, p_WF_first, xy):
+def observations(w: Window, clone: int, cameras: Int, p_WF: Float, p_WF_first: Float, xy: Float) -> tuple[Float, Float]:
     """Landmarks (M, 3) seen by ``cameras`` (M,) at (M, 2) px from one clone: blocks (M, 2, 25), residuals (M, 2)."""
     m = len(xy)
     blocks = np.empty((m, 2, 25))
@@ -171,7 +185,9 @@ def observations(w, clone, cameras, p_WF, p_WF_first, xy):
 
 
 @kernel(inlined=True)
-def track_rows(w, xy, xy_normalised, seen, pixel_sigma):
+def track_rows(
+    w: Window, xy: Float, xy_normalised: Float, seen: Bool, pixel_sigma: float
+) -> tuple[bool, Float, Float, Float, Float]:
     """One track (C,): whether it was triangulated, p_WF, H over [cameras, clones] and the landmark, residual."""
     K, N = len(w.p_WB), len(w.p_BC)
     views = np.flatnonzero(seen)
@@ -206,7 +222,7 @@ def track_rows(w, xy, xy_normalised, seen, pixel_sigma):
 
 
 @kernel(inlined=True)
-def reduce_landmark(H, H_f, residual):
+def reduce_landmark(H: Float, H_f: Float, residual: Float) -> None:
     """Rotate the rows by the orthogonal Q with Q H_f = [T; 0], T (3, 3) upper triangular, in place.
 
     Householder reflections. The rows below the third are free of the landmark: Mourikis and Roumeliotis, eq. (22)-(24).
@@ -245,7 +261,9 @@ def reduce_landmark(H, H_f, residual):
 
 
 @kernel(inlined=True)
-def distance_and_variances(S, H_f, residual, variance, cauchy):
+def distance_and_variances(
+    S: Float, H_f: Float, residual: Float, variance: float, cauchy: float
+) -> tuple[float, Float]:
     """Of M sightings of one landmark their squared Mahalanobis distance, and (M,) variances to take them with, px^2.
 
     Of their ``residual`` (2 M,) the state leaves ``S`` (2 M, 2 M) unsure, the landmark anything along ``H_f`` (2 M, 3),
@@ -297,7 +315,9 @@ def distance_and_variances(S, H_f, residual, variance, cauchy):
 
 
 @kernel(inlined=True)
-def reduced_track(w, xy, xy_normalised, seen, P, pixel_sigma, cauchy):
+def reduced_track(
+    w: Window, xy: Float, xy_normalised: Float, seen: Bool, P: Float, pixel_sigma: float, cauchy: float
+) -> tuple[bool, Float, Float, Float, Float, float]:
     """One track (C,): whether it was triangulated, p_WF, H, H_f, residual, and its squared Mahalanobis distance.
 
     Below the third row there is no landmark. ``P`` is the covariance of the columns of H, [cameras, clones]; the noise
@@ -338,7 +358,9 @@ class TrackRows(NamedTuple):
 
 
 @kernel
-def msckf_rows(w, xy, xy_normalised, seen, P, pixel_sigma, cauchy, gate):
+def msckf_rows(
+    w: Window, xy: Float, xy_normalised: Float, seen: Bool, P: Float, pixel_sigma: float, cauchy: float, gate: Float
+) -> TrackRows:
     """Triangulate (F, C) tracks, linearise them, project out the landmarks, and gate each at ``gate[dof]``.
 
     ``P`` is the covariance of [cameras, clones].

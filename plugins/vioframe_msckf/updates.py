@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from vioframe.estimation.factors.tracks import TrackTable
 from vioframe.estimation.point_noise import PointNoise
 from vioframe.estimation.standstill import Standstill
-from vioframe.types import DP, Float, FrameTracks, ImuNoise, ImuSegment, Int
+from vioframe.types import DP, Bool, Float, FrameTracks, ImuNoise, ImuSegment, Int
 from vioframe_msckf.covariance import distances
 from vioframe_msckf.measurement import ACCEPTED, GATED, TrackRows, Window, landmark_blocks, msckf_rows
 from vioframe_msckf.options import MsckfOptions
@@ -114,13 +114,13 @@ def _new_landmarks(
     """Take those of ``tracks`` that are ``offered`` into the state; returns the ones taken, whose distance is known."""
     T_inverse, p_WF = np.linalg.inv(tracks.T[offered]), tracks.p_WF[offered]
     gain = -T_inverse @ tracks.H_of[offered]
-    own = point_noise.px**2 * T_inverse @ np.swapaxes(T_inverse, -1, -2)
+    own = np.asarray(point_noise.px**2 * T_inverse @ np.swapaxes(T_inverse, -1, -2), np.float64)
     # How unsure where it is from the body, not where both are in the world.
     from_body = p_WF - state.p_WB
     J = np.zeros((len(offered), len(state.cov)))
     J[:, columns], J[:, DP] = np.einsum("fi,fik->fk", from_body, gain), -from_body
     unsure = ((J @ state.cov) * J).sum(axis=1) + np.einsum("fi,fij,fj->f", from_body, own, from_body)
-    known = unsure <= (_KNOWN_TO * (from_body**2).sum(axis=1)) ** 2
+    known: Bool = unsure <= (_KNOWN_TO * (from_body**2).sum(axis=1)) ** 2
     if known.any():
         found = p_WF + (T_inverse @ tracks.residual_of[offered, :, None])[..., 0]
         state.add_landmarks(ids[offered[known]], found[known], p_WF[known], gain[known], columns, own[known])

@@ -89,8 +89,8 @@ def describe(keyframe: Keyframe, orb: cv2.ORB, sigma_px: float) -> tuple[Place, 
     p_WB_seen = state.p_WB + p_WC - keyframe.p_WC
     depth_sigma = np.hypot(_LEAST_DEPTH_SIGMA, sigma / np.maximum(keyframe.parallax[which], _PARALLEL))
     place = Place(state.t_ns, keyframe.segment, state.R_WB, state.p_WB, p_WB_seen, R_WC, p_WC, _levelled(state))
-    points = (array.astype(np.float32) for array in (xy_normalised, p_WF, depth_sigma))
-    return place, View(*points, descriptors)
+    xy_seen, p_known, sigma_known = (array.astype(np.float32) for array in (xy_normalised, p_WF, depth_sigma))
+    return place, View(xy_seen, p_known, sigma_known, descriptors)
 
 
 def _levelled(state: NavState) -> Float:

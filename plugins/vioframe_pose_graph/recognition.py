@@ -77,8 +77,8 @@ class Recogniser:
             self.seconds[stage] = self.seconds.get(stage, 0.0) + seconds
 
     def _view(self, number: int) -> View:
-        *points, rows = self._remembered[number]
-        return View(*points, self._index.descriptors(rows))
+        xy_normalised, p_WF, depth_sigma, rows = self._remembered[number]
+        return View(xy_normalised, p_WF, depth_sigma, self._index.descriptors(rows))
 
     def _retrieve(self, place: Place, view: View) -> list[int]:
         """Numbers of the earlier keyframes that look most like ``place``, no two of them neighbours."""
@@ -92,9 +92,10 @@ class Recogniser:
         old, index = self._remembered, DescriptorIndex()
         older = set(list(old)[1 : len(old) // 2 : 2])
         self._remembered = {}
-        for number, (*points, rows) in old.items():
+        for number, (xy_normalised, p_WF, depth_sigma, rows) in old.items():
             if number not in older:
-                self._remembered[number] = *points, index.add(self._index.descriptors(rows), number)
+                kept = index.add(self._index.descriptors(rows), number)
+                self._remembered[number] = xy_normalised, p_WF, depth_sigma, kept
         self._index = index
 
 

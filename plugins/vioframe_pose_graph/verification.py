@@ -140,7 +140,7 @@ def _shortened(values: Float, along: Float, sigma: float) -> Float:
     squared = np.sum(along**2, axis=1)
     rest = 1.0 / np.sqrt(1.0 + squared / sigma**2)
     part = np.einsum("mi,mik->mk", along, values) * ((1.0 - rest) / np.maximum(squared, _PARALLEL**2))[:, None]
-    return values - along[:, :, None] * part[:, None, :]
+    return np.asarray(values - along[:, :, None] * part[:, None, :])
 
 
 def _refined(
@@ -175,7 +175,8 @@ def _refined(
     if supporting < min_inliers or np.linalg.norm(tilt) > _MAX_TILT:
         return None
     which = [0, 1, 2, 5]
-    return Relation(p_AB - p_A, float(yaw_of(R_AB)), np.linalg.inv(H)[np.ix_(which, which)], supporting)
+    cov: Float = np.linalg.inv(H)[np.ix_(which, which)].astype(np.float64, copy=False)
+    return Relation(p_AB - p_A, float(yaw_of(R_AB)), cov, supporting)
 
 
 def hypotheses(p_1: Float, p_2: Float, ray_1: Float, ray_2: Float, centre: Float) -> tuple[Float, Float]:

@@ -192,7 +192,8 @@ def inlier_loss(
         error = (warped.gather(1, best.expand(-1, -1, 2)) - xy_b).norm(dim=-1)
         label = torch.where(error < NEAR_PX, 1.0, -1.0)
     matches = torch.cat([2.0 * xy_a / size - 1.0, 2.0 * xy_b / size - 1.0, apart[..., None]], dim=-1)
-    return 0.5 * (judge(matches.transpose(1, 2)) - label).square().mean()
+    loss: Tensor = 0.5 * (judge(matches.transpose(1, 2)) - label).square().mean()
+    return loss
 
 
 def _apart(a: Tensor, b: Tensor) -> Tensor:

@@ -167,7 +167,7 @@ def pair(picture: Picture, options: TrainingOptions, number: int, *, corners_tau
     width, height = options.size
     fit = max(width / picture.pixels.shape[1], height / picture.pixels.shape[0])
     scale = fit * (max(_LARGEST_SCALE, fit) / fit) ** rng.random()
-    shrunk = cv2.resize(picture.pixels, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    shrunk = np.asarray(cv2.resize(picture.pixels, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), np.uint8)
     room = np.maximum(0, [shrunk.shape[1] - width, shrunk.shape[0] - height])
     crop = np.eye(3)
     crop[:2, 2] = -rng.uniform(0.0, 1.0, 2) * room
@@ -240,9 +240,10 @@ def disturbed(view: View, rng: np.random.Generator, probability: float) -> View:
     if happens():
         out = out + np.float32(rng.uniform(-_BRIGHTNESS, _BRIGHTNESS))
     if happens():
-        out = cv2.GaussianBlur(out, (0, 0), rng.uniform(0.1, _BLUR_SIGMA_PX))
+        out = np.asarray(cv2.GaussianBlur(out, (0, 0), rng.uniform(0.1, _BLUR_SIGMA_PX)), np.float32)
     if happens():
-        out = cv2.filter2D(out, -1, line_kernel(rng.uniform(1.0, _MOTION_BLUR_PX), rng.uniform(0.0, np.pi)))
+        blur = line_kernel(rng.uniform(1.0, _MOTION_BLUR_PX), rng.uniform(0.0, np.pi))
+        out = np.asarray(cv2.filter2D(out, -1, blur), np.float32)
     if happens():
         out = out + rng.normal(0.0, rng.uniform(0.0, _NOISE_SIGMA), out.shape).astype(np.float32)
     clipped: View = np.clip(out, 0.0, 1.0, dtype=np.float32)

@@ -25,7 +25,7 @@ from vioframe.errors import ConfigError
 from vioframe.types import TrainingJob, TrainingStep
 from vioframe_keypointnet import weights
 from vioframe_keypointnet.detector import KeypointNet as Detector
-from vioframe_keypointnet.network import KeypointNet, fill, of_weights
+from vioframe_keypointnet.network import KeypointNet, fill, in_channels_last, of_weights
 from vioframe_keypointnet.options import KeypointNetOptions, Runtime, TrainingOptions
 from vioframe_keypointnet.quantisation import measure_ranges
 from vioframe_keypointnet.training.followed import Followed, Told, follow, followed_losses, rank_correlation, told
@@ -94,7 +94,7 @@ class KeypointNetTrainer:
 
     def _end_epoch(self, of_epoch: list[Mapping[str, float]]) -> Mapping[str, float]:
         training = self._training
-        row = {"epoch": training.step // training.epoch_steps}
+        row: dict[str, float] = {"epoch": training.step // training.epoch_steps}
         row |= {name: float(np.mean([values[name] for values in of_epoch])) for name in of_epoch[0]}
         if self._held_out:
             row |= training.validate(self._held_out)
@@ -129,7 +129,7 @@ class Training:
             torch.set_num_threads(options.threads)
         torch.manual_seed(options.seed)
         network = KeypointNet(options.architecture, options.dropout)
-        self.network = network.to(self._device, memory_format=torch.channels_last)
+        self.network = in_channels_last(network.to(self._device))
         self.judge = InlierOutlierNet().to(self._device)
         self._frozen = _detecting(self.network) if options.descriptors_only else []
         for part in self._frozen:
@@ -137,7 +137,7 @@ class Training:
         trained = [p for p in (*self.network.parameters(), *self.judge.parameters()) if p.requires_grad]
         self._optimiser = Adam(trained, lr=options.learning_rate)
         self.step = 0
-        self.target = options.target
+        self.target: str = options.target
         """That of the detector: where only descriptors are trained, it is that of the weights begun with."""
         self.worlds: list[dict[str, Any]] = []
 
@@ -343,8 +343,10 @@ def validate(
         H_21 = random_homography(np.random.default_rng([seed, 2, k]), _VALIDATION_SIZE)
         moved = cv2.warpPerspective(image, H_21, _VALIDATION_SIZE, flags=cv2.INTER_LINEAR)
         # Some of the points of one view the other does not show.
-        found = [detector.detect(view.astype(np.uint8, copy=False), 4 * _VALIDATION_TOP) for view in (image, moved)]
-        scores.append(score_pair(*found, H_21, _VALIDATION_SIZE, _VALIDATION_TOP))
+        first, second = (
+            detector.detect(view.astype(np.uint8, copy=False), 4 * _VALIDATION_TOP) for view in (image, moved)
+        )
+        scores.append(score_pair(first, second, H_21, _VALIDATION_SIZE, _VALIDATION_TOP))
     # Where nothing was found again there is no distance.
     distances = np.array([score.localisation_px for score in scores], np.float64)
     repeatability = float(np.mean([score.repeatability for score in scores]))
