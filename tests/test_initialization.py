@@ -267,6 +267,21 @@ class TestBadInput:
         assert estimate.states[-1].t_ns <= alone.states[-1].t_ns + 0.3e9
         assert judge(estimate, Motion.of(sequence), packets[0][1].t_ns).velocity < 0.1
 
+    def test_a_third_camera_that_sees_nothing_of_the_others_and_takes_turns_does_not_hold_stereo_up(self):
+        two = packaged_calibration("euroc")
+        third = replace(two.cameras[0], name="cam2", R_BC=two.cameras[0].R_BC @ so3.exp([0.0, np.pi, 0.0]))
+        calibration = replace(two, cameras=(*two.cameras, third))
+        packets = []
+        for k, (imu, t) in enumerate(
+            simulated_sequence("figure_eight", duration_s=2.0, calibration=calibration).packets
+        ):
+            turn = np.isin(t.camera, [2] if k % 2 else [0, 1])
+            own = replace(t, ids=t.ids[turn], camera=t.camera[turn], xy=t.xy[turn], xy_normalised=t.xy_normalised[turn])
+            packets.append((imu, own))
+        estimate, _ = first_estimate(packets, calibration)
+        assert estimate is not None
+        assert estimate.method == "stereo"
+
     def test_points_that_cannot_be_undistorted_are_left_out(self, sequence: TrackSequence):
         packets = []
         for imu, tracks in sequence.packets:

@@ -216,10 +216,16 @@ class Initializer:
         return static.initialise(packets, self._calibration.imu)
 
     def _take_of_rig(self, imu: ImuSegment, tracks: FrameTracks) -> None:
-        """Take a frame for a start by stereo, where one that is not linked to that before is the first."""
+        """Take a frame for a start by stereo; of those before only if readings and points lead on from them.
+
+        Cameras may take turns, also such as see nothing in common: points lead on from the last of one camera's frames.
+        """
         if len(self._given.cameras) == 1:
             return
-        if self._of_rig and not (imu.t_ns[0] == self._of_rig[-1][0].t_ns[-1] and linked(self._of_rig[-1][1], tracks)):
+        by_same = (seen for _, seen in reversed(self._of_rig) if np.isin(seen.camera, tracks.camera).any())
+        before = next(by_same, None)
+        gap = bool(self._of_rig) and imu.t_ns[0] != self._of_rig[-1][0].t_ns[-1]
+        if gap or not (before is None or linked(before, tracks)):
             self._of_rig.clear()
         self._of_rig.append((imu, tracks))
         oldest_ns = tracks.t_ns - round(_LONGEST_STEREO_S * NS_PER_S)
