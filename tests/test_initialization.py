@@ -271,13 +271,11 @@ class TestBadInput:
         two = packaged_calibration("euroc")
         third = replace(two.cameras[0], name="cam2", R_BC=two.cameras[0].R_BC @ so3.exp([0.0, np.pi, 0.0]))
         calibration = replace(two, cameras=(*two.cameras, third))
-        packets = []
-        for k, (imu, t) in enumerate(
-            simulated_sequence("figure_eight", duration_s=2.0, calibration=calibration).packets
-        ):
-            turn = np.isin(t.camera, [2] if k % 2 else [0, 1])
-            own = replace(t, ids=t.ids[turn], camera=t.camera[turn], xy=t.xy[turn], xy_normalised=t.xy_normalised[turn])
-            packets.append((imu, own))
+        sequence = simulated_sequence("figure_eight", duration_s=2.0, calibration=calibration)
+        turns = ([0, 1], [2])
+        packets = [
+            (imu, tracks.only(np.isin(tracks.camera, turns[k % 2]))) for k, (imu, tracks) in enumerate(sequence.packets)
+        ]
         estimate, _ = first_estimate(packets, calibration)
         assert estimate is not None
         assert estimate.method == "stereo"
