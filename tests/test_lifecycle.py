@@ -125,6 +125,22 @@ def test_cameras_may_take_turns(name):
     assert abs(flown - expected) < 0.02 * max(expected, 1.0)
 
 
+def test_cameras_that_take_turns_tell_standstill_each_by_its_own_images():
+    """The right one, too, and on its own once nothing comes from the left one any more."""
+    sequence = simulated_sequence("figure_eight", duration_s=3.0, seed=1, calibration=STEREO)
+    backend = Scripted()
+    backend.takes_rigs = True
+    life, picture = begun(backend, sequence=sequence), sequence.packets[0][1]
+    for k, (imu, tracks) in enumerate(sequence.packets[1:]):
+        camera = k % 2 if k < 40 else 1
+        seen = picture if camera == 0 or k < 50 else tracks  # at last the body flies
+        life.process(imu, replace(seen.of_camera(camera), t_ns=tracks.t_ns))
+    still = [(tracks.camera[0], still) for (_, tracks), still in zip(backend.given, backend.still, strict=True)]
+    assert all(stands for _, stands in still[12:46])
+    assert {camera for camera, _ in still[12:40]} == {0, 1}
+    assert not any(stands for _, stands in still[51:])
+
+
 @pytest.mark.parametrize("name", BACKENDS)
 def test_a_rig_begins_at_once_and_goes_on(name):
     """Of one of its cameras nothing comes for a while, then of the other."""

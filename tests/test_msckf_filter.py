@@ -57,6 +57,19 @@ def test_observations_are_filed_by_track_and_clone():
     assert table.ids.tolist() == [7]
 
 
+def test_what_does_not_count_is_in_view_all_the_same():
+    table = TrackTable(cameras=2)
+    both = replace(tracks(0, [1, 2, 1, 3]), camera=np.array([0, 0, 1, 1]))
+    table.add_frame(both, np.array([True, True, False, True]))
+    table.add_frame(both, np.array([True, True, False, False]))
+    assert table.seen.tolist() == [[True, False, True, False], [True, False, True, False], [False, True, False, False]]
+    assert table.in_view.tolist() == [[True] * 4, [True, False, True, False], [False, True, False, True]]
+    assert table.lengths().tolist() == [2, 2, 1]
+    assert table.in_sight().all()
+    table.drop_frame(0)
+    assert table.ids.tolist() == [1, 2, 3]
+
+
 def test_what_a_camera_that_takes_its_turn_in_other_frames_saw_last_is_in_sight():
     def seen(*by_camera: list[int]) -> FrameTracks:
         frames = [tracks(0, ids) for ids in by_camera]

@@ -288,11 +288,12 @@ def test_parallax_is_free_of_rotation():
 
 
 def test_cameras_that_take_turns_have_parallax_each_to_its_own_last_frame():
+    """Also by what does not count."""
     table, xy = TrackTable(cameras=2), np.random.default_rng(0).uniform(-0.3, 0.3, (20, 2))
     for t, (camera, moved) in enumerate([(0, 0.0), (1, 0.0), (0, 0.1), (1, 0.05)]):
         ids = 100 * camera + np.arange(20)
         seen = xy + np.array([moved, 0.0])
-        table.add_frame(FrameTracks(t, ids, np.full(20, camera), 400.0 * seen, seen))
+        table.add_frame(FrameTracks(t, ids, np.full(20, camera), 400.0 * seen, seen), np.zeros(20, bool))
     R_WC = np.tile(np.eye(3), (8, 1, 1))
     assert parallax(table, R_WC, np.array([400.0, 200.0])) == (20, pytest.approx(10.0))
     table.drop_frame(3)

@@ -25,6 +25,9 @@ Int32 = NDArray[np.int32]
 
 NS_PER_S = 1_000_000_000
 
+MOST_APART_S = 0.06
+"""Images of two cameras that are farther apart than this are of different moments, s."""
+
 GRAVITY_M_S2 = 9.81
 """Magnitude of gravity used everywhere, m/s^2."""
 

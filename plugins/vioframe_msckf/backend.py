@@ -11,6 +11,7 @@ import numpy as np
 from vioframe.estimation.factors.tracks import TrackTable
 from vioframe.estimation.inertial.noise import noise_over
 from vioframe.estimation.point_noise import PointNoise
+from vioframe.estimation.repeats import Repeats
 from vioframe.quantiles import chi2_quantile
 from vioframe.stopwatch import Stopwatch
 from vioframe.types import Estimate, FrameTracks, ImuSegment, Start, Status
@@ -48,6 +49,7 @@ class Msckf:
         self.point_noise = PointNoise(options.pixel_sigma)
         cameras = len(start.calibration.calibration.cameras)
         self._observations, self._turns = TrackTable(cameras), Turns(cameras)
+        self._repeats = Repeats(cameras, options.shared_every_s)
         dof = np.arange(1, 2 * cameras * options.max_clones + 3)
         self._gate = np.concatenate([[0.0], chi2_quantile(options.gate_quantile, dof)])
 
@@ -68,13 +70,14 @@ class Msckf:
 
         state.propagate(imu, noise_over(imu, self._noise_at_rest, self._imu_noise), options.first_estimate_jacobians)
         state.augment_clone(imu.gyro_B[-1] - state.bias_gyro_B)
-        observations.add_frame(tracks.only(~np.isin(tracks.ids, state.landmark_ids)))
+        counts, new = self._repeats.counting(tracks), ~np.isin(tracks.ids, state.landmark_ids)
+        observations.add_frame(tracks.only(new), counts[new])
         self._turns.add_frame(tracks)
         full = self._turns.most >= options.max_clones
         watch.lap("propagate")
 
         # Ahead of the tracks: what these make landmarks of has been used with what the newest frame sees of it.
-        landmarks = update_from_landmarks(state, tracks, self._turns.in_sight, options, point_noise, gate)
+        landmarks = update_from_landmarks(state, tracks.only(counts), self._turns.in_sight, options, point_noise, gate)
         watch.lap("landmark_update")
         selection = select_tracks(observations, state, options, full)
         gone, ids, p_WF = update_from_tracks(state, observations, selection, options, point_noise, gate)

@@ -18,6 +18,8 @@ class MsckfOptions:
     """Observations that a finished track must have to be used."""
     max_slam_features: NonNegativeInt = 50
     """Long-lived landmarks kept in the state; 0 makes this a pure MSCKF."""
+    shared_every_s: NonNegativeFloat = 0.5
+    """Of what a camera ahead of it in the rig sees, too, a camera counts once in so many seconds; 0: always."""
     landmark_drift_px: NonNegativeFloat = 0.1
     """How far a followed point slides off its landmark from one frame to the next, px; 0 where noise is white."""
     pixel_sigma: PositiveFloat = 0.2

@@ -24,6 +24,8 @@ class SlidingWindowOptions:
     """Frames that must have seen a landmark before it is used."""
     residual: Literal["plane", "sphere"] = "plane"
     """Where reprojection errors are measured: on the normalised image plane, or on the unit sphere."""
+    shared_every_s: NonNegativeFloat = 0.5
+    """Of what a camera ahead of it in the rig sees, too, a camera counts once in so many seconds; 0: always."""
     pixel_sigma: PositiveFloat = 0.16
     """Standard deviation of a tracked feature's position, px, at least; more is found where tracks fit worse."""
     cauchy_sigmas: PositiveFloat = 1.0

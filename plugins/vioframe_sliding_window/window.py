@@ -47,6 +47,7 @@ from vioframe.estimation.factors.tracks import LandmarkTable, TrackTable
 from vioframe.estimation.inertial.noise import noise_over
 from vioframe.estimation.inertial.preintegration import Preintegrated, join_segments, preintegrate
 from vioframe.estimation.point_noise import PointNoise
+from vioframe.estimation.repeats import Repeats
 from vioframe.estimation.standstill import Standstill
 from vioframe.geometry.cameras import intrinsics_of
 from vioframe.geometry.kernels import undistorted
@@ -103,6 +104,7 @@ class Window:
         self._cov = state.cov
         self._undistorted_with = np.empty((0, 8))  # each view's points
         self.tracks = LandmarkTable(len(sigma))
+        self._repeats = Repeats(len(sigma), options.shared_every_s)
         self._add_tracks(start.tracks)
 
     def __len__(self) -> int:
@@ -170,7 +172,7 @@ class Window:
         for c, lens in lenses:
             own = tracks.camera == c
             to_px[own] = pixels_by_residual(int(self._models[c]), lens, tracks.xy_normalised[own], on_sphere)
-        at = self.tracks.add_frame(tracks)
+        at = self.tracks.add_frame(tracks, self._repeats.counting(tracks))
         self.tracks.to_px[at] = to_px
 
     @property
@@ -363,12 +365,12 @@ def parallax(tracks: TrackTable, R_WC: Float, focal_px: Float) -> tuple[int, flo
     For each camera, of focal length ``focal_px`` (N,), the frame before is the last in which it saw anything, or just
     the last. The rotation is taken out: ``R_WC`` (V, 3, 3) is that of every view.
     """
-    N, last = tracks.cameras, tracks.seen.shape[1]
+    N, last = tracks.cameras, tracks.in_view.shape[1]
     common, moved_px = np.zeros(len(tracks.ids), bool), [np.empty(0)]
     for c in range(N):
         now, earlier = last - N + c, np.arange(last - 2 * N + c, -1, -N)
-        before = next((v for v in earlier if tracks.seen[:, v].any()), earlier[0])
-        both = tracks.seen[:, before] & tracks.seen[:, now]
+        before = next((v for v in earlier if tracks.in_view[:, v].any()), earlier[0])
+        both = tracks.in_view[:, before] & tracks.in_view[:, now]
         turned = rays(tracks.xy_normalised[both, now]) @ (R_WC[before].T @ R_WC[now]).T
         ahead = turned[:, 2] > 0.0
         moved = turned[ahead, :2] / turned[ahead, 2:] - tracks.xy_normalised[both, before][ahead]

@@ -57,7 +57,7 @@ class LifeCycle:
             raise ConfigError(f"of a rig every camera's rotation on the body must be known, that of {unknown} is not")
         self._given = calibration
         self._initializer = Initializer(calibration)
-        self._standstill = StandstillDetector(self._options.standstill_disparity_px)
+        self._standstills = [StandstillDetector(self._options.standstill_disparity_px) for _ in calibration.cameras]
         self._initial_state = initial_state
         self._following = False
         self._stands = False
@@ -83,10 +83,9 @@ class LifeCycle:
         known = self.calibration
         by = by or known
         tracks = tracks.undistorted(*known.lenses, by=by.lenses).finite()
-        apart = tracks.by_others_alone and self._initial_state is None
-        still = (
-            not apart and self._standstill.sees_standstill(tracks.of_camera(0)) and self._options.zero_velocity_update
-        )
+        camera = int(tracks.camera.min()) if len(tracks.ids) else 0  # each by its own images, where they take turns
+        still = self._standstills[camera].sees_standstill(tracks.of_camera(camera))
+        still &= self._options.zero_velocity_update
         if not self._following:
             return self._begin(imu, tracks, by.cameras[0].time_offset_ns)
         if self._initializer.in_doubt and self._initializer.follow(imu, tracks, still):
@@ -95,7 +94,7 @@ class LifeCycle:
                 Status.LOST, events=(f"lost: the camera is mounted differently; {self._initializer.found}",)
             )
         # The first frame of a standstill says that the body has come to rest, those after it that it has not set off.
-        stood, self._stands = self._stands, still or (apart and self._stands)
+        stood, self._stands = self._stands, still
         if stood and self._stands:
             return self._wait(imu, tracks, still)
         imu, self._waiting = join_segments([*(readings for readings, _, _ in self._waiting), imu]), []

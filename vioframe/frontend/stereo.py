@@ -21,8 +21,8 @@ from vioframe.types import Bool, Calibration, Float, Int
 _EPIPOLAR_PX = 2.0
 # Nearer than this nothing is matched, 1/m, nor much farther than infinity, as noise can have it.
 _NEAREST, _FARTHEST = 1.0 / 0.2, -0.02
-# Images farther apart than this are not matched, s, and a body moves between them at most as fast as this, m/s.
-MOST_APART_S, _FASTEST_M_S = 0.06, 3.0
+# Between two images that are matched a body moves at most as fast as this, m/s.
+_FASTEST_M_S = 3.0
 # Cameras overlap where one sees this part of what another does, infinitely far away or at one of these distances, m.
 _LEAST_OVERLAP, _DISTANCES_M = 0.1, (np.inf, 5.0, 1.0)
 # What was not found is looked for again every so many images: it looks different from elsewhere.

@@ -11,12 +11,12 @@ import numpy as np
 from vioframe.errors import DatasetError
 from vioframe.frontend.flow import body_rotation
 from vioframe.frontend.options import FrontendOptions
-from vioframe.frontend.stereo import MOST_APART_S, Pair, overlapping
+from vioframe.frontend.stereo import Pair, overlapping
 from vioframe.frontend.view import Shown, View
 from vioframe.incidents import Incidents
 from vioframe.interfaces import Detector
 from vioframe.stopwatch import Stopwatch
-from vioframe.types import NS_PER_S, Calibration, FrameSet, FrameTracks, Image, ImuSegment
+from vioframe.types import MOST_APART_S, NS_PER_S, Calibration, FrameSet, FrameTracks, Image, ImuSegment
 
 # Frames that are prepared at once: more than wait at any rate of a camera, unless its IMU has fallen silent.
 _MOST_PREPARED = 8

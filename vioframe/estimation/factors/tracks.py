@@ -13,17 +13,18 @@ from vioframe.types import FrameTracks
 class TrackTable:
     """F tracks over the V = K N views of K frames by N ``cameras``: the oldest frame first, those of a frame together.
 
-    ``ids`` (F,) ascending, ``seen`` (F, V); ``xy`` (F, V, 2) px and ``xy_normalised`` (F, V, 2) are zero where not
-    seen.
+    ``ids`` (F,) ascending; ``in_view`` (F, V), and of that ``seen`` (F, V) what counts; ``xy`` (F, V, 2) px and
+    ``xy_normalised`` (F, V, 2) are zero where not in view.
     """
 
     # The arrays with a row a track, and those with a row a track and a column a view.
     _by_track: tuple[str, ...] = ("ids",)
-    _by_sighting: tuple[str, ...] = ("seen", "xy", "xy_normalised")
+    _by_sighting: tuple[str, ...] = ("in_view", "seen", "xy", "xy_normalised")
 
     def __init__(self, cameras: int = 1) -> None:
         self.cameras = cameras
         self.ids: Int = np.empty(0, np.int64)
+        self.in_view: Bool = np.empty((0, 0), dtype=bool)
         self.seen: Bool = np.empty((0, 0), dtype=bool)
         self.xy: Float = np.empty((0, 0, 2))
         self.xy_normalised: Float = np.empty((0, 0, 2))
@@ -44,17 +45,17 @@ class TrackTable:
         """
         newest = np.arange(-self.cameras, 0)
         if self.cameras > 1 and len(self.ids):
-            by_camera = self.seen.any(axis=0).reshape(-1, self.cameras)
+            by_camera = self.in_view.any(axis=0).reshape(-1, self.cameras)
             if by_camera[-1].any():
                 newest += self.cameras * -by_camera[::-1].argmax(axis=0)
-        return np.asarray(self.seen[:, newest].any(axis=1))
+        return np.asarray(self.in_view[:, newest].any(axis=1))
 
     def reach_back(self) -> Bool:
         """(F,) which tracks are in the oldest frame."""
         return np.asarray(self.seen[:, : self.cameras].any(axis=1))
 
-    def add_frame(self, tracks: FrameTracks) -> tuple[Int, Int]:
-        """Append a frame; returns the rows and columns (N,) of its sightings."""
+    def add_frame(self, tracks: FrameTracks, counts: Bool | None = None) -> tuple[Int, Int]:
+        """Append a frame whose sightings all count, or those ``counts`` (N,); returns the rows and columns of all."""
         ids, views = np.union1d(self.ids, tracks.ids), self.seen.shape[1]
         old, new = np.searchsorted(ids, self.ids), np.searchsorted(ids, tracks.ids)
         for name in self._by_track:
@@ -66,7 +67,7 @@ class TrackTable:
             setattr(self, name, _placed(values, shape, (old, slice(0, views))))
         self.ids = ids
         at = new, views + tracks.camera
-        self.seen[at] = True
+        self.in_view[at], self.seen[at] = True, True if counts is None else counts
         self.xy[at], self.xy_normalised[at] = tracks.xy, tracks.xy_normalised
         return at
 
@@ -81,7 +82,7 @@ class TrackTable:
         for name in self._by_sighting:
             views = self.cameras * frame + np.arange(self.cameras)
             setattr(self, name, np.delete(getattr(self, name), views, axis=1))
-        self.keep(np.asarray(self.seen.any(axis=1)))
+        self.keep(np.asarray(self.in_view.any(axis=1)))
 
     def keep(self, keep: Bool) -> None:
         """Only the tracks ``keep`` (F,)."""
@@ -99,7 +100,7 @@ class LandmarkTable(TrackTable):
     """
 
     _by_track = ("ids", "landmarks", "known")
-    _by_sighting = ("seen", "xy", "xy_normalised", "to_px")
+    _by_sighting = ("in_view", "seen", "xy", "xy_normalised", "to_px")
 
     def __init__(self, cameras: int = 1) -> None:
         super().__init__(cameras)
