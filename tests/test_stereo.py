@@ -131,6 +131,19 @@ def test_a_camera_that_goes_black_takes_up_the_same_landmarks_again():
     assert len(np.intersect1d(pairs(again)[0], pairs(steps[2])[0])) > 15
 
 
+def test_what_a_camera_has_let_go_of_by_itself_is_not_given_back_to_it():
+    """Something is before the right lens in one frame; what it hid is there again in the next, and the left saw it."""
+    images = flown(12)
+    images[3] = (images[3][0], images[3][1].copy())
+    images[3][1][40:200] = 90
+    steps = play(RIG, images)
+    right = [tracks.of_camera(1).ids for tracks in steps]
+    hidden = np.setdiff1d(right[2], right[3])
+    hidden = hidden[np.isin(hidden, steps[-1].of_camera(0).ids)]
+    assert len(hidden) > 10
+    assert not any(np.isin(hidden, later).any() for later in right[3:])
+
+
 def test_a_camera_that_brings_no_image_holds_up_no_other():
     images = flown(6)
     images[2] = (None, images[2][1])

@@ -39,6 +39,8 @@ class Pair:
     def __init__(self, first: int, second: int, overlap: float) -> None:
         self.first, self.second, self.overlap = first, second, overlap
         self._not_found: Int = np.empty(0, np.int64)
+        self._shared: Int = np.empty(0, np.int64)  # what both saw last
+        self._let_go: Int = np.empty(0, np.int64)
         self._images = 0
 
     def match(
@@ -50,8 +52,15 @@ class Pair:
         second, which is to follow no more than ``most`` points.
         """
         one, other = views[self.first], views[self.second]
+        if one.is_featureless or other.is_featureless:
+            self._shared = self._shared[:0]
+            return
+        _, i, j = np.intersect1d(one.ids, other.ids, assume_unique=True, return_indices=True)
+        # What a camera no longer follows was hidden or has slid off its landmark, and would be taken up where it did.
+        gone = np.append(self._let_go, np.setdiff1d(self._shared, other.ids, assume_unique=True))
+        self._let_go, self._shared = one.ids[np.isin(one.ids, gone)], one.ids[i]
         lets_go = self.first < self.second  # of the two it is this one that does
-        if one.is_featureless or other.is_featureless or not (lets_go or other.wanted(most)):
+        if not (lets_go or other.wanted(most)):
             return
         self._images += 1
         if self._images % _AGAIN_IMAGES == 0:
@@ -60,19 +69,17 @@ class Pair:
         then = replace(first, R_BC=R_B1B2.T @ first.R_BC, p_BC=R_B1B2.T @ first.p_BC)
         R_C2C1, p_C2C1 = then.seen_from(calibration.cameras[self.second])
         nearest = _EPIPOLAR_PX / other.camera.focal_px, _FASTEST_M_S * apart_s
-        _, i, j = np.intersect1d(one.ids, other.ids, assume_unique=True, return_indices=True)
         right, rho = _agreement(one.xy_normalised[i], other.xy_normalised[j], R_C2C1, p_C2C1, nearest)
         wrong, typical = ~right, float(np.median(rho[right])) if right.any() else 0.0
         if lets_go and wrong.any():
             keep = np.ones(len(other.ids), bool)
             keep[j[wrong]] = False
-            self._not_found = np.append(self._not_found, one.ids[i[wrong]])
             other.keep(keep)
 
         wanted = other.wanted(most)
         if not wanted:
             return
-        tried = np.isin(one.ids, self._not_found)
+        tried = np.isin(one.ids, np.append(self._not_found, self._let_go))
         tried[i] = True
         new = np.flatnonzero(~tried)
         p_C2 = rays(one.xy_normalised[new]) @ R_C2C1.T + max(typical, 0.0) * p_C2C1
