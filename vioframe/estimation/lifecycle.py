@@ -61,8 +61,8 @@ class LifeCycle:
         self._initial_state = initial_state
         self._following = False
         self._stands = False
-        # Frames in which it seems to stand still, which the back-end has yet to be given: readings, tracks, if so.
-        self._waiting: list[tuple[ImuSegment, FrameTracks, bool]] = []
+        # Frames in which it seems to stand still, which the back-end has yet to be given.
+        self._waiting: list[tuple[ImuSegment, FrameTracks]] = []
         self._settled = Estimate(Status.INITIALISING)  # the newest that is the back-end's own
         self._last: NavState | None = None
         self._corrected_ns = 0
@@ -96,25 +96,25 @@ class LifeCycle:
         # The first frame of a standstill says that the body has come to rest, those after it that it has not set off.
         stood, self._stands = self._stands, still
         if stood and self._stands:
-            return self._wait(imu, tracks, still)
-        imu, self._waiting = join_segments([*(readings for readings, _, _ in self._waiting), imu]), []
+            return self._wait(imu, tracks)
+        imu, self._waiting = join_segments([*(readings for readings, _ in self._waiting), imu]), []
         return self._follow(imu, tracks, still)
 
-    def _wait(self, imu: ImuSegment, tracks: FrameTracks, still: bool) -> Estimate:
+    def _wait(self, imu: ImuSegment, tracks: FrameTracks) -> Estimate:
         """A frame that shows the picture of half a second before: the body stood still, and may be about to set off.
 
         That is seen too late, so the back-end is given the frame of a while ago, in which the body surely stood still,
         and the readings lead from there to this one. Once the body is seen to move, the back-end has them, too.
         """
-        self._waiting.append((imu, tracks, still))
+        self._waiting.append((imu, tracks))
         estimate = Estimate(Status.TRACKING, corrected=False, calibration=self._settled.calibration)
         while tracks.t_ns - self._waiting[0][1].t_ns >= SETTLED_NS:
-            estimate = self._follow(*self._waiting.pop(0))
+            estimate = self._follow(*self._waiting.pop(0), still=True)
             if estimate.status is not Status.TRACKING:
                 return estimate
         state, noise = self._settled.state, self._options.in_flight(self.calibration.imu)
         assert state is not None
-        since = join_segments([readings for readings, _, _ in self._waiting])
+        since = join_segments([readings for readings, _ in self._waiting])
         self._last = preintegrate(since, state.bias_gyro_B, state.bias_accel_B, noise).predict(state)
         return replace(estimate, state=self._last)
 
