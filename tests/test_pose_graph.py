@@ -274,6 +274,8 @@ def test_fewer_keyframes_drift_as_far():
     assert np.array_equal(few.p, p[which])
     i, j = np.triu_indices(len(which))
     np.testing.assert_allclose(few.cov(i, j), graph.cov(which[i], which[j]), rtol=1e-9, atol=1e-9)
+    few, graph = few.as_told(2.0), graph.as_told(2.0)
+    np.testing.assert_allclose(few.cov(i, j), graph.cov(which[i], which[j]), rtol=1e-9, atol=1e-9)
 
 
 def claimed(p, added, first):
@@ -299,8 +301,19 @@ def test_the_odometry_drifts_by_what_its_back_end_says():
     )
     np.testing.assert_allclose(once.drift[1:], added[1:], atol=1e-9)
     np.testing.assert_allclose(thrice.drift, 9.0 * once.drift, atol=1e-9)
+    # Which concerns the limit alone: what it says is what it says, and at least what the best drift by.
+    np.testing.assert_array_equal(thrice.told, once.told)
+    beside = np.diagonal(once.told - added, axis1=1, axis2=2)[1:]
+    np.testing.assert_allclose(beside, np.square([[0.003] * 3 + [np.radians(0.01)]]) * least_way(t_ns, p), atol=1e-12)
     relative = claimed(p[10:31], added[10:31], np.zeros((4, 4)))[-1]
     np.testing.assert_allclose(once.cov(np.array([10]), np.array([30]))[0], relative, atol=1e-8)
+
+
+def least_way(t_ns, p):
+    """(N - 1, 4) what the least drift of each step grows with: metres, some of them for hovering, and seconds."""
+    seconds = np.diff(t_ns) * 1e-9
+    way = np.linalg.norm(np.diff(p, axis=0), axis=1) + 0.1 * seconds
+    return np.column_stack([way, way, way, seconds])
 
 
 def test_images_that_told_more_than_was_lost_take_no_drift_away():
@@ -314,8 +327,11 @@ def test_images_that_told_more_than_was_lost_take_no_drift_away():
     assert np.linalg.eigvalsh(step - walk[20]).min() > -1e-12
     unknown = said.copy()
     unknown[12] = np.nan
-    drift = Odometry.of(t_ns, p, segment, OPTIONS, unknown).drift
+    odometry = Odometry.of(t_ns, p, segment, OPTIONS, unknown)
+    drift = odometry.drift
     np.testing.assert_array_equal(drift[12:14], walk[12:14])
+    np.testing.assert_array_equal(odometry.told[12:14], walk[12:14])
+    assert (np.trace(drift - odometry.told, axis1=1, axis2=2)[[11, 14]] > 0.0).all()
     assert (np.trace(drift[[11, 14]] - walk[[11, 14]], axis1=1, axis2=2) > 0.0).all()
 
 
@@ -335,6 +351,35 @@ def test_loops_of_one_place_count_once():
     assert believed.all()
 
 
+def flown(seed, sigma_m, sigma_yaw, said_m, said_yaw, loop_sigma):
+    """Root mean square errors, m, of an odometry and of its path with the loops of three laps.
+
+    Its steps are off by ``sigma_m`` and ``sigma_yaw``, and it says by ``said_m`` and ``said_yaw``.
+    """
+    rng = np.random.default_rng(seed)
+    t_ns, p, _ = circle(laps=3)
+    odometry, yaw_error = drifted(p, rng, sigma_m, sigma_yaw)
+    step = np.diag(np.square([said_m, said_m, said_m, said_yaw]))
+    cov = claimed(odometry, np.tile(step, (len(p), 1, 1)), 1e-6 * np.eye(4))
+    graph = Odometry.of(t_ns, odometry, np.zeros(len(p), int), OPTIONS, cov)
+    loops = true_loops(p, yaw_error, [(i, i + 40) for i in range(1, 80, 8)], loop_sigma, rng)
+    corrected_p, _, believed = corrected(graph, loops, t_ns, every(loops))
+    assert believed.all()
+    return [np.sqrt(np.mean(np.sum((path - p) ** 2, axis=1))) for path in (odometry, corrected_p)]
+
+
+def test_loops_do_not_harm_an_odometry_that_knows_better():
+    """Both are off by 5 cm, and say so: the loops add to what is known, and would take from it if they always won."""
+    errors = np.array([flown(seed, 0.003, 0.0002, 0.003, 0.0002, (0.05, 0.005)) for seed in range(12)])
+    assert errors[:, 1].mean() < 0.9 * errors[:, 0].mean()
+
+
+def test_an_odometry_that_claims_too_much_is_corrected_by_what_loops_show():
+    """It drifts twenty times as fast as it says; taken at its word it would be off by half as much again."""
+    errors = np.array([flown(seed, 0.06, 0.004, 0.003, 0.0002, (0.02, 0.003)) for seed in range(12)])
+    assert errors[:, 1].mean() < 0.3 * errors[:, 0].mean()
+
+
 def test_a_segment_after_a_reset_is_hardly_tied_to_the_one_before():
     t_ns, p, _ = circle(laps=1)
     segment = (np.arange(len(p)) >= 20).astype(int)
@@ -342,6 +387,7 @@ def test_a_segment_after_a_reset_is_hardly_tied_to_the_one_before():
     tied, across = graph.cov(np.array([0, 19]), np.array([19, 20]))
     assert np.sqrt(across[0, 0]) > 2.0 > 4.0 * np.sqrt(tied[0, 0])
     assert np.sqrt(across[3, 3]) >= 1.0
+    np.testing.assert_array_equal(graph.as_told().cov(np.array([19]), np.array([20]))[0], across)
 
 
 def test_loops_bring_a_lost_segment_home():

@@ -4,7 +4,8 @@ A place may have a twin: shelves, windows, a texture laid out again and again. I
 itself, so the picture cannot tell; where it would put the body can.
 
 How far the odometry is trusted is what its back-end says of itself, made larger, and a random walk of position and yaw
-at least.
+at least: no right loop may be turned away. Those that are believed are weighed against what it says, or what they show
+where that is more: a loop is off by a centimetre, and so are some odometries, which a loop that always wins would harm.
 """
 
 from __future__ import annotations
@@ -25,6 +26,10 @@ from vioframe_pose_graph.recognition import Sighting
 _SPAN = 4
 # Position also drifts where nothing moves, as far as it would along this many metres a second.
 _HOVERING_M_S = 0.1
+# As little as this an odometry drifts at best, whatever it says: m after 1 m, and rad after 1 s.
+_LEAST_DRIFT, _LEAST_YAW_DRIFT = 0.003, np.radians(0.01)
+# By how much more than an odometry says it drifts may be tried, up to a hundred times.
+_TIMES = 1.1 ** np.arange(50)
 # Between two segments nothing is known but that the body cannot have gone far.
 _LOST_SPEED_M_S, _LOST_M, _LOST_YAW = 5.0, 5.0, 1.0
 REPEAT_NS = 3 * NS_PER_S
@@ -38,12 +43,13 @@ _SIGMA_M, _SIGMA_PART, _SIGMA_YAW = 0.02, 0.02, np.radians(0.2)
 class Odometry:
     """N keyframes as the odometry placed them, and how far each step may have led astray.
 
-    ``p`` (N, 3) m; ``drift`` (N, 4, 4) is the covariance that the step to each added to [position yaw], 0 for the
-    first.
+    ``p`` (N, 3) m; ``drift`` (N, 4, 4) is the covariance that the step to each added to [position yaw] at most, 0 for
+    the first, and ``told`` (N, 4, 4) what its back-end says.
     """
 
     p: Float
     drift: Float
+    told: Float
 
     @classmethod
     def of(cls, t_ns: Int, p: Float, segment: Int, options: PoseGraphOptions, cov: Float | None = None) -> Odometry:
@@ -54,24 +60,37 @@ class Odometry:
         """
         dt = np.diff(t_ns, prepend=t_ns[:1]) * 1e-9
         steps = np.diff(p, axis=0, prepend=p[:1])
-        drift = np.zeros((len(p), 4, 4))
+        way = np.linalg.norm(steps, axis=1) + _HOVERING_M_S * dt
+        drift, told = (
+            np.eye(4) * np.stack([position**2 * way] * 3 + [yaw**2 * dt], axis=1)[:, None]
+            for position, yaw in (
+                (options.position_drift, np.radians(options.yaw_drift_deg)),
+                (_LEAST_DRIFT, _LEAST_YAW_DRIFT),
+            )
+        )
+        said = np.zeros(len(p), bool)
         if cov is not None:
-            added = options.overconfidence**2 * (cov[1:] - _seen_from_afar(cov[:-1], steps[1:]))
-            said = np.isfinite(added).all(axis=(1, 2))
-            values, vectors = np.linalg.eigh(added[said])
-            drift[1:][said] = (vectors * np.maximum(values, 0.0)[:, None]) @ np.swapaxes(vectors, 1, 2)
-        way = np.linalg.norm(steps, axis=1)
-        drift[:, [0, 1, 2], [0, 1, 2]] += options.position_drift**2 * (way + _HOVERING_M_S * dt)[:, None]
-        drift[:, 3, 3] += np.radians(options.yaw_drift_deg) ** 2 * dt
+            added = cov[1:] - _seen_from_afar(cov[:-1], steps[1:])
+            said[1:] = np.isfinite(added).all(axis=(1, 2))
+            values, vectors = np.linalg.eigh(added[said[1:]])
+            added = (vectors * np.maximum(values, 0.0)[:, None]) @ np.swapaxes(vectors, 1, 2)
+            drift[said] += options.overconfidence**2 * added
+            told[said] += added
         broken = np.diff(segment, prepend=segment[:1]) > 0
         lost = np.full((np.count_nonzero(broken), 4), _LOST_YAW)
         lost[:, :3] = (_LOST_M + _LOST_SPEED_M_S * dt[broken])[:, None]
         drift[broken] = np.eye(4) * lost[:, None] ** 2
-        return cls(p, drift)
+        told[broken | ~said] = drift[broken | ~said]
+        return cls(p, drift, told)
 
     def at(self, which: Int) -> Odometry:
         """The keyframes ``which`` (M,), in their order: fewer and longer steps."""
-        return Odometry(self.p[which], self.cov(np.concatenate([which[:1], which[:-1]]), which))
+        before = np.concatenate([which[:1], which[:-1]])
+        return Odometry(self.p[which], self.cov(before, which), self.as_told().cov(before, which))
+
+    def as_told(self, times: float = 1.0) -> Odometry:
+        """The same, drifting no farther than ``times`` what its back-end says."""
+        return replace(self, drift=times**2 * self.told)
 
     def edges(self) -> Edges:
         """Edges from every keyframe to the four before it.
@@ -110,9 +129,8 @@ def measured(sightings: Sequence[Sighting]) -> Edges:
 
 def within_drift(loops: Edges, odometry: Odometry) -> Bool:
     """(S,) whether what a loop says is as near to what the odometry says as its drift can explain."""
-    i, j = loops.i, loops.j
-    error = np.column_stack([loops.z - (odometry.p[j] - odometry.p[i]), loops.turn])
-    return np.asarray(mahalanobis_squared(error, odometry.cov(i, j) + loops.cov) < GATE)
+    cov = odometry.cov(loops.i, loops.j) + loops.cov
+    return np.asarray(mahalanobis_squared(_innovation(loops, odometry), cov) < GATE)
 
 
 def agreed(loops: Edges, odometry: Odometry, t_ns: Int) -> Bool:
@@ -137,12 +155,31 @@ def corrected(odometry: Odometry, loops: Edges, t_ns: Int, trusted: Bool) -> tup
 
     Loops that tie one stretch to one other are of the same landmarks, and off by the same: together they count once.
     """
-    edges = odometry.edges()
-    p, yaw, used = solve_robustly(odometry.p, edges, loops, trusted)
+    p, yaw, used = solve_robustly(odometry.p, odometry.edges(), loops, trusted)
     if used.any():
         believed = loops.select(used)
-        p, yaw = solve(p, yaw, edges + replace(believed, cov=believed.cov * _alike(believed, t_ns)[:, None, None]))
+        alike = _alike(believed, t_ns)
+        weighed = replace(believed, cov=believed.cov * alike[:, None, None])
+        p, yaw = solve(p, yaw, _as_shown(odometry, believed, alike).edges() + weighed)
     return p, yaw, used
+
+
+def _as_shown(odometry: Odometry, loops: Edges, alike: Int) -> Odometry:
+    """The odometry drifting as told, or as much farther as ``loops`` (L,) show, ``alike`` (L,) of which are of one.
+
+    Their squared Mahalanobis distances from where it puts them are four in the mean if it drifts as is assumed.
+    """
+    error, told = _innovation(loops, odometry), odometry.as_told().cov(loops.i, loops.j)
+    for times in _TIMES:
+        squares = mahalanobis_squared(error, times**2 * told + loops.cov)
+        if np.average(squares, weights=1.0 / alike) <= 4.0:
+            break
+    return odometry.as_told(times)
+
+
+def _innovation(loops: Edges, odometry: Odometry) -> Float:
+    """(L, 4) how far from where the odometry puts them the loops put their later bodies, and how they turn them."""
+    return np.column_stack([loops.z - (odometry.p[loops.j] - odometry.p[loops.i]), loops.turn])
 
 
 def _alike(loops: Edges, t_ns: Int) -> Int:

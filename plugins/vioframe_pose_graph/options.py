@@ -5,7 +5,11 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PoseGraphOptions:
-    """Lengths and angles of drift are what an odometry is trusted with, not what it is hoped to reach."""
+    """Lengths and angles of drift are the most that an odometry is suspected of, not what it is hoped to reach.
+
+    By them loops are judged, so that twins of a place are told from it. What is believed is weighed by what the
+    odometry says itself.
+    """
 
     parallax_px: float = 20.0
     """Image motion, turning left out, after which a frame becomes the next keyframe."""
@@ -16,12 +20,12 @@ class PoseGraphOptions:
     min_inliers: int = 25
     """Points that must support a loop."""
     overconfidence: float = 3.0
-    """How many times as far as its covariance says the odometry drifts; filters know too little of what they do not
+    """How many times as far as its covariance says the odometry may drift; filters know too little of what they do not
     know."""
     position_drift: float = 0.03
-    """Least drift of the odometry's position, m after 1 m; it grows with the square root of the way."""
+    """More that the odometry's position may drift by, m after 1 m; it grows with the square root of the way."""
     yaw_drift_deg: float = 0.2
-    """Least drift of the odometry's yaw, deg after 1 s; it grows with the square root of the time."""
+    """More that the odometry's yaw may drift by, deg after 1 s; it grows with the square root of the time."""
 
     def __post_init__(self) -> None:
         if self.max_corners < 1 or self.min_inliers < 4:
