@@ -18,6 +18,8 @@ RUNS := $(DETECTORS:%=$(DEMO)/%) $(DEMO)/sliding_window
 SYSTEM_LIBRARIES := libusb-1.0-0 libgl1 libgomp1 libx11-6 libegl1
 BROWSER := chromium chromium-driver
 
+# The tests begin many programs, each of which would compile every module anew.
+unexport PYTHONDONTWRITEBYTECODE
 export OMP_NUM_THREADS := 1
 export OPENBLAS_NUM_THREADS := 1
 

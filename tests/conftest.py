@@ -2,10 +2,12 @@
 
 import os
 import signal
+from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 
 import pytest
+from simulation_helpers import textures_drawn_once
 from threadpoolctl import threadpool_limits
 
 from vioframe.frontend.warming import load_kernels
@@ -42,6 +44,14 @@ def pytest_sessionstart(session: pytest.Session) -> None:
         parts = [partial(warm_up, installed.create_backend(name), calibration) for name in BACKENDS]
         for compile_part in [*parts, load_kernels][number :: worker["workercount"]]:
             compile_part()
+
+
+@pytest.fixture(scope="session", autouse=True)
+def remembered_textures() -> Iterator[None]:
+    """Worlds of one seed look the same, and most tests' are of one."""
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr("vioframe.simulation.textures.procedural_textures", textures_drawn_once)
+        yield
 
 
 @pytest.fixture

@@ -12,7 +12,7 @@ import pytest
 from click.testing import CliRunner
 from recordings import assert_same_rig
 from rosbags.highlevel import AnyReader
-from simulation_helpers import INSTALLED, drawn_textures, small_calibration, small_simulation, textures_drawn_once
+from simulation_helpers import INSTALLED, drawn_textures, small_calibration, small_simulation
 
 from vioframe.cli import main
 from vioframe.errors import ConfigError, DatasetError, TrajectoryError
@@ -54,13 +54,6 @@ def under(tmp_path, condition: str, level: float = 1.0, **settings):
     return small_simulation(
         tmp_path, duration_s=settings.pop("duration_s", 0.5), conditions={condition: level}, **settings
     )
-
-
-@pytest.fixture(scope="module", autouse=True)
-def remembered_textures():
-    with pytest.MonkeyPatch.context() as patched:
-        patched.setattr("vioframe.simulation.textures.procedural_textures", textures_drawn_once)
-        yield
 
 
 @pytest.fixture(scope="module")
