@@ -26,8 +26,8 @@ from vioframe_pose_graph.recognition import Sighting
 _SPAN = 4
 # Position also drifts where nothing moves, as far as it would along this many metres a second.
 _HOVERING_M_S = 0.1
-# As little as this an odometry drifts at best, whatever it says: m after 1 m, and rad after 1 s.
-_LEAST_DRIFT, _LEAST_YAW_DRIFT = 0.003, np.radians(0.01)
+# As little as this an odometry drifts at best, whatever it says: x, y and z, m after 1 m, and yaw, rad after 1 s.
+_LEAST_DRIFT = np.array([0.003, 0.003, 0.003, np.radians(0.01)])
 # By how much more than an odometry says it drifts may be tried, up to a hundred times.
 _TIMES = 1.1 ** np.arange(50)
 # Between two segments nothing is known but that the body cannot have gone far.
@@ -61,13 +61,9 @@ class Odometry:
         dt = np.diff(t_ns, prepend=t_ns[:1]) * 1e-9
         steps = np.diff(p, axis=0, prepend=p[:1])
         way = np.linalg.norm(steps, axis=1) + _HOVERING_M_S * dt
-        drift, told = (
-            np.eye(4) * np.stack([position**2 * way] * 3 + [yaw**2 * dt], axis=1)[:, None]
-            for position, yaw in (
-                (options.position_drift, np.radians(options.yaw_drift_deg)),
-                (_LEAST_DRIFT, _LEAST_YAW_DRIFT),
-            )
-        )
+        walked = np.column_stack([way, way, way, dt])
+        most = np.array([options.position_drift] * 3 + [np.radians(options.yaw_drift_deg)])
+        drift, told = (np.eye(4) * (rate**2 * walked)[:, None] for rate in (most, _LEAST_DRIFT))
         said = np.zeros(len(p), bool)
         if cov is not None:
             added = cov[1:] - _seen_from_afar(cov[:-1], steps[1:])
