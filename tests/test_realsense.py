@@ -578,7 +578,7 @@ def test_a_flight_by_an_emulated_device_is_the_same_again_from_its_recording(tmp
     (tmp_path / "rig").mkdir()
     # It rests at first: that is enough to begin on a computer that is busy otherwise.
     settings = {"flight": {"name": "stop_and_go"}, "duration_s": 9.0, "frame_rate_hz": 10.0}
-    simulated = small_simulation(tmp_path / "rig", workers=2, rig=rig, **settings)
+    simulated = small_simulation(tmp_path / "rig", rig=rig, **settings)
     measured = list(simulated.measurements())
     emulated = Emulated(rig, rate_hz=10)
     monkeypatch.setattr(devices, "_context", lambda: SimpleNamespace(query_devices=lambda: [emulated.device]))

@@ -692,7 +692,7 @@ class TestFlight:
             )
         flight = {"name": "stop_and_go", "options": {"speed": 2.0}}
         world = {"name": "hall", "options": {"images": folder / "textures"}}
-        simulated = small_simulation(folder, workers=2, divisor=2, duration_s=6.0, flight=flight, world=world)
+        simulated = small_simulation(folder, divisor=2, duration_s=6.0, flight=flight, world=world)
         convert(simulated.measurements(), simulated.calibration, folder / "flight.mcap")
         return folder / "flight.mcap"
 
