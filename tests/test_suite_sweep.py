@@ -62,7 +62,7 @@ def flown(tmp_path_factory, toy) -> tuple[Sweep, list[str], Path]:
     folder = tmp_path_factory.mktemp("flown")
     with pytest.MonkeyPatch.context() as monkeypatch:
         set_up(folder, monkeypatch)
-        return run(folder, GRID, toy)
+        return run(folder, GRID, toy, workers=2)
 
 
 @pytest.fixture
@@ -215,9 +215,9 @@ class TestSweep:
 
 @pytest.mark.usefixtures("parts")
 def test_a_simulated_recording_is_made_once_and_goes_when_it_is_no_longer_needed(tmp_path):
-    text = GRID.replace("TOY", "{name: hover, duration_s: 0.3}").replace("shi_tomasi, fast", "fast")
-    outcome, progress, path = run(tmp_path, text + "conditions: {noise: [0.5]}\n", tmp_path, workers=2)
-    assert (outcome.done, outcome.failed) == (4, {})
+    text = GRID.replace("TOY", "{name: hover, duration_s: 0.5}") + "conditions: {noise: [0.5]}\n"
+    outcome, progress, path = run(tmp_path, text, tmp_path, workers=2)
+    assert (outcome.done, outcome.failed) == (8, {})
     assert sum(label.endswith(" simulated") for label in progress) == 2
     assert not (path / "recordings").exists()
     assert {row["data"] for row in found(path)} == {Data.SIMULATED}

@@ -5,7 +5,7 @@ itself, so the picture cannot tell; where it would put the body can.
 
 How far the odometry is trusted is what its back-end says of itself, made larger, and a random walk of position and yaw
 at least: no right loop may be turned away. Those that are believed are weighed against what it says, or what they show
-where that is more: a loop is off by a centimetre, and so are some odometries, which a loop that always wins would harm.
+where that is more: a loop is off, too, and one that always won would harm an odometry that knows better.
 """
 
 from __future__ import annotations
