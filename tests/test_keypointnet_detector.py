@@ -100,10 +100,10 @@ def response_of_peaks(shape=(120, 160), seed=0):
     return cv2.GaussianBlur(np.random.default_rng(seed).normal(size=shape).astype(np.float32), (0, 0), 1.0)
 
 
-def folded(response):
-    """As networks give it: (H/2, W/2, 4)."""
-    rows, columns = response.shape[0] // 2, response.shape[1] // 2
-    return response.reshape(rows, 2, columns, 2).swapaxes(1, 2).reshape(rows, columns, 4)
+def folded(response, f=2):
+    """As networks give it: (H/f, W/f, f^2)."""
+    rows, columns = response.shape[0] // f, response.shape[1] // f
+    return response.reshape(rows, f, columns, f).swapaxes(1, 2).reshape(rows, columns, f * f)
 
 
 def peaks_by_definition(response, image, shape, rules):
@@ -119,16 +119,17 @@ def peaks_by_definition(response, image, shape, rules):
     return np.array(kept)
 
 
+@pytest.mark.parametrize("fold", [2, 4])
 @pytest.mark.parametrize("nms_px", [0.0, 3.0, 4.0, 4.5, 15.0])
-def test_peaks_are_as_defined(nms_px):
+def test_peaks_are_as_defined(nms_px, fold):
     response, image, rules = response_of_peaks(), half_blank((120, 160)), rules_of(nms_px, 4)
-    xy, score = peaks(folded(response), image, (110, 155), 1000, rules)
+    xy, score = peaks(folded(response, fold), image, (110, 155), 1000, rules)
     expected = peaks_by_definition(response, image, (110, 155), rules)
     assert len(expected) > 5
     assert np.array_equal(np.round(xy)[:, ::-1], expected)
     assert np.allclose(score, 1.0 / (1.0 + np.exp(-response[tuple(expected.T)])))
     assert 0.05 < np.abs(xy - np.round(xy)).mean() < 0.35
-    first, _ = peaks(folded(response), image, (110, 155), 7, rules)
+    first, _ = peaks(folded(response, fold), image, (110, 155), 7, rules)
     assert np.array_equal(first, xy[:7])
 
 

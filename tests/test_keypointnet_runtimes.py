@@ -17,7 +17,7 @@ from vioframe_keypointnet.graph import model  # noqa: E402
 from vioframe_keypointnet.network import describe as describe_in_torch  # noqa: E402
 from vioframe_keypointnet.options import KeypointNetOptions  # noqa: E402
 from vioframe_keypointnet.quantisation import measure_ranges  # noqa: E402
-from vioframe_keypointnet.selection import by_pixels, candidate_places, describe  # noqa: E402
+from vioframe_keypointnet.selection import candidate_places, describe, response_at  # noqa: E402
 
 ON_CPU = ("openvino", "torch")
 each_architecture = pytest.mark.parametrize("architecture", ARCHITECTURES.values(), ids=ARCHITECTURES)
@@ -121,7 +121,11 @@ def test_places_are_those_of_the_trained_network():
 @pytest.mark.parametrize("architecture", [COMPACT, QUICK, FAR], ids=lambda a: a.name)
 def test_the_response_of_each_pixel_is_that_of_the_trained_network(architecture):
     (response, _), found = as_trained(network(architecture), texture())
-    assert np.array_equal(by_pixels(response), torch.nn.functional.pixel_shuffle(found.response, 8)[0, 0].numpy())
+    levels = architecture.fold.bit_length() - 1
+    rows, columns = np.indices(texture().shape)
+    at = np.vectorize(lambda row, column: response_at(response.reshape(len(response), -1), levels, row, column))
+    expected = torch.nn.functional.pixel_shuffle(found.response, 8)[0, 0].numpy()
+    assert np.array_equal(at(rows, columns), expected)
 
 
 @pytest.mark.parametrize("descriptors", [False, True])

@@ -37,11 +37,11 @@ class Eye:
 
     def _make_room(self, rows: int, columns: int) -> None:
         """Arrays for images of one size: as new ones each time they would take longer than what fills them."""
-        self._contrast, self._steps = np.empty((rows, columns), np.float32), np.empty((rows, columns), np.uint8)
+        self._contrast = np.empty((rows, columns), np.uint8 if self._eight_bits else np.float32)
         f = self._fold
         self._seen = np.empty((f * f, rows // f, columns // f), np.uint8 if self._eight_bits else np.float32)
         self._coarse, self._means = (np.empty((rows // COARSE_PX, columns // COARSE_PX), np.float32) for _ in range(2))
-        self._around = np.empty((rows // COARSE_PX, columns), np.float32)
+        self._mean, self._variance = (np.empty((rows // COARSE_PX, columns), np.float32) for _ in range(2))
 
     def __call__(self, image: Image) -> Floats | Image:
         if self._fold == 1:
@@ -51,26 +51,28 @@ class Eye:
         if image.shape != self._contrast.shape:
             self._make_room(rows, columns)
         _means(image, self._coarse)
-        _take_away(image, self._smoothed(), self._contrast, self._coarse)
-        _divide(self._contrast, self._smoothed(), _FAINT)
+        self._smooth(self._mean)
+        _variances(image, self._mean, self._coarse)
+        self._smooth(self._variance)
         if self._eight_bits:
-            _round(self._contrast, np.float32(1.0) / CONTRAST_STEP, self._steps)
+            _contrast_in_steps(image, self._mean, self._variance, self._contrast)
             # The pixels of a row that one place holds are one whole number, of which a cast takes the lowest.
-            places = self._steps.view(f"<u{f}").reshape(rows // f, f, columns // f).swapaxes(0, 1)
+            places = self._contrast.view(f"<u{f}").reshape(rows // f, f, columns // f).swapaxes(0, 1)
             for k in range(f):
                 np.right_shift(places, 8 * k, out=self._seen[k::f], casting="unsafe")
         else:
+            _contrast(image, self._mean, self._variance, self._contrast)
             by_place = self._contrast.reshape(rows // f, f, columns // f, f).transpose(1, 3, 0, 2)
             self._seen.reshape(f, f, rows // f, columns // f)[:] = by_place
         return self._seen
 
-    def _smoothed(self) -> Floats:
-        """(H/4, W): the mean of the coarse values around each, interpolated within the rows; kernels do it between."""
+    def _smooth(self, around: Floats) -> None:
+        """Fill ``around`` (H/4, W) with the mean of the coarse values about each, interpolated within the rows; kernels
+        do it between."""
         import cv2
 
         cv2.blur(self._coarse, (_AROUND, _AROUND), self._means, borderType=cv2.BORDER_REPLICATE)
-        cv2.resize(self._means, self._around.shape[::-1], self._around, interpolation=cv2.INTER_LINEAR)
-        return self._around
+        cv2.resize(self._means, around.shape[::-1], around, interpolation=cv2.INTER_LINEAR)
 
 
 @kernel
@@ -96,8 +98,8 @@ def _means(image: Image, coarse: Floats) -> None:
 
 
 @kernel
-def _take_away(image: Image, mean: Floats, off: Floats, variance: Floats) -> None:
-    """``off`` (H, W) becomes the image less its local ``mean``, ``variance`` the mean square of each 4 x 4 px."""
+def _variances(image: Image, mean: Floats, variance: Floats) -> None:
+    """Fill ``variance`` (H/4, W/4) with the mean square, over each 4 x 4 px, of the image less its local ``mean``."""
     rows, columns = variance.shape
     total = np.empty(image.shape[1], np.float32)
     for r in range(rows):
@@ -107,7 +109,6 @@ def _take_away(image: Image, mean: Floats, off: Floats, variance: Floats) -> Non
             rest = np.float32(1.0) - share
             for x in range(len(total)):
                 difference = np.float32(image[y, x]) - (rest * mean[above, x] + share * mean[below, x])
-                off[y, x] = difference
                 total[x] += difference * difference
         for c in range(columns):
             x = COARSE_PX * c
@@ -115,20 +116,30 @@ def _take_away(image: Image, mean: Floats, off: Floats, variance: Floats) -> Non
 
 
 @kernel
-def _divide(off: Floats, variance: Floats, faint: np.float32) -> None:
-    """Divide ``off`` (H, W) by the local deviation."""
-    for y in range(off.shape[0]):
-        above, below, share = _between(y, len(variance))
-        rest = np.float32(1.0) - share
-        for x in range(off.shape[1]):
-            off[y, x] /= np.sqrt(rest * variance[above, x] + share * variance[below, x] + faint)
+def _contrast(image: Image, mean: Floats, variance: Floats, contrast: Floats) -> None:
+    """Fill ``contrast`` (H, W) with the image less its local mean, over the local deviation."""
+    for y in range(len(image)):
+        _contrast_of_row(image[y], mean, variance, y, contrast[y])
 
 
 @kernel
-def _round(contrast: Floats, per_step: np.float32, steps: Image) -> None:
-    """Fill ``steps`` (H, W) with ``contrast`` in 8 bits."""
-    for y in range(contrast.shape[0]):
-        for x in range(contrast.shape[1]):
-            rounded = contrast[y, x] * per_step + np.float32(ZERO + 0.5)
+def _contrast_in_steps(image: Image, mean: Floats, variance: Floats, steps: Image) -> None:
+    """The same in 8 bits."""
+    contrast = np.empty(image.shape[1], np.float32)
+    per_step = np.float32(1.0) / CONTRAST_STEP
+    for y in range(len(image)):
+        _contrast_of_row(image[y], mean, variance, y, contrast)
+        for x in range(len(contrast)):
+            rounded = contrast[x] * per_step + np.float32(ZERO + 0.5)
             # By way of int32, as processors convert no vector of floats to bytes.
             steps[y, x] = np.uint8(np.int32(min(max(rounded, np.float32(0.0)), np.float32(255.0))))
+
+
+@kernel(inlined=True)
+def _contrast_of_row(grey: Image, mean: Floats, variance: Floats, y: int, contrast: Floats) -> None:
+    """That of row ``y``, ``grey`` and ``contrast`` (W,)."""
+    above, below, share = _between(y, len(mean))
+    rest = np.float32(1.0) - share
+    for x in range(len(grey)):
+        off = np.float32(grey[x]) - (rest * mean[above, x] + share * mean[below, x])
+        contrast[x] = off / np.sqrt(rest * variance[above, x] + share * variance[below, x] + _FAINT)

@@ -22,11 +22,8 @@ ratio, so that neighbours reach into each other."""
 
 _CONTRAST_REACH_PX = 8
 """Half the side of the window in which the image must vary for a keypoint to be there."""
-_PEAKS_A_POINT = 2
-"""So many of the highest peaks are looked at for each point that is wanted, before all are."""
-
-_ROW_OF = {2: np.float64, 4: np.complex128}
-"""Numbers as large as so many floats."""
+_SUMMITS_A_POINT = 2
+"""So many of the highest that may be peaks are looked at for each point that is wanted, before all are."""
 
 Array = NDArray[np.float32]
 
@@ -92,31 +89,17 @@ def peaks(
     A peak is the highest of all pixels nearer than ``nms_px`` along both axes, of equals the first row by row; its
     place is that of the parabolas through it and its neighbours. Not taken: what :func:`select` leaves.
     """
-    response, reach = by_pixels(found), max(ceil(rules.nms_px) - 1, 1)
-    everywhere = _peaks(response, reach)
-    height = response[everywhere[:, 1], everywhere[:, 0]]
+    levels, reach = isqrt(found.shape[2]).bit_length() - 1, max(ceil(rules.nms_px) - 1, 1)
+    response = found.reshape(len(found), -1)
+    at, height = _summits(response, levels, reach)
     # The highest nearly always suffice; to sort all takes several times as long.
-    for most in (_PEAKS_A_POINT * max_points, len(height)):
-        highest = np.argpartition(-height, most)[:most] if most < len(height) else np.arange(len(height))
-        at = everywhere[highest[np.lexsort((highest, -height[highest]))]]
-        at = at[_first_varied(image, at, shape[0], shape[1], rules.min_contrast, max_points)]
-        if len(at) == max_points or len(height) <= most:
+    for most in (_SUMMITS_A_POINT * max_points, len(height)):
+        highest = np.sort(np.argpartition(-height, most)[:most]) if most < len(height) else np.arange(len(height))
+        highest = highest[np.argsort(-height[highest], stable=True)]
+        xy, taken = _first_peaks(response, levels, at[highest], reach, image, *shape, rules.min_contrast, max_points)
+        if len(taken) == max_points or len(height) <= most:
             break
-    x, y = at.T
-    here = response[y, x]
-    xy = np.empty((len(at), 2), np.float32)
-    xy[:, 0] = x + _summits(response[y, x - 1], here, response[y, x + 1])
-    xy[:, 1] = y + _summits(response[y - 1, x], here, response[y + 1, x])
-    return xy, _sigmoid(here)
-
-
-def by_pixels(found: Array) -> Array:
-    """(H, W) of (H/f, W/f, f^2), the values of f x f pixels, row by row; f is 2 or 4."""
-    h, w, values = found.shape
-    f = isqrt(values)
-    # The pixels of a row that one place holds are moved as one number, which is several times as fast.
-    rows: NDArray[np.generic] = np.ascontiguousarray(found).view(_ROW_OF[f]).swapaxes(1, 2)
-    return np.ascontiguousarray(rows).reshape(f * h, w).view(np.float32)
+    return xy, _sigmoid(height[highest[taken]])
 
 
 def describe(descriptors: Array, xy: Array) -> Array:
@@ -144,12 +127,6 @@ def _sigmoid(x: Array) -> Array:
     one = np.float32(1.0)
     y: Array = one / (one + np.exp(np.minimum(-x, np.float32(80.0))))
     return y
-
-
-def _summits(before: Array, here: Array, after: Array) -> NDArray[np.float64]:
-    """Where the parabolas through three values, a pixel apart, are highest: at most half a pixel from the middle."""
-    bend = 2.0 * here.astype(np.float64) - before - after
-    return np.divide(0.5 * (after - before).astype(np.float64), bend, out=np.zeros(len(bend)), where=bend > 0.0)
 
 
 @kernel
@@ -181,20 +158,27 @@ def _strongest(score: Array, x: Array, y: Array, nms_px: np.float32, reach: int)
 
 
 @kernel
-def _peaks(response: Array, reach: int) -> Int:
-    """(N, 2) columns and rows of the peaks that are off the border, two rows after the other."""
-    rows, columns = response.shape[0] // 2, response.shape[1] // 2
-    found = np.empty((rows * columns, 2), np.int64)
-    above, around = np.empty(2 * columns, np.float32), np.empty(columns, np.float32)
-    # Of each 2 x 2 px the highest value, one of which at most is a peak, and of three such squares beside each other.
+def _summits(response: Array, levels: int, reach: int) -> tuple[Int, Array]:
+    """Columns and rows (N, 2) px, and heights (N,), of what may be peaks, two rows after the other, off the border.
+
+    Of each 2 x 2 px that is the highest, of equals the first, if none of the squares around has a higher one: whether
+    it is a peak :func:`_is_peak` knows. For ``response`` and its ``levels`` see :func:`response_at`.
+    """
+    fold, half = 1 << levels, 1 << (levels - 1)
+    rows, columns = len(response) * half, response.shape[1] // (2 * fold)
+    at, height = np.empty((rows * columns, 2), np.int64), np.empty(rows * columns, np.float32)
+    # Of each 2 x 2 px the highest value, and of three such squares beside each other.
     square, three = np.full((3, columns), -np.inf, np.float32), np.full((3, columns), -np.inf, np.float32)
+    around = np.empty(columns, np.float32)
     count, border = 0, CELL_PX // 2
     for below in range(border - 1, rows - border + 1):
-        new = below % 3
-        for column in range(2 * columns):
-            above[column] = max(response[2 * below, column], response[2 * below + 1, column])
-        for column in range(columns):
-            square[new, column] = max(above[2 * column], above[2 * column + 1])
+        new, line = below % 3, response[below >> (levels - 1)]
+        for column in range(half):
+            k = ((below & (half - 1)) << (levels + 1)) + 2 * column
+            for place in range(columns >> (levels - 1)):
+                highest = max(max(line[k], line[k + 1]), max(line[k + fold], line[k + fold + 1]))
+                square[new, (place << (levels - 1)) + column] = highest
+                k += fold << levels
         for column in range(1, columns - 1):
             three[new, column] = max(square[new, column - 1], square[new, column], square[new, column + 1])
         row = below - 1
@@ -208,23 +192,76 @@ def _peaks(response: Array, reach: int) -> Int:
             # All of the squares around are within 3 px.
             if reach >= 3 and around[left] > highest:
                 continue
-            for y in range(2 * row, 2 * row + 2):
-                for x in range(2 * left, 2 * left + 2):
-                    if response[y, x] == highest and _is_peak(response, y, x, reach):
-                        found[count] = x, y
-                        count += 1
-    return found[:count]
+            for k in range(4):
+                y, x = 2 * row + k // 2, 2 * left + k % 2
+                if response_at(response, levels, y, x) == highest:
+                    at[count] = x, y
+                    height[count] = highest
+                    count += 1
+                    break
+    return at[:count], height[:count]
 
 
 @kernel(inlined=True)
-def _is_peak(response: Array, row: int, column: int, reach: int) -> bool:
-    here = response[row, column]
-    for r in range(max(row - reach, 0), min(row + reach + 1, response.shape[0])):
-        for c in range(max(column - reach, 0), min(column + reach + 1, response.shape[1])):
-            there = response[r, c]
+def response_at(response: Array, levels: int, row: int, column: int) -> np.float32:
+    """That of a pixel, of ``response`` (H/f, f W): of f x f px, row by row, beside that of the next; f is 2^levels."""
+    within = (1 << levels) - 1
+    place = ((column >> levels) << 2 * levels) + ((row & within) << levels) + (column & within)
+    value: np.float32 = response[row >> levels, place]
+    return value
+
+
+@kernel
+def _first_peaks(
+    response: Array,
+    levels: int,
+    at: Int,
+    reach: int,
+    image: Image,
+    height: int,
+    width: int,
+    min_contrast: int,
+    most: int,
+) -> tuple[Array, Int]:
+    """Of the columns and rows ``at`` (N, 2) px the first ``most`` that are peaks where the image varies: where they are
+    to a part of a pixel, (M, 2), and which (M,)."""
+    xy, taken = np.empty((min(most, len(at)), 2), np.float32), np.empty(min(most, len(at)), np.int64)
+    count = 0
+    for k in range(len(at)):
+        if count == most:
+            break
+        x, y = at[k]
+        if x >= width or y >= height or not _is_peak(response, levels, y, x, reach):
+            continue
+        if _varies(image, x, y, height, width, min_contrast):
+            here = response_at(response, levels, y, x)
+            xy[count, 0] = x + _summit(
+                response_at(response, levels, y, x - 1), here, response_at(response, levels, y, x + 1)
+            )
+            xy[count, 1] = y + _summit(
+                response_at(response, levels, y - 1, x), here, response_at(response, levels, y + 1, x)
+            )
+            taken[count] = k
+            count += 1
+    return xy[:count], taken[:count]
+
+
+@kernel(inlined=True)
+def _is_peak(response: Array, levels: int, row: int, column: int, reach: int) -> bool:
+    here = response_at(response, levels, row, column)
+    for r in range(max(row - reach, 0), min(row + reach + 1, len(response) << levels)):
+        for c in range(max(column - reach, 0), min(column + reach + 1, response.shape[1] >> levels)):
+            there = response_at(response, levels, r, c)
             if there > here or (there == here and (r < row or (r == row and c < column))):
                 return False
     return True
+
+
+@kernel(inlined=True)
+def _summit(before: np.float32, here: np.float32, after: np.float32) -> float:
+    """Where the parabola through three values, a pixel apart, is highest: at most half a pixel from the middle."""
+    bend = 2.0 * np.float64(here) - before - after
+    return 0.5 * np.float64(after - before) / bend if bend > 0.0 else 0.0
 
 
 @kernel
