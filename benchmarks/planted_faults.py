@@ -288,7 +288,7 @@ def flight_named(name: str, data: Path, seed: int) -> Flight:
             duration_s=_DURATION_S,
             seed=seed + len(name),
             conditions={"rolling_shutter": 1.0} if name.startswith("rolling") else {},
-            calibration=(Path(temporary),),
+            rig=(temporary,),
         )
         recording = SimulatedRecording(complete(config, installed), installed)
         return Flight(list(recording.measurements()), recording.calibration)

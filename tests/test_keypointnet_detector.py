@@ -191,6 +191,33 @@ def test_images_of_any_size(tiny, shape):
     assert (found.xy <= np.array(shape[::-1]) - 1).all()
 
 
+@pytest.mark.parametrize(("shape", "halvings"), [((479, 500), 0), ((480, 750), 1), ((753, 481), 1), ((960, 976), 2)])
+def test_large_images_are_seen_as_in_training(shape, halvings):
+    pytest.importorskip("openvino")
+    image = small = texture(shape)
+    for _ in range(halvings):
+        small = cv2.pyrDown(small)
+    as_it_is = FACTORY(weights="quick", threads=1, halvings=0)
+    found, expected = FACTORY(weights="quick", threads=1).detect(image, 200), as_it_is.detect(small, 200)
+    assert len(found.xy) == 200
+    assert np.array_equal(found.xy, 2.0**halvings * expected.xy)
+    assert np.array_equal(found.score, expected.score)
+    # A dot is found where it is.
+    dot = np.full(shape, 90, np.uint8)
+    dot[200:216, 300:316] = 220
+    at = FACTORY(weights="quick", threads=1).detect(cv2.GaussianBlur(dot, (0, 0), 6.0), 1).xy
+    assert np.abs(at - [307.5, 207.5]).max() < 3.0
+
+
+@pytest.mark.parametrize("name", ["tracks", "untrained:full"])
+def test_other_networks_see_images_as_they_are(name):
+    pytest.importorskip("openvino")
+    image = texture((480, 500))
+    found, expected = (FACTORY(weights=name, threads=1, **more).detect(image, 50) for more in ({}, {"halvings": 0}))
+    assert len(found.xy) > 0
+    assert np.array_equal(found.xy, expected.xy)
+
+
 def test_padding_repeats_the_border():
     image = texture((21, 16))
     padded = padded_to_cells(image)

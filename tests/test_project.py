@@ -13,6 +13,7 @@ import pytest
 from vioframe.parts import registry
 from vioframe.parts.options import REQUIRED
 from vioframe.testing import check_backend, check_dataset, check_detector
+from vioframe.types import FrameSet
 
 ROOT = Path(__file__).resolve().parents[1]
 INSTALLED = registry.load()
@@ -136,3 +137,15 @@ def test_every_builtin_plugin_is_declared():
     modules = {path.stem for path in (ROOT / "plugins").iterdir() if path.name.startswith("vioframe_")}
     entries = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["entry-points"]["vioframe"]
     assert set(entries.values()) == modules
+
+
+def test_a_flight_to_plant_a_fault_into_is_rendered_as_asked(monkeypatch):
+    """What the record of planted faults begins with, which takes minutes."""
+    monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
+    import planted_faults
+
+    monkeypatch.setattr(planted_faults, "_DURATION_S", 0.2)
+    flight = planted_faults.flight_named("fisheye", ROOT, seed=1)
+    (camera,) = flight.calibration.cameras
+    assert camera.model.distortion_model == "equidistant"
+    assert len([m for m in flight.measurements if isinstance(m, FrameSet)]) == 5

@@ -16,7 +16,7 @@ from vioframe.jit import kernel, waited_s
 from vioframe.odometry import Odometry
 from vioframe.quantiles import chi2_quantile
 from vioframe.stopwatch import Stopwatch, working_s
-from vioframe.warming import helped
+from vioframe.warming import helped, loaded_meanwhile
 
 CALIBRATION = packaged_calibration("euroc", cameras=["cam0"])
 
@@ -50,6 +50,16 @@ def test_what_a_thread_computes_is_counted_without_compiling():
     while thread_time() - begin_s < 0.02:
         pass
     assert working_s(thread_time) - working >= 0.02
+
+
+@pytest.mark.parametrize("compiled", [True, False])
+def test_a_start_is_loaded_meanwhile_where_that_is_not_to_compile(monkeypatch, compiled):
+    loaded = []
+    monkeypatch.setattr("vioframe.jit.have_been_compiled", lambda: compiled)
+    monkeypatch.setattr("vioframe.estimation.initialization.warm_up", loaded.append)
+    with loaded_meanwhile(CALIBRATION.with_camera(0, rotation_known=False)):
+        pass
+    assert [calibration.cameras[0].rotation_known for calibration in loaded] == [True] * compiled
 
 
 @pytest.fixture

@@ -8,6 +8,7 @@ from __future__ import annotations
 import subprocess
 import sys
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 
@@ -42,8 +43,7 @@ def warm_up(backend: Backend, calibration: Calibration) -> None:
 
     ``backend`` is of no use afterwards; it may find its flight too odd to follow.
     """
-    if not calibration.cameras[0].rotation_known:
-        calibration = calibration.with_camera(0, R_BC=np.eye(3), rotation_known=True)
+    calibration = _with_rotation(calibration)
     with limited_threads():
         with suppress(DivergedError, np.linalg.LinAlgError):
             _fly_along_a_wall(backend, calibration)
@@ -71,6 +71,25 @@ def helped(backend: str) -> Iterator[None]:
         for helper in helpers:
             helper.terminate()
             helper.wait()
+
+
+@contextmanager
+def loaded_meanwhile(calibration: Calibration) -> Iterator[None]:
+    """Within it a thread loads what a start needs: until it is due, this process waits for points more than it works.
+
+    Only what has been compiled before: to compile takes this process' time as well.
+    """
+    with ThreadPoolExecutor(1, "loader") as thread:
+        if jit.have_been_compiled():
+            thread.submit(initialization.warm_up, _with_rotation(calibration))  # what fails here fails in its turn
+        yield
+
+
+def _with_rotation(calibration: Calibration) -> Calibration:
+    """The same, the first camera's rotation taken for any where it is not known."""
+    if calibration.cameras[0].rotation_known:
+        return calibration
+    return calibration.with_camera(0, R_BC=np.eye(3), rotation_known=True)
 
 
 def _fly_along_a_wall(backend: Backend, calibration: Calibration) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from typing import cast
 
+import cv2
 import numpy as np
 
 from vioframe.errors import ConfigError
@@ -13,6 +14,9 @@ from vioframe_keypointnet import runtimes
 from vioframe_keypointnet.options import KeypointNetOptions
 from vioframe_keypointnet.selection import describe, first_varied, padded_to_cells, peaks, select
 from vioframe_keypointnet.weights import Weights
+
+LEAST_SIDE_PX = 240
+"""Side to which images are halved, unless told otherwise: that of the views in training."""
 
 _LOG = logging.getLogger(__name__)
 
@@ -38,6 +42,7 @@ class KeypointNet:
         self._choose = peaks if weights.architecture.peaks else of_cells
         self._options = options
         self.best_first = weights.target != "repeatability"
+        self._may_halve = weights.architecture.peaks and not self.best_first
 
     @property
     def device(self) -> str:
@@ -47,7 +52,18 @@ class KeypointNet:
         """At most ``max_points`` keypoints of ``image`` (H, W), at sub-pixel places."""
         if image.ndim != 2 or image.dtype != np.uint8:
             raise ConfigError(f"KeypointNet wants images (H, W) of uint8, not {image.shape} of {image.dtype}")
+        halvings = self._halvings(min(image.shape))
+        for _ in range(halvings):
+            image = np.asarray(cv2.pyrDown(image), np.uint8)
         padded = padded_to_cells(image)
         found, *described = self._run(padded)
         xy, score = self._choose(found, padded, cast(tuple[int, int], image.shape), max_points, self._options)
-        return Keypoints(xy, score, describe(described[0], xy) if described else None)
+        # A pixel of half the size lies where every second one of the image does.
+        places = xy * np.float32(2**halvings)
+        return Keypoints(places, score, describe(described[0], xy) if described else None)
+
+    def _halvings(self, side_px: int) -> int:
+        """Of an image whose shorter side has ``side_px``."""
+        if self._options.halvings is not None:
+            return self._options.halvings
+        return max((side_px // LEAST_SIDE_PX).bit_length() - 1, 0) if self._may_halve else 0

@@ -32,8 +32,11 @@ class KeypointNetOptions:
     compiled: bool = False
     """By CUDA: have torch.compile fuse what lies between the convolutions; it needs a C compiler, and some seconds for
     the first image."""
+    halvings: NonNegativeInt | None = None
+    """How often the image is halved before the network sees it; null: a small network trained for repeatability sees
+    images of 480 rows or more at half their size, of 960 or more at a quarter, as it did in training."""
     nms_px: NonNegativeFloat = 4.0
-    """A keypoint goes where a stronger one is nearer than this."""
+    """A keypoint goes where a stronger one is nearer than this, in pixels of what the network sees."""
     min_contrast: NonNegativeInt = 4
     """Grey levels by which the image must vary within 8 px of a keypoint; 0 admits those on blank surfaces."""
     descriptors: bool = False
