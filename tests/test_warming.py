@@ -16,7 +16,7 @@ from vioframe.jit import kernel, waited_s
 from vioframe.odometry import Odometry
 from vioframe.quantiles import chi2_quantile
 from vioframe.stopwatch import Stopwatch, working_s
-from vioframe.warming import helped, loaded_meanwhile
+from vioframe.warming import helped, loading_meanwhile
 
 CALIBRATION = packaged_calibration("euroc", cameras=["cam0"])
 
@@ -57,8 +57,7 @@ def test_a_start_is_loaded_meanwhile_where_that_is_not_to_compile(monkeypatch, c
     loaded = []
     monkeypatch.setattr("vioframe.jit.have_been_compiled", lambda: compiled)
     monkeypatch.setattr("vioframe.estimation.initialization.warm_up", loaded.append)
-    with loaded_meanwhile(CALIBRATION.with_camera(0, rotation_known=False)):
-        pass
+    assert list(loading_meanwhile([1, 2, 3], CALIBRATION.with_camera(0, rotation_known=False))) == [1, 2, 3]
     assert [calibration.cameras[0].rotation_known for calibration in loaded] == [True] * compiled
 
 

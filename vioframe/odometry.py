@@ -44,7 +44,7 @@ from vioframe.types import (
     NavState,
     Step,
 )
-from vioframe.warming import loaded_meanwhile, warm_up
+from vioframe.warming import loading_meanwhile, warm_up
 
 
 @dataclass(frozen=True, slots=True)
@@ -205,9 +205,9 @@ class Odometry:
         if isinstance(self._frontend, FrontendProcess):
             cores = usable_cores()
             try:
-                with limited_threads(opencv=cores - 1), loaded_meanwhile(self.calibration):
+                with limited_threads(opencv=cores - 1):
                     packets = self._packets(read_ahead(measurements) if cores > 2 else measurements)
-                    yield from self._follow_ahead(packets, self._frontend)
+                    yield from loading_meanwhile(self._follow_ahead(packets, self._frontend), self.calibration)
             finally:
                 self._frontend.close()
         else:

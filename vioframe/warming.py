@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import replace
@@ -31,6 +31,7 @@ from vioframe.types import (
     ImuSegment,
     NavState,
     Start,
+    Step,
     g_W,
 )
 
@@ -73,16 +74,16 @@ def helped(backend: str) -> Iterator[None]:
             helper.wait()
 
 
-@contextmanager
-def loaded_meanwhile(calibration: Calibration) -> Iterator[None]:
-    """Within it a thread loads what a start needs: until it is due, this process waits for points more than it works.
+def loading_meanwhile(steps: Iterable[Step], calibration: Calibration) -> Iterator[Step]:
+    """The same; from the first on a thread loads what a start needs, for until that is due there is little to do here.
 
     Only what has been compiled before: to compile takes this process' time as well.
     """
     with ThreadPoolExecutor(1, "loader") as thread:
-        if jit.have_been_compiled():
-            thread.submit(initialization.warm_up, _with_rotation(calibration))  # what fails here fails in its turn
-        yield
+        for number, step in enumerate(steps):
+            yield step
+            if number == 0 and jit.have_been_compiled():
+                thread.submit(initialization.warm_up, _with_rotation(calibration))  # what fails here fails in its turn
 
 
 def _with_rotation(calibration: Calibration) -> Calibration:
