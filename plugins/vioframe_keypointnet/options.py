@@ -28,7 +28,7 @@ class KeypointNetOptions:
     precision: Precision = "auto"
     """Auto: float16 by CUDA; by OpenVINO int8 where the weights know their ranges; else float32."""
     threads: NonNegativeInt = 0
-    """Threads on a CPU; 0 leaves the library's choice."""
+    """Threads on a CPU; 0 leaves the library's choice, but for small networks by OpenVINO, which take one."""
     compiled: bool = False
     """By CUDA: have torch.compile fuse what lies between the convolutions; it needs a C compiler, and some seconds for
     the first image."""
