@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -207,6 +208,17 @@ def test_large_images_are_seen_as_in_training(shape, halvings):
     dot[200:216, 300:316] = 220
     at = FACTORY(weights="quick", threads=1).detect(cv2.GaussianBlur(dot, (0, 0), 6.0), 1).xy
     assert np.abs(at - [307.5, 207.5]).max() < 3.0
+
+
+def test_weights_trained_on_larger_views_see_more(tmp_path):
+    pytest.importorskip("openvino")
+    path, card = tmp_path / "large.safetensors", {"options": {"size": [640, 480]}}
+    weights_file.save(path, replace(weights_file.load("quick"), card=card))
+    image = texture((500, 640))
+    found, expected = (
+        FACTORY(weights=str(path), threads=1, **more).detect(image, 50) for more in ({}, {"halvings": 0})
+    )
+    assert np.array_equal(found.xy, expected.xy)
 
 
 @pytest.mark.parametrize("name", ["tracks", "untrained:full"])

@@ -128,6 +128,7 @@ class Odometry:
             name = str(self._registry.find(registry.BACKEND, backend))
             warm_backend = self._registry.create_backend(backend, backend_options) if warm else None
             backend = self._registry.create_backend(backend, backend_options)
+        self._is_warm = warm_backend is not None
         self._loop_closer_name = f"the loop closer {type(loop_closer).__name__}"
         if isinstance(loop_closer, str):
             self._loop_closer_name = str(self._registry.find(registry.LOOP_CLOSER, loop_closer))
@@ -207,7 +208,8 @@ class Odometry:
             try:
                 with limited_threads(opencv=cores - 1):
                     packets = self._packets(read_ahead(measurements) if cores > 2 else measurements)
-                    yield from loading_meanwhile(self._follow_ahead(packets, self._frontend), self.calibration)
+                    steps = self._follow_ahead(packets, self._frontend)
+                    yield from steps if self._is_warm else loading_meanwhile(steps, self.calibration)
             finally:
                 self._frontend.close()
         else:

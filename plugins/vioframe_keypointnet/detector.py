@@ -15,9 +15,6 @@ from vioframe_keypointnet.options import KeypointNetOptions
 from vioframe_keypointnet.selection import describe, first_varied, padded_to_cells, peaks, select
 from vioframe_keypointnet.weights import Weights
 
-LEAST_SIDE_PX = 240
-"""Side to which images are halved, unless told otherwise: that of the views in training."""
-
 _LOG = logging.getLogger(__name__)
 
 
@@ -42,7 +39,8 @@ class KeypointNet:
         self._choose = peaks if weights.architecture.peaks else of_cells
         self._options = options
         self.best_first = weights.target != "repeatability"
-        self._may_halve = weights.architecture.peaks and not self.best_first
+        # The shorter side to which images are halved where nothing is said, if they are.
+        self._least_side_px = weights.view_side_px if weights.architecture.peaks and not self.best_first else None
 
     @property
     def device(self) -> str:
@@ -66,4 +64,4 @@ class KeypointNet:
         """Of an image whose shorter side has ``side_px``."""
         if self._options.halvings is not None:
             return self._options.halvings
-        return max((side_px // LEAST_SIDE_PX).bit_length() - 1, 0) if self._may_halve else 0
+        return max((side_px // self._least_side_px).bit_length() - 1, 0) if self._least_side_px else 0

@@ -58,6 +58,11 @@ class Weights:
         return str(self.card.get("target", "repeatability"))
 
     @property
+    def view_side_px(self) -> int:
+        """The shorter side of the views in training; where the card does not say, that of the weights that ship."""
+        return int(min(self.card.get("options", {}).get("size", (320, 240))))
+
+    @property
     def has_descriptors(self) -> bool:
         """Whether the layers of descriptors were trained with those before them, as these are."""
         return bool(self.card.get("descriptors", True))
