@@ -31,10 +31,10 @@ class FrontendOptions:
     """Pyramid levels above the full image."""
     anchored: bool = True
     """Find each patch again as it looked at first, or let go of it, so that points do not slide off their landmarks."""
-    rejection: Rejection = "magsac"
-    """Epipolar outlier rejection: magsac (essential matrix by MAGSAC++), fundamental (fundamental matrix by RANSAC, it
-    asks less of the calibration), two_point (rotation from the gyroscope; magsac where nobody knows how the camera
-    is turned) or none."""
+    rejection: Rejection = "two_point"
+    """Epipolar outlier rejection: two_point (the gyroscope gives the rotation to begin from, and two points the
+    direction; magsac where it is unknown how the camera is turned, or fewer than four fifths agree), magsac (essential
+    matrix by MAGSAC++), fundamental (fundamental matrix by RANSAC, it asks less of the calibration) or none."""
     rejection_px: float = 0.7
     """Largest distance of an inlier from the epipolar geometry, scaled by the focal length."""
     refill_below: float = 0.9

@@ -15,6 +15,7 @@ from vioframe.frontend.options import FrontendOptions
 from vioframe.frontend.refill import spread, thin
 from vioframe.geometry import so3, two_view
 from vioframe.geometry.cameras import Camera
+from vioframe.geometry.two_point import two_point_inliers
 from vioframe.incidents import Incidents
 from vioframe.interfaces import Detector
 from vioframe.stopwatch import Stopwatch
@@ -188,7 +189,7 @@ class View:
         threshold = options.rejection_px / self.camera.focal_px
         pair = xy_normalised_before, self.xy_normalised
         if options.rejection == "two_point" and R_C2C1 is not None:
-            inliers = two_view.two_point_inliers(*pair, R_C2C1, threshold)
+            inliers = two_point_inliers(*pair, R_C2C1, threshold)
         elif options.rejection == "fundamental":
             inliers = two_view.fundamental_inliers(*pair, threshold)
         else:

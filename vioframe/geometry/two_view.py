@@ -19,9 +19,6 @@ from vioframe.geometry import so3
 Mask = NDArray[np.bool_]
 
 _MAX_ITERATIONS = 1000
-# Hypotheses of the 2-point method: with 50 % of outliers, 100 pairs miss every clean one with a chance of 3e-13.
-_PAIRS = 100
-_REFINEMENTS = 3
 _SEED = 20110
 
 
@@ -56,15 +53,15 @@ def essential_matrix(R_C2C1: Float, p_C2C1: Float) -> Float:
 
 
 def sampson_distance(E: Float, xy_1: Float, xy_2: Float) -> Float:
-    """First-order distance to the epipolar geometry ``E`` (..., 3, 3) (11.9): signed, (..., N), in normalised units.
+    """First-order distance to the epipolar geometry ``E`` (3, 3) (11.9): signed, (N,), in normalised units.
 
     Where ``E`` vanishes on a point (both epipoles on it) the distance is zero: such a point says nothing about ``E``.
     """
     ray_1, ray_2 = rays(xy_1), rays(xy_2)
-    line_2 = ray_1 @ np.swapaxes(E, -1, -2)  # (..., N, 3), rows E x_1
+    line_2 = ray_1 @ E.T  # (N, 3), rows E x_1
     line_1 = ray_2 @ E  # rows E^T x_2
-    algebraic = (line_2 * ray_2).sum(axis=-1)
-    slope = np.sqrt((line_2[..., :2] ** 2).sum(axis=-1) + (line_1[..., :2] ** 2).sum(axis=-1))
+    algebraic = (line_2 * ray_2).sum(axis=1)
+    slope = np.sqrt((line_2[:, :2] ** 2).sum(axis=1) + (line_1[:, :2] ** 2).sum(axis=1))
     distance: Float = np.divide(algebraic, slope, out=np.zeros_like(algebraic), where=slope > 1e-12)
     return distance
 
@@ -96,55 +93,6 @@ def magsac_inliers(xy_1: Float, xy_2: Float, threshold: float, confidence: float
     K = np.eye(3)
     _, mask = cv2.findEssentialMat(xy_1, xy_2, K, K, np.zeros(4), np.zeros(4), params)
     return _as_mask(mask, len(xy_1))
-
-
-def two_point_inliers(xy_1: Float, xy_2: Float, R_C2C1: Float, threshold: float) -> Mask:
-    """(N,) inliers to the translation direction that agrees with most points, the rotation being known to a degree.
-
-    With the rotation given, each match confines the translation to a plane, ``(x_2 x R x_1) . p_C2C1 = 0``, and two
-    matches fix its direction (Troiani et al., ICRA 2014). A gyroscope's bias turns the given rotation by a few
-    milliradians, more than a pixel, so the best hypothesis is refined over its own inliers (rotation and direction,
-    Gauss-Newton on the Sampson distance) before it judges. Needs N >= 2.
-    """
-    ray_1, ray_2 = rays(xy_1) @ R_C2C1.T, rays(xy_2)
-    normals = np.cross(ray_2, ray_1)
-    rng = np.random.default_rng(_SEED)
-    first = rng.integers(0, len(xy_1), _PAIRS)
-    second = (first + rng.integers(1, len(xy_1), _PAIRS)) % len(xy_1)
-    directions = np.cross(normals[first], normals[second])
-    length = np.linalg.norm(directions, axis=1, keepdims=True)
-    directions = np.divide(directions, length, out=np.tile([0.0, 0.0, 1.0], (_PAIRS, 1)), where=length > 1e-15)
-    # The truncated square (MSAC) tells good hypotheses apart where counts tie.
-    distances = sampson_distance(so3.hat(directions) @ R_C2C1, xy_1, xy_2)
-    best = int(np.argmin(np.minimum((distances / (3.0 * threshold)) ** 2, 1.0).sum(axis=1)))
-    R, direction = R_C2C1, directions[best]
-    for _ in range(_REFINEMENTS):
-        near = np.abs(sampson_distance(essential_matrix(R, direction), xy_1, xy_2)) < 3.0 * threshold
-        R, direction = _refine(R, direction, xy_1[near], xy_2[near], threshold)
-    inliers: Mask = np.abs(sampson_distance(essential_matrix(R, direction), xy_1, xy_2)) < threshold
-    return inliers
-
-
-def _refine(R_C2C1: Float, direction: Float, xy_1: Float, xy_2: Float, sigma: float) -> tuple[Float, Float]:
-    """One damped Gauss-Newton step of ``R <- R Exp(dtheta)`` and ``direction`` on the sphere, slopes held fixed.
-
-    The damping is a prior of 1 degree on the rotation and 1 rad on the direction: without parallax the direction cannot
-    be seen, and must not run away.
-    """
-    E = essential_matrix(R_C2C1, direction)
-    ray_1, ray_2 = rays(xy_1), rays(xy_2)
-    line_2, line_1 = ray_1 @ E.T, ray_2 @ E
-    slope = np.sqrt((line_2[:, :2] ** 2).sum(axis=1) + (line_1[:, :2] ** 2).sum(axis=1)) + 1e-12
-    turned = ray_1 @ R_C2C1.T
-    tangent = np.linalg.svd(direction[None])[2][1:].T  # (3, 2), perpendicular to the direction
-    # e = x_2 . (t x R x_1): de/dtheta = x_1 x E^T x_2 and de/dt = (R x_1) x x_2.
-    J = np.column_stack([np.cross(ray_1, line_1), np.cross(turned, ray_2) @ tangent]) / slope[:, None] / sigma
-    residual = (line_2 * ray_2).sum(axis=1) / slope / sigma
-    prior = np.diag(1.0 / np.array([*[np.deg2rad(1.0)] * 3, 1.0, 1.0]) ** 2)
-    step = -np.linalg.solve(J.T @ J + prior, J.T @ residual)
-    moved = direction + tangent @ step[3:]
-    R: Float = R_C2C1 @ so3.exp(step[:3])
-    return R, moved / np.linalg.norm(moved)
 
 
 def _as_mask(mask: Any, count: int) -> Mask:
