@@ -1,6 +1,7 @@
 """What is an outlier between two views if a gyroscope tells the turn between them to a degree; compiled.
 
-Importing this module loads numba. Notation and equation numbers are those of :mod:`vioframe.geometry.two_view`.
+Derivation: ``docs/derivations/outliers.md``. Notation and equation numbers are those of
+:mod:`vioframe.geometry.two_view`. Importing this module loads numba.
 """
 
 from __future__ import annotations
