@@ -93,7 +93,9 @@ def fitted_lens(views: list[BoardView], camera: Camera) -> tuple[Camera, Float]:
     import cv2
 
     some = views[1::_VIEWS_APART]  # the first is older than any reading
-    points, pixels = ([np.float32(a) for a in seen] for seen in ([v.p_A for v in some], [v.xy for v in some]))
+    points, pixels = (
+        [np.asarray(a, np.float32) for a in seen] for seen in ([v.p_A for v in some], [v.xy for v in some])
+    )
     k1_to_p2 = np.append(camera.distortion, 0.0)  # and k3, which stays zero
     flags = cv2.CALIB_USE_INTRINSIC_GUESS | cv2.CALIB_FIX_K3
     _, K, distortion, _, _ = cv2.calibrateCamera(points, pixels, camera.resolution, camera.K, k1_to_p2, flags=flags)

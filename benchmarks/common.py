@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from functools import reduce, wraps
+from functools import wraps
 from pathlib import Path
 from typing import Any
 
@@ -121,10 +121,18 @@ def table(title: str, rows: Sequence[Row], columns: Mapping[str, str]) -> Table:
     for key, spec in columns.items():
         out.add_column(key, justify="right" if spec else "left", no_wrap=True)
     for row in rows:
-        values = [reduce(lambda found, part: (found or {}).get(part), key.split("."), row) for key in columns]
+        values = [_found(row, key) for key in columns]
         cells = zip(values, columns.values(), strict=True)
         out.add_row(*("-" if value is None else format(value, spec) for value, spec in cells))
     return out
+
+
+def _found(row: Row, key: str) -> Any:
+    """What ``row`` has under ``key``, with a dot for each mapping within; None where there is no such thing."""
+    found: Any = row
+    for part in key.split("."):
+        found = (found or {}).get(part)
+    return found
 
 
 def results_file(name: str, settings: Mapping[str, Any]) -> Path:

@@ -170,9 +170,9 @@ def follow(recording: SimulatedRecording, config: Config, installed: Registry) -
     R_WB, p_WB = recording.scenario.motion(np.array([frame.t_ns for frame in tracks]))[:2]
     known = landmarks_of(tracks, *camera.pose(R_WB, p_WB), recording.world.mesh.corners)
     kept, landmarks, errors = [], [], []
-    for frame, *pose in zip(tracks, R_WB, p_WB, strict=True):
+    for frame, R, p in zip(tracks, R_WB, p_WB, strict=True):
         p_WF = known[frame.ids]
-        xy, ahead = pixels(camera, *pose, p_WF)
+        xy, ahead = pixels(camera, R, p, p_WF)
         kept.append(frame.only(ahead))
         landmarks.append(p_WF[ahead])
         errors.append(frame.xy[ahead] - xy[ahead])

@@ -12,7 +12,7 @@ from __future__ import annotations
 import re
 import subprocess
 import sys
-from collections import Counter, defaultdict
+from collections import defaultdict
 from collections.abc import Iterator
 from pathlib import Path
 from shutil import rmtree
@@ -55,9 +55,9 @@ def main(keep: bool, rounds: int, data: Path) -> None:
 def _rows(data: Path, rounds: int, out: Path) -> Iterator[Row]:
     arguments = ["-m", "vioframe", "run", str(data), "--duration", "3", "--out", str(out), "--quiet"]
     arguments += ["-o", "cameras=cam0"]
-    measured = defaultdict(list)
+    measured: dict[str, list[float]] = defaultdict(list)
     for k in range(rounds + 1):  # the first writes byte code and is left out
-        found: Counter[str] = Counter()
+        found: dict[str, float] = defaultdict(float)
         for cores in (1, 2):
             rmtree(out, ignore_errors=True)
             found[f"until the first frame, {cores} core{'s' * (cores > 1)}"] = first_frame_s(
@@ -70,8 +70,8 @@ def _rows(data: Path, rounds: int, out: Path) -> Iterator[Row]:
             what = "vioframe" if package.startswith("vioframe_") else _PACKAGES.get(package, "all else")
             found[f"to import: {what}"] += 1e-6 * int(microseconds)
         if k:
-            for what, seconds in found.items():
-                measured[what].append(seconds)
+            for what, each in found.items():
+                measured[what].append(each)
     for what, seconds in measured.items():
         yield {
             "what": what,

@@ -10,9 +10,10 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from statistics import geometric_mean
+from typing import Any
 
 import pandas as pd
 
@@ -712,7 +713,7 @@ def _revision(commit: str | None) -> str:
     return revision[:8] + (" with changes" if dirty else "")
 
 
-def markdown(rows: Iterable[dict[str, str]]) -> str:
+def markdown(rows: Iterable[Mapping[Any, object]]) -> str:
     table = pd.DataFrame(list(rows)).fillna("-")
     lines = [list(table.columns), ["---"] * len(table.columns), *table.to_numpy().tolist()]
     return "".join(f"| {' | '.join(line)} |\n" for line in lines)

@@ -26,7 +26,7 @@ from vioframe.io.calibration import packaged_calibration
 from vioframe.odometry import Odometry
 from vioframe.runs.recorder import Recorder
 from vioframe.simulation import TrackOptions, simulated_stream
-from vioframe.types import FrameTracks, ImuSample
+from vioframe.types import FrameTracks, ImuSample, Step
 
 COLUMNS = {
     "backend": "",
@@ -95,7 +95,7 @@ def fly(backend: str, loop_closer: str | None, minutes: float) -> Row:
     }
 
 
-def _add(odometry: Odometry, tracks: FrameTracks, pictured: bool) -> list:
+def _add(odometry: Odometry, tracks: FrameTracks, pictured: bool) -> list[Step]:
     """The landmarks of a frame, with a picture of noise where somebody looks at it."""
     if not pictured:
         return odometry.add_tracks(tracks)

@@ -68,7 +68,9 @@ class Flight:
         """With every image changed."""
 
         def of(_: int, frames: FrameSet) -> FrameSet:
-            image = change(frames.images[0])
+            (image,) = frames.images
+            assert image is not None
+            image = change(image)
             image.flags.writeable = False
             return FrameSet(frames.t_ns, (image,))
 
@@ -98,7 +100,7 @@ def turned(flight: Flight, degrees: float, axis: Sequence[float]) -> Flight:
 
 def bunched(flight: Flight) -> Flight:
     """Packets of ten readings, stamped when they arrive."""
-    count = 0
+    count, arrival = 0, 0
 
     def stamp(sample: ImuSample) -> ImuSample:
         nonlocal count, arrival
@@ -107,7 +109,6 @@ def bunched(flight: Flight) -> Flight:
         count += 1
         return replace(sample, t_ns=arrival + count % 10 * 20_000)
 
-    arrival = 0
     return flight.imu(stamp)
 
 

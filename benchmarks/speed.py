@@ -80,7 +80,7 @@ def main(keep: bool, rounds: int, runs: tuple[str, ...], against: Path | None, d
 
 def _rows(data: Path, runs: tuple[str, ...], rounds: int, against: Path | None, folder: Path) -> Iterator[Row]:
     """A row for the yardstick and for each run, code and number of cores."""
-    measured = defaultdict(list)
+    measured: dict[tuple[str, Path | None, int], list[Row]] = defaultdict(list)
     for _ in range(rounds):
         for cores in (1, 2):
             measured["yardstick", None, cores].append(_yardstick(data, cores))
@@ -88,8 +88,7 @@ def _rows(data: Path, runs: tuple[str, ...], rounds: int, against: Path | None, 
             for checkout in (None, against) if against else (None,):
                 for cores in (1, 2):
                     if checkout is None or cores == 1:
-                        found = _run(data, run, checkout, cores, folder / "run")
-                        measured[run, checkout, cores].append(found)
+                        measured[run, checkout, cores].append(_run(data, run, checkout, cores, folder / "run"))
     yardstick = measured["yardstick", None, 1]
     for (run, checkout, cores), found in measured.items():
         times = [each["frame_ms"] for each in found]
@@ -115,7 +114,7 @@ def _rows(data: Path, runs: tuple[str, ...], rounds: int, against: Path | None, 
 
 
 def _ratio(found: list[Row], others: list[Row], name: str) -> float:
-    return median(a[name] / b[name] for a, b in zip(found, others, strict=True))
+    return median(float(a[name]) / float(b[name]) for a, b in zip(found, others, strict=True))
 
 
 def _yardstick(data: Path, copies: int) -> Row:

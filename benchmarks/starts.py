@@ -36,8 +36,10 @@ from vioframe.types import Calibration, FrameTracks, NavState, Status
 FLIGHTS = {"walk": 20.0, "hover": 20.0, "inspection": 20.0}
 """Simulated ones, and how long each is flown, s."""
 _FIRST_WORLD = 40  # limits were chosen in those below
-FAULTS = ("none", "offset +30 ms", "offset -30 ms", "offset +100 ms", "offset -100 ms")
-FAULTS += ("rotation 10 deg", "rotation 90 deg", "focal +10 %", "focal -10 %")
+FAULTS = (
+    *("none", "offset +30 ms", "offset -30 ms", "offset +100 ms", "offset -100 ms"),
+    *("rotation 10 deg", "rotation 90 deg", "focal +10 %", "focal -10 %"),
+)
 _AXIS = np.array([0.6, 0.64, 0.48])
 _LOOKED_AT_S, _RESET_S, _SCALE_S = 8.0, 10.0, 2.0
 # Motion is sufficient once a body has, within 1.5 s, gone so far, changed its velocity and turned by so much (rms).
@@ -100,8 +102,17 @@ def sequences(data: Path) -> Iterator[tuple[str, TrackSequence]]:
     """The recordings as tracks with truth."""
     yield "MH_01_easy_15s", tracked(data / "euroc/MH_01_easy_15s")
     for seed, (name, duration_s) in enumerate(FLIGHTS.items(), _FIRST_WORLD):
-        biases = {"bias_gyro_B": np.array([-0.002, 0.02, 0.08]), "bias_accel_B": np.array([-0.02, 0.13, 0.07])}
-        yield name, simulated_sequence(name, pixel_sigma=0.5, seed=seed, duration_s=duration_s, **biases)
+        yield (
+            name,
+            simulated_sequence(
+                name,
+                pixel_sigma=0.5,
+                seed=seed,
+                duration_s=duration_s,
+                bias_gyro_B=np.array([-0.002, 0.02, 0.08]),
+                bias_accel_B=np.array([-0.02, 0.13, 0.07]),
+            ),
+        )
     yield "april", april_sequence(data / "euroc_imu_april")
 
 

@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 import click
 import numpy as np
@@ -54,7 +55,7 @@ class _Covered:
     def __init__(self, dataset: Dataset) -> None:
         self._dataset = dataset
 
-    def __getattr__(self, name: str) -> object:
+    def __getattr__(self, name: str) -> Any:
         return getattr(self._dataset, name)
 
     def measurements(self) -> Iterator[Measurement]:

@@ -37,7 +37,7 @@ from vioframe_keypointnet.training.samples import simulated_worlds
 from vioframe_keypointnet.training.trainer import Training
 
 TOURS = ("V2_02_medium", "V1_01_easy", "MH_03_medium", "V2_01_easy")
-CONDITIONS = (
+CONDITIONS: tuple[dict[str, float], ...] = (
     {},
     {"motion_blur": 0.6},
     {"low_texture": 0.9},

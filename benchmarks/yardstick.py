@@ -3,6 +3,7 @@
 import sys
 from pathlib import Path
 from time import perf_counter
+from typing import Any
 
 import cv2
 import numpy as np
@@ -12,6 +13,7 @@ from vioframe.parts import registry
 from vioframe.types import FrameSet
 
 _LEVELS, _WINDOW = 4, (15, 15)
+follow: Any = cv2.calcOpticalFlowPyrLK  # it takes a guess or None, of which its types do not know
 
 
 def main(data: Path) -> None:
@@ -21,7 +23,7 @@ def main(data: Path) -> None:
     camera = dataset.calibration.cameras[0].model
     K = np.array([[camera.fx, 0.0, camera.cx], [0.0, camera.fy, camera.cy], [0.0, 0.0, 1.0]])
     most, equalise = FrontendOptions().max_points, cv2.createCLAHE(3.0, (8, 8))
-    before, xy = np.empty(0), np.empty((0, 1, 2), np.float32)
+    before, xy = None, np.empty((0, 1, 2), np.float32)
     frames, begin_s = 0, perf_counter()
     for measurement in dataset.measurements():
         if not isinstance(measurement, FrameSet) or measurement.images[0] is None:
@@ -29,8 +31,8 @@ def main(data: Path) -> None:
         frames += 1
         image = equalise.apply(measurement.images[0])
         if len(xy) > 8:
-            now, ok, _ = cv2.calcOpticalFlowPyrLK(before, image, xy, None, winSize=_WINDOW, maxLevel=_LEVELS)
-            back, ok_back, _ = cv2.calcOpticalFlowPyrLK(image, before, now, None, winSize=_WINDOW, maxLevel=_LEVELS)
+            now, ok, _ = follow(before, image, xy, None, winSize=_WINDOW, maxLevel=_LEVELS)
+            back, ok_back, _ = follow(image, before, now, None, winSize=_WINDOW, maxLevel=_LEVELS)
             good = (ok & ok_back).ravel().astype(bool) & (np.abs(back - xy).max(axis=(1, 2)) < 1.0)
             if good.sum() > 8:
                 mask = cv2.findEssentialMat(xy[good], now[good], K, cv2.USAC_MAGSAC, 0.99, 1.0)[1]

@@ -10,7 +10,7 @@ from typing import Any
 
 from vioframe.runs import machine
 
-Row = Mapping[str, Any]
+Row = dict[str, Any]
 
 
 def record(path: Path, rows: Sequence[Row], settings: Mapping[str, Any]) -> None:
