@@ -55,9 +55,9 @@ def main(keep: bool, rounds: int, data: Path) -> None:
 def _rows(data: Path, rounds: int, out: Path) -> Iterator[Row]:
     arguments = ["-m", "vioframe", "run", str(data), "--duration", "3", "--out", str(out), "--quiet"]
     arguments += ["-o", "cameras=cam0"]
-    measured: dict[str, list[float]] = defaultdict(list)
+    measured: defaultdict[str, list[float]] = defaultdict(list)
     for k in range(rounds + 1):  # the first writes byte code and is left out
-        found: dict[str, float] = defaultdict(float)
+        found: defaultdict[str, float] = defaultdict(float)
         for cores in (1, 2):
             rmtree(out, ignore_errors=True)
             found[f"until the first frame, {cores} core{'s' * (cores > 1)}"] = first_frame_s(
@@ -70,15 +70,15 @@ def _rows(data: Path, rounds: int, out: Path) -> Iterator[Row]:
             what = "vioframe" if package.startswith("vioframe_") else _PACKAGES.get(package, "all else")
             found[f"to import: {what}"] += 1e-6 * int(microseconds)
         if k:
-            for what, each in found.items():
-                measured[what].append(each)
-    for what, seconds in measured.items():
+            for what, seconds in found.items():
+                measured[what].append(seconds)
+    for what, times in measured.items():
         yield {
             "what": what,
             "rounds": rounds,
-            "seconds": median(seconds),
-            "lowest_s": min(seconds),
-            "highest_s": max(seconds),
+            "seconds": median(times),
+            "lowest_s": min(times),
+            "highest_s": max(times),
         }
 
 

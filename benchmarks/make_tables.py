@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from statistics import geometric_mean
 from typing import Any
@@ -67,7 +67,7 @@ def real_images() -> str:
             "resets": f"{row.resets}",
             "ATE": length(1e-3 * row.ate_mm),
         }
-        for row in rows.itertuples()
+        for row in _each(rows)
     ]
     return markdown(shown) + source(rows)
 
@@ -80,7 +80,7 @@ def stages() -> str:
     table = rows.set_index("backend")[list(names)].rename(columns=names)
     table.insert(0, "all", rows.set_index("backend")["frame_ms"])
     shown = [
-        {"ms a frame": stage, **{f"`{backend}`": _number(value, ".1f") for backend, value in values.items()}}
+        {"ms a frame": str(stage), **{f"`{backend}`": _number(value, ".1f") for backend, value in values.items()}}
         for stage, values in table.T.iterrows()
     ]
     return markdown(shown) + source(rows)
@@ -92,7 +92,7 @@ def planted_faults() -> str:
     bad, good = rows[rows["fault"] != "none"], rows[rows["fault"] == "none"]
     shown = [
         {"planted": row.fault, "into": row.recording, "found first": f"`{row.kind}`", "right": row.right}
-        for row in bad.itertuples()
+        for row in _each(bad)
     ]
     told = (
         f"\nThe right cause is named first in {(bad['right'] == 'yes').sum()} of {len(bad)}; in "
@@ -123,7 +123,7 @@ def landmarks() -> str:
     rows = recorded("real_motion_*.json")
     shown = [
         {
-            "flight": sequence,
+            "flight": str(sequence),
             "path": _mean(own, "path_m"),
             **{
                 f"`{backend}`": f"{_ate(found)}, {found['percent'].mean():.2f} %" for backend, found in _by_backend(own)
@@ -140,7 +140,7 @@ def rendered() -> str:
     rows = recorded("rendered_flights_*.json")
     shown = [
         {
-            "flight": clip,
+            "flight": str(clip),
             "back-end": f"`{backend}`",
             "detector": f"`{detector}`",
             "path": _mean(own, "path_m"),
@@ -161,7 +161,7 @@ def one_or_two() -> str:
     rows = _in_m(recorded("stereo_*.json"))
     shown = []
     for (clip, backend), own in rows.groupby(["clip", "backend"]):
-        found = dict(iter(own.groupby("cameras")))
+        found = {str(cameras): flown for cameras, flown in own.groupby("cameras")}
         one, both = (found[cameras].set_index("world") for cameras in ("one", "both"))
 
         def beside(cameras: str, found: dict[str, pd.DataFrame] = found, both: pd.Series = both["ate_m"]) -> str:
@@ -170,7 +170,7 @@ def one_or_two() -> str:
 
         shown.append(
             {
-                "flight": clip,
+                "flight": str(clip),
                 "back-end": f"`{backend}`",
                 "one camera": _ate(one),
                 "both": _ate(both),
@@ -260,7 +260,7 @@ def april() -> str:
             "turns unlike the gyroscope by": f"{row.turned_deg:.2f} deg",
             "ATE": length(row.ate_m),
         }
-        for row in rows.itertuples()
+        for row in _each(rows)
     ]
     return markdown(shown) + source(rows)
 
@@ -296,7 +296,7 @@ def rolling_shutter() -> str:
             readout = begun["readout_ms"] if "estimated" in str(shutter) else begun["readout_ms"].head(0)
             shown.append(
                 {
-                    "flight": flight,
+                    "flight": str(flight),
                     "back-end": f"`{backend}`",
                     "shutter": str(shutter),
                     "begun": f"{len(begun)} of {len(found)}",
@@ -323,7 +323,7 @@ def starts() -> str:
             "worst": f"{_number(row.worst_scale_percent, '.1f')} %",
             "bad": _number(row.bad, ".0f"),
         }
-        for row in rows.itertuples()
+        for row in _each(rows)
     ]
     return markdown(shown) + source(rows)
 
@@ -384,7 +384,7 @@ def whole_runs() -> str:
             "first frame, s": _number(row.first_s, ".2f"),
             "ratio": _number(row.ratio, ".2f"),
         }
-        for row in rows.itertuples()
+        for row in _each(rows)
     ]
     return markdown(shown) + source(rows)
 
@@ -398,7 +398,7 @@ def first_frame() -> str:
             "n": f"{row.rounds}",
             "seconds": _within(row.seconds, row.lowest_s, row.highest_s, ".2f"),
         }
-        for row in rows.sort_values("seconds", ascending=False).itertuples()
+        for row in _each(rows.sort_values("seconds", ascending=False))
     ]
     return markdown(shown) + source(rows)
 
@@ -438,7 +438,7 @@ def memory() -> str:
             "grown since": f"{row.grown_mb:.1f} MB",
             "landmarks in the map": f"{row.landmarks}",
         }
-        for row in rows.itertuples()
+        for row in _each(rows)
     ]
     return markdown(shown) + source(rows)
 
@@ -474,7 +474,7 @@ def push() -> str:
             "times the command line": f"{row.ratio:.2f}",
             "the same bytes": row.same_bytes,
         }
-        for row in rows.itertuples()
+        for row in _each(rows)
     ]
     return markdown(shown) + source(rows)
 
@@ -495,7 +495,7 @@ def _speeds(name: str) -> str:
     theirs = rows[rows["detector"] == BASELINE].set_index("images")["fps_high"]
     shown = []
     for detector, own in rows.groupby("detector", sort=False):
-        each = {row.images: row for row in own.itertuples()}
+        each = {row.images: row for row in _each(own)}
         faster = ", ".join(kind for kind in kinds if each[kind].fps_low > theirs[kind])
         told = {f"faster than `{BASELINE}` on": faster or "-", "on": own["on"].iloc[0]}
         shown.append({"detector": f"`{detector}`", **{kind: _pace(each[kind].fps) for kind in kinds}, **told})
@@ -527,7 +527,7 @@ def clean() -> str:
             "of distinct points": f"{row.distinct:.3f}",
             "localisation px": f"{row.localisation_px:.2f}",
         }
-        for row in rows.itertuples()
+        for row in _each(rows)
     ]
     return markdown(shown) + source(rows)
 
@@ -623,7 +623,7 @@ def throughput() -> str:
             "seconds": f"{row.seconds:.0f}",
             "times one worker": f"{row.times_one:.2f}",
         }
-        for row in rows.itertuples()
+        for row in _each(rows)
     ]
     return markdown(shown) + source(rows)
 
@@ -695,7 +695,7 @@ def recorded(pattern: str) -> pd.DataFrame:
 def source(*records: pd.DataFrame) -> str:
     """The line below a table that says which records it is made of."""
     files = pd.concat([rows[["file", "commit", "date"]] for rows in records]).drop_duplicates()
-    told = (f"`{row.file}` ({_revision(row.commit)}, {row.date})" for row in files.itertuples())
+    told = (f"`{row.file}` ({_revision(row.commit)}, {row.date})" for row in _each(files))
     return f"\nFrom {', '.join(told)} in `benchmarks/results`.\n"
 
 
@@ -713,14 +713,19 @@ def _revision(commit: str | None) -> str:
     return revision[:8] + (" with changes" if dirty else "")
 
 
-def markdown(rows: Iterable[Mapping[Any, object]]) -> str:
+def markdown(rows: Iterable[dict[Any, str]]) -> str:
     table = pd.DataFrame(list(rows)).fillna("-")
     lines = [list(table.columns), ["---"] * len(table.columns), *table.to_numpy().tolist()]
     return "".join(f"| {' | '.join(line)} |\n" for line in lines)
 
 
+def _each(rows: pd.DataFrame) -> Iterable[Any]:
+    """The rows, whose attributes are named as the columns."""
+    return rows.itertuples()
+
+
 def _by_backend(rows: pd.DataFrame) -> Iterable[tuple[str, pd.DataFrame]]:
-    return rows.groupby("backend")
+    return ((str(backend), own) for backend, own in rows.groupby("backend"))
 
 
 def _in_m(rows: pd.DataFrame) -> pd.DataFrame:

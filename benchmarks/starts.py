@@ -102,17 +102,11 @@ def sequences(data: Path) -> Iterator[tuple[str, TrackSequence]]:
     """The recordings as tracks with truth."""
     yield "MH_01_easy_15s", tracked(data / "euroc/MH_01_easy_15s")
     for seed, (name, duration_s) in enumerate(FLIGHTS.items(), _FIRST_WORLD):
-        yield (
-            name,
-            simulated_sequence(
-                name,
-                pixel_sigma=0.5,
-                seed=seed,
-                duration_s=duration_s,
-                bias_gyro_B=np.array([-0.002, 0.02, 0.08]),
-                bias_accel_B=np.array([-0.02, 0.13, 0.07]),
-            ),
+        bias_gyro_B, bias_accel_B = np.array([-0.002, 0.02, 0.08]), np.array([-0.02, 0.13, 0.07])
+        flown = simulated_sequence(
+            name, pixel_sigma=0.5, seed=seed, duration_s=duration_s, bias_gyro_B=bias_gyro_B, bias_accel_B=bias_accel_B
         )
+        yield name, flown
     yield "april", april_sequence(data / "euroc_imu_april")
 
 
