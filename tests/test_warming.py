@@ -150,3 +150,13 @@ def test_nothing_is_compiled_or_loaded_in_flight(backend: str, begin_s: int):
 def test_quantiles_are_those_of_scipy(p):
     dof = np.arange(1, 50)
     np.testing.assert_allclose(chi2_quantile(p, dof), chi2.ppf(p, dof), rtol=1e-12)
+
+
+def test_outliers_are_judged_by_what_was_loaded():
+    """Where the camera's rotation is unknown at first, that is needed in the midst of a flight."""
+    code = (
+        "from vioframe.frontend.warming import load_kernels; from vioframe.geometry import two_point; load_kernels(); "
+        "print(len(two_point._inliers.signatures))"
+    )
+    found = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
+    assert int(found.stdout) == 1

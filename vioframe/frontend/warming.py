@@ -8,6 +8,7 @@ import numpy as np
 from vioframe.frontend import anchors, equalisation, lucas_kanade
 from vioframe.frontend.options import FrontendOptions
 from vioframe.frontend.tracker import Frontend
+from vioframe.geometry import two_point
 from vioframe.geometry.cameras import Camera
 from vioframe.incidents import Incidents
 from vioframe.interfaces import Detector
@@ -23,6 +24,7 @@ def load_kernels() -> None:
     """
     ideal = Camera(1.0, 1.0, 0.0, 0.0, (0.0, 0.0, 0.0, 0.0), (1, 1))
     ideal.distort(ideal.undistort(np.zeros((1, 2))))
+    two_point.warm_up()
     anchors.warm_up()
     lucas_kanade.warm_up()
     equalisation.warm_up()

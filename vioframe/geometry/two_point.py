@@ -46,6 +46,12 @@ def two_point_inliers(xy_1: Float, xy_2: Float, R_C2C1: Float, threshold: float)
     return inliers if inliers.mean() >= _FEW else two_view.magsac_inliers(xy_1, xy_2, threshold)
 
 
+def warm_up() -> None:
+    """Compile the kernel, or load it from the cache, so that no frame of a flight waits for it."""
+    xy = np.zeros((6, 2))
+    two_point_inliers(xy, xy, np.eye(3), 1.0)
+
+
 @kernel
 def _inliers(xy_1: Float, xy_2: Float, R_C2C1: Float, first: Int, second: Int, threshold: float) -> Bool:
     """(N,) of ``xy_1`` and ``xy_2`` (2, N); hypotheses come from the pairs ``first`` and ``second`` (P,)."""
