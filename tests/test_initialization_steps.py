@@ -15,7 +15,7 @@ from vioframe.estimation.factors.problem import Problem, Variables
 from vioframe.estimation.factors.reprojection import Calibrated
 from vioframe.estimation.inertial.preintegration import Preintegrated, preintegrate
 from vioframe.estimation.initialization import GIVEN, dynamic, static
-from vioframe.estimation.initialization.bundle_adjustment import adjusted, adjustment, covariance
+from vioframe.estimation.initialization.bundle_adjustment import adjusted, adjustment, covariance, noise_px
 from vioframe.estimation.initialization.closed_form import (
     _solve_on_gravity_sphere,
     align,
@@ -231,6 +231,12 @@ class TestBundleAdjustment:
         )
         hosts = problem.sightings.seen.argmax(axis=1)
         np.testing.assert_allclose(positions(s.truth, truth.cameras, hosts, truth.landmarks), s.p_WF, atol=1e-9)
+
+    @pytest.mark.parametrize(("pixels", "counted_px"), [(0.0, 0.15), (0.1, 0.3), (0.2, 0.6), (2.0, 1.0)])
+    def test_sightings_count_with_three_times_the_noise_they_show(self, pixels: float, counted_px: float):
+        problem, truth = problem_of(scene(pixels))
+        adjusted_to_them = adjusted(problem, truth, CALIBRATION_COV).variables
+        assert noise_px(problem, adjusted_to_them) == pytest.approx(counted_px, rel=0.2)
 
     def test_finds_back_from_far_off(self):
         s = scene()

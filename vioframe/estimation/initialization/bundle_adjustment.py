@@ -34,6 +34,9 @@ from vioframe.geometry.cameras import intrinsics_of
 from vioframe.types import DBA, DBG, DP, DTHETA, CameraOnBody
 
 _CAUCHY = 2.0  # standard deviations
+# Of a sighting: times what landmarks show, as a track's errors last, so that its sightings say the same again; and px,
+# at least and at most.
+_TIMES_SHOWN, _LEAST_PX = 3.0, 0.15
 _MAX_ITERATIONS = 15
 # The last steps are small and many, as robust weights settle: much less than chance moves the minimum by.
 _RELATIVE_DECREASE, _ROUGH_DECREASE = 3e-4, 1e-2
@@ -43,11 +46,17 @@ _HELD, _FIXED = 1e4, 1e8
 
 
 def adjustment(
-    window: Window, imu: Sequence[Preintegrated], x: Variables, cameras: Sequence[CameraOnBody], known: Float
+    window: Window,
+    imu: Sequence[Preintegrated],
+    x: Variables,
+    cameras: Sequence[CameraOnBody],
+    known: Float,
+    sigma: float | None = None,
 ) -> Problem:
     """All factors of ``window``, whose readings are ``imu``, about the values ``x``; the first state is held.
 
-    ``known`` (16 N, 16 N) is the covariance of the calibration of ``cameras``, zero in what is known for sure.
+    ``known`` (16 N, 16 N) is the covariance of the calibration of ``cameras``, zero in what is known for sure;
+    ``sigma`` px the noise of a sighting, None for what ``x`` shows.
     """
     seen, N = np.ascontiguousarray(window.seen.T), len(cameras)
     gyro_B = np.stack([imu[0].imu.gyro_B[0], *(m.imu.gyro_B[-1] for m in imu)])
@@ -67,10 +76,22 @@ def adjustment(
     lens = Lens(True, by_intrinsics, np.tile(np.stack(intrinsics), (len(gyro_B), 1)))
     velocity = image_velocities(x.states, x.cameras, gyro_B, at, depth)
     shutter = Shutter(True, row, *motion_in_body(x.states, gyro_B)) if rolling else GLOBAL_SHUTTER
-    sightings = Sightings(seen, xy, velocity, to_px, PIXEL_SIGMA, _CAUCHY, shutter=shutter, lens=lens)
-    return Problem(
-        _prior(x, 0, _HELD, Calibrated.of(*cameras), known), ImuFactors.stack(imu), {}, sightings, first_estimates=False
-    )
+    sightings = Sightings(seen, xy, velocity, to_px, sigma or PIXEL_SIGMA, _CAUCHY, shutter=shutter, lens=lens)
+    prior = _prior(x, 0, _HELD, Calibrated.of(*cameras), known)
+    problem = Problem(prior, ImuFactors.stack(imu), {}, sightings, first_estimates=False)
+    return problem if sigma else replace(problem, sightings=sightings._replace(sigma=noise_px(problem, x)))
+
+
+def noise_px(problem: Problem, x: Variables) -> float:
+    """Standard deviation that a sighting is to count with, px, by what the landmarks of ``x`` are off by."""
+    shown_px = problem.sightings.sigma * float(np.sqrt(variance_of(problem, x)))
+    return float(np.clip(_TIMES_SHOWN * shown_px, _LEAST_PX, PIXEL_SIGMA))
+
+
+def variance_of(problem: Problem, x: Variables) -> float:
+    """That of the sightings as the landmarks show it, over that which is assumed."""
+    errors, views = problem.sightings.errors(x.poses, x.cameras, x.landmarks), problem.sightings.seen.sum(axis=1)
+    return float(np.median(2.0 * views * errors**2 / (2.0 * views - 3.0)))
 
 
 def adjusted(problem: Problem, x: Variables, known: Float, roughly: bool = False) -> Solution:

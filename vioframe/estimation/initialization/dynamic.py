@@ -25,6 +25,8 @@ from vioframe.estimation.initialization.bundle_adjustment import (
     adjusted,
     adjustment,
     covariance,
+    noise_px,
+    variance_of,
     with_calibration,
 )
 from vioframe.estimation.initialization.closed_form import (
@@ -55,7 +57,7 @@ from vioframe.geometry.so3 import level_rotation
 from vioframe.types import DP, DTHETA, DV, Calibration, FrameTracks, ImuSegment, NavState, g_W
 
 _MIN_VIEWS = 4
-# Tracks farther off than this are not noise: standard deviations, typical over all views.
+# Tracks farther off than this are not noise: px, typical over all views.
 _EPIPOLAR_LIMIT, _STRUCTURE_LIMIT, _ADJUSTED_LIMIT = 3.0, 10.0, 3.0
 _FARTHEST_M = 200.0
 # Frames of the window that are estimated, most tracks that are used, and how few refuse the attempt.
@@ -125,6 +127,7 @@ def initialise(
         # Only fast turns tell a readout; slow ones would have it make up for something else.
         doubted = doubted.copy()
         doubted[READOUT, READOUT] = known[READOUT, READOUT]
+        solution = _with_readout(solution, problem.prior.cameras.readout_s)
     window, problem, solution = refined(window, problem, solution, packets[-held_out:], calibration, doubted)
     cov = covariance(problem, solution, doubted)
     check_uncertainty(solution.variables.states, cov, scale_sigma)
@@ -155,7 +158,7 @@ def refined(
     predicted = _predicted_states(held_out, x.states.unstack(window.t_ns[:-1])[-1], calibration)
     _check_lookahead(predicted, held_out, x.cameras, window.ids, p_WF, calibration.cameras[0].model)
     x = replace(x, states=x.states.append(StateArrays.stack(predicted[-1:])))
-    problem, solution = adjusted_window(window, x, calibration, known)
+    problem, solution = adjusted_window(window, x, calibration, known, noise_px(problem, rough.variables))
     _check_fit(problem, solution)
     return window, problem, solution
 
@@ -175,10 +178,10 @@ def _believed(
     return problem, believed
 
 
-def variance_of(problem: Problem, x: Variables) -> float:
-    """That of the sightings as the landmarks show it, over that which is assumed."""
-    errors, views = problem.sightings.errors(x.poses, x.cameras, x.landmarks), problem.sightings.seen.sum(axis=1)
-    return float(np.median(2.0 * views * errors**2 / (2.0 * views - 3.0)))
+def _with_readout(solution: Solution, readout_s: Float) -> Solution:
+    """The same but for the readout times (N,) of the cameras."""
+    x = solution.variables
+    return replace(solution, variables=replace(x, cameras=x.cameras._replace(readout_s=readout_s)))
 
 
 def require_tracks(window: Window, what: str) -> None:
@@ -227,21 +230,23 @@ def _start_of_adjustment(
     return Variables(states, Calibrated.of(*calibration.cameras), landmarks)
 
 
-def adjusted_window(window: Window, x: Variables, calibration: Calibration, known: Float) -> tuple[Problem, Solution]:
+def adjusted_window(
+    window: Window, x: Variables, calibration: Calibration, known: Float, sigma: float
+) -> tuple[Problem, Solution]:
     """The adjustment of ``window`` from ``x``, its readings integrated at the biases there.
 
-    ``known`` (16 N, 16 N) is the covariance of the ``calibration``'s cameras.
+    ``known`` (16 N, 16 N) is the covariance of the ``calibration``'s cameras, ``sigma`` px the noise of a sighting.
     """
     biases = zip(x.states.bias_gyro_B[:-1], x.states.bias_accel_B[:-1], strict=True)
     imu = [preintegrate(segment, *bias, calibration.imu) for segment, bias in zip(window.segments, biases, strict=True)]
-    problem = adjustment(window, imu, x, calibration.cameras, known)
+    problem = adjustment(window, imu, x, calibration.cameras, known, sigma)
     return problem, adjusted(problem, x, known)
 
 
 def explained(problem: Problem, x: Variables) -> Bool:
     """(L,) whether a track's landmark lies in front of its cameras, at a finite depth, and near its observations."""
-    errors = problem.sightings.errors(x.poses, x.cameras, x.landmarks)
-    return np.asarray((errors < _ADJUSTED_LIMIT) & (x.landmarks[:, 2] > 1.0 / _FARTHEST_M))
+    errors_px = problem.sightings.sigma * problem.sightings.errors(x.poses, x.cameras, x.landmarks)
+    return np.asarray((errors_px < _ADJUSTED_LIMIT) & (x.landmarks[:, 2] > 1.0 / _FARTHEST_M))
 
 
 def landmark_positions(problem: Problem, x: Variables) -> Float:
@@ -382,6 +387,6 @@ def warm_up(calibration: Calibration) -> None:
     with_gyro_bias(window, np.zeros(3), calibration, 1e-3)
     state, landmarks = NavState(0, np.eye(3), *np.zeros((4, 3))), np.column_stack([xy[0], np.full(20, 0.2)])
     x = Variables(StateArrays.stack([state] * 4), Calibrated.of(*calibration.cameras), landmarks)
-    problem, solution = adjusted_window(window, x, calibration, 1e-4 * np.eye(CALIBRATION_SIZE))
+    problem, solution = adjusted_window(window, x, calibration, 1e-4 * np.eye(CALIBRATION_SIZE), PIXEL_SIGMA)
     explained(problem, solution.variables)
     problem.reading_residuals(solution.variables.states)

@@ -18,7 +18,7 @@ from vioframe.estimation.factors.inertial import StateArrays
 from vioframe.estimation.factors.landmarks import in_hosts
 from vioframe.estimation.factors.problem import Variables
 from vioframe.estimation.factors.reprojection import Calibrated
-from vioframe.estimation.initialization.bundle_adjustment import adjusted, adjustment, covariance
+from vioframe.estimation.initialization.bundle_adjustment import adjusted, adjustment, covariance, variance_of
 from vioframe.estimation.initialization.closed_form import align, rotations
 from vioframe.estimation.initialization.dynamic import (
     CONTRADICTED,
@@ -30,7 +30,6 @@ from vioframe.estimation.initialization.dynamic import (
     preintegrated,
     refined,
     require_tracks,
-    variance_of,
     with_gyro_bias,
 )
 from vioframe.estimation.initialization.window import (
@@ -93,7 +92,7 @@ def initialise(packets: Sequence[Packet], calibration: Calibration, known: Float
     solution = adjusted(problem, x, known, roughly=True)
     window, problem, solution = refined(window, problem, solution, packets[-_HELD_OUT:], calibration, known)
     x = solution.variables
-    _, other = adjusted_window(window, x, calibration, doubted)
+    _, other = adjusted_window(window, x, calibration, doubted, problem.sightings.sigma)
     contradicted = not solution.cost < other.cost + CONTRADICTED * variance_of(problem, x)
     refuse_unless(not contradicted, "images and readings contradict the calibration")
     cov = covariance(problem, solution, known)

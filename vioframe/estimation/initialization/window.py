@@ -21,7 +21,7 @@ from vioframe.types import CameraOnBody, Float, FrameTracks, ImuSegment, Int, Na
 Packet = tuple[ImuSegment, FrameTracks]
 
 PIXEL_SIGMA = 1.0
-"""Standard deviation of an observation, px."""
+"""Standard deviation of an observation, px, as long as none has been found, and at most."""
 BIAS_GYRO_SIGMA, BIAS_ACCEL_SIGMA = BIAS_SIGMA, 0.15
 """Priors of the biases about zero, rad/s and m/s^2; those of EuRoC's IMU are 0.08 and 0.13."""
 LARGEST_IMU_GAP_S = 0.1
