@@ -78,24 +78,30 @@ def right_jacobian_inverse(phi: ArrayLike) -> Float:
     return out
 
 
+def _quaternion_products() -> Float:
+    """(9, 16) by which the entries of R, row by row, become 4 q q' - I, in the order x y z w."""
+    P = np.zeros((3, 3, 4, 4))
+    for i in range(3):
+        P[i, i] = np.diag([-1.0, -1.0, -1.0, 1.0])
+        P[i, i, i, i] = 1.0
+        k, n = (i + 1) % 3, (i + 2) % 3
+        P[k, n, k, n] = P[k, n, n, k] = P[n, k, k, n] = P[n, k, n, k] = 1.0
+        P[n, k, i, 3] = P[n, k, 3, i] = 1.0
+        P[k, n, i, 3] = P[k, n, 3, i] = -1.0
+    return P.reshape(9, 16)
+
+
+_PRODUCTS = _quaternion_products()
+
+
 def to_quat_xyzw(R: ArrayLike) -> Float:
     """(..., 3, 3) -> (..., 4), Hamilton, unit norm, w >= 0 (Shepperd's method: the largest component is divided by)."""
     R = np.asarray(R, dtype=np.float64)
-    m = R.reshape(-1, 3, 3)
-    diagonal = m[:, [0, 1, 2], [0, 1, 2]]
-    trace = diagonal.sum(axis=1)
-    # Four times the products q_i q_j; the row of the largest diagonal entry is proportional to q.
-    Q = np.empty((len(m), 4, 4))
-    for i in range(3):
-        Q[:, i, i] = 1.0 - trace + 2.0 * diagonal[:, i]
-        for j in range(i):
-            Q[:, i, j] = Q[:, j, i] = m[:, i, j] + m[:, j, i]
-        k, n = (i + 1) % 3, (i + 2) % 3
-        Q[:, i, 3] = Q[:, 3, i] = m[:, n, k] - m[:, k, n]
-    Q[:, 3, 3] = 1.0 + trace
-    best = np.argmax(Q[:, [0, 1, 2, 3], [0, 1, 2, 3]], axis=1)
-    quat = Q[np.arange(len(m)), best]
-    quat *= (np.where(quat[:, 3] < 0.0, -1.0, 1.0) / np.linalg.norm(quat, axis=1))[:, None]
+    Q = (R.reshape(-1, 9) @ _PRODUCTS).reshape(-1, 4, 4) + np.eye(4)
+    # Each row is proportional to q, that of the largest diagonal entry most exactly.
+    best = Q.reshape(-1, 16)[:, ::5].argmax(axis=1)
+    quat = Q[np.arange(len(Q)), best]
+    quat /= np.copysign(np.linalg.norm(quat, axis=1), quat[:, 3])[:, None]
     out: Float = quat.reshape(*R.shape[:-2], 4)
     return out
 

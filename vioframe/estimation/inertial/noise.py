@@ -28,8 +28,11 @@ def roughness(t_ns: Int, values: Float, order: int = 2) -> float:
     """
     if len(t_ns) <= order:
         return 0.0
-    dt_s = float(np.median(np.diff(t_ns))) * 1e-9
-    return float(np.sqrt((np.diff(values, order, axis=0) ** 2).mean() / comb(2 * order, order) * dt_s))
+    between_ns, middle = np.sort(t_ns[1:] - t_ns[:-1]), len(t_ns) - 1
+    dt_s = 0.5e-9 * float(between_ns[(middle - 1) // 2] + between_ns[middle // 2])  # np.median takes ten times as long
+    for _ in range(order):
+        values = values[1:] - values[:-1]
+    return float(np.sqrt((values * values).mean() / comb(2 * order, order) * dt_s))
 
 
 def noise_over(imu: ImuSegment, at_rest: ImuNoise, in_flight: ImuNoise) -> ImuNoise:
