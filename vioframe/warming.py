@@ -88,7 +88,8 @@ def loading_meanwhile(steps: Iterable[Step], calibration: Calibration) -> Iterat
 
 
 def _load_start(calibration: Calibration) -> None:
-    gate(0.95, 1)  # which takes a module that takes its time
+    """What is needed when a flight begins: the module that gates take, and the kernels of a start."""
+    gate(0.95, 1)
     initialization.warm_up(calibration)
 
 

@@ -15,7 +15,7 @@ from math import inf
 import numpy as np
 from numpy.typing import ArrayLike
 
-from vioframe.arrays import Bool
+from vioframe.arrays import Bool, same_image
 from vioframe.errors import ImageSizeError
 from vioframe.frontend import Frontend, FrontendOptions
 from vioframe.incidents import Incidents
@@ -123,7 +123,7 @@ class Gatherer:
             close = len(self._frames_ns) % self._look_every == 0
             self._frames_ns.append(measurement.t_ns)
             self._looks.append(_look(image) if close else (np.nan,) * 4)
-            self._repeated.append(self._last is not None and _is_same(image, self._last))
+            self._repeated.append(self._last is not None and same_image(image, self._last))
             self._last = image
 
     def turning(self, since: int) -> float:
@@ -189,11 +189,6 @@ def gather(measurements: Iterable[Measurement], calibration: Calibration) -> Rec
 
 def _by_turning(stretch: tuple[float, tuple[FrameTracks, ...]]) -> float:
     return stretch[0]
-
-
-def _is_same(image: Image, other: Image) -> bool:
-    """To the last bit, which hardly ever needs all of both to be looked at."""
-    return np.array_equal(image[::32], other[::32]) and np.array_equal(image, other)
 
 
 def sharpness_of(image: Image) -> float:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from vioframe.arrays import same_image
 from vioframe.frontend.anchors import Anchors
 from vioframe.frontend.candidates import CandidateSource
 from vioframe.frontend.equalisation import equalise
@@ -157,10 +158,9 @@ class View:
 
     def _watch_for_frozen(self, image: Image, R_C2C1: Float | None, t_ns: int) -> None:
         """Count an image that is the one before it to the last bit, though the camera turned: it was not taken anew."""
-        if R_C2C1 is None or self._image is None or not np.array_equal(image[::16, ::16], self._image[::16, ::16]):
+        if R_C2C1 is None or self._image is None or not same_image(image, self._image):
             return
-        turned_px = self.camera.focal_px * float(np.linalg.norm(so3.log(R_C2C1)))
-        if turned_px > _FROZEN_PX and np.array_equal(image, self._image):
+        if self.camera.focal_px * float(np.linalg.norm(so3.log(R_C2C1))) > _FROZEN_PX:
             self._incidents.add("frozen_image", t_ns)
 
     def _follow(self, pyramid: Pyramid, R_C2C1: Float | None) -> Float:

@@ -76,10 +76,14 @@ def adjustment(
     lens = Lens(True, by_intrinsics, np.tile(np.stack(intrinsics), (len(gyro_B), 1)))
     velocity = image_velocities(x.states, x.cameras, gyro_B, at, depth)
     shutter = Shutter(True, row, *motion_in_body(x.states, gyro_B)) if rolling else GLOBAL_SHUTTER
-    sightings = Sightings(seen, xy, velocity, to_px, sigma or PIXEL_SIGMA, _CAUCHY, shutter=shutter, lens=lens)
+    sightings = Sightings(
+        seen, xy, velocity, to_px, PIXEL_SIGMA if sigma is None else sigma, _CAUCHY, shutter=shutter, lens=lens
+    )
     prior = _prior(x, 0, _HELD, Calibrated.of(*cameras), known)
     problem = Problem(prior, ImuFactors.stack(imu), {}, sightings, first_estimates=False)
-    return problem if sigma else replace(problem, sightings=sightings._replace(sigma=noise_px(problem, x)))
+    if sigma is None:
+        problem = replace(problem, sightings=sightings._replace(sigma=noise_px(problem, x)))
+    return problem
 
 
 def noise_px(problem: Problem, x: Variables) -> float:

@@ -122,13 +122,14 @@ def initialise(
     check_uncertainty(x.states, covariance(problem, guess, doubted), scale_sigma, _HOPELESS)
     solution = adjusted(problem, x, doubted, roughly=True)
     cov = covariance(problem, solution, doubted)
-    check_uncertainty(solution.variables.states, cov, scale_sigma, _HOPELESS)
+    x = solution.variables
+    check_uncertainty(x.states, cov, scale_sigma, _HOPELESS)
     if not cov[_READOUT, _READOUT] <= _READOUT_SIGMA_S**2:
         # Only fast turns tell a readout; slow ones would have it make up for something else.
         doubted = doubted.copy()
         doubted[READOUT, READOUT] = known[READOUT, READOUT]
-        solution = _with_readout(solution, problem.prior.cameras.readout_s)
-    window, problem, solution = refined(window, problem, solution, packets[-held_out:], calibration, doubted)
+        x = replace(x, cameras=x.cameras._replace(readout_s=problem.prior.cameras.readout_s))
+    window, problem, solution = refined(window, problem, x, packets[-held_out:], calibration, doubted)
     cov = covariance(problem, solution, doubted)
     check_uncertainty(solution.variables.states, cov, scale_sigma)
     problem, solution = _believed(problem, solution, calibration, known, cov)
@@ -141,24 +142,23 @@ def initialise(
 def refined(
     window: Window,
     problem: Problem,
-    rough: Solution,
+    x: Variables,
     held_out: Sequence[Packet],
     calibration: Calibration,
     known: Float,
 ) -> tuple[Window, Problem, Solution]:
-    """What fits of ``window``, and its adjustment, from the ``rough`` one of all but the newest frame.
+    """What fits of ``window``, and its adjustment, from ``x``, to which all but the newest frame led roughly.
 
     That must predict what the first camera sees in the packets ``held_out`` behind it, of which the newest is the last.
     """
-    x = rough.variables
-    keep = explained(problem, x)
+    keep, sigma = explained(problem, x), noise_px(problem, x)
     p_WF = landmark_positions(problem, x)[keep]
     window, x = window.only(keep), replace(x, landmarks=x.landmarks[keep])
     require_tracks(window, "tracks fit the bundle adjustment")
     predicted = _predicted_states(held_out, x.states.unstack(window.t_ns[:-1])[-1], calibration)
     _check_lookahead(predicted, held_out, x.cameras, window.ids, p_WF, calibration.cameras[0].model)
     x = replace(x, states=x.states.append(StateArrays.stack(predicted[-1:])))
-    problem, solution = adjusted_window(window, x, calibration, known, noise_px(problem, rough.variables))
+    problem, solution = adjusted_window(window, x, calibration, known, sigma)
     _check_fit(problem, solution)
     return window, problem, solution
 
@@ -176,12 +176,6 @@ def _believed(
     if not believed.cost < solution.cost + CONTRADICTED * variance_of(problem, x):
         raise ContradictedError(x.cameras, _camera(cov))
     return problem, believed
-
-
-def _with_readout(solution: Solution, readout_s: Float) -> Solution:
-    """The same but for the readout times (N,) of the cameras."""
-    x = solution.variables
-    return replace(solution, variables=replace(x, cameras=x.cameras._replace(readout_s=readout_s)))
 
 
 def require_tracks(window: Window, what: str) -> None:

@@ -89,8 +89,8 @@ def initialise(packets: Sequence[Packet], calibration: Calibration, known: Float
 
     x = Variables(alignment.states.turned(level_rotation(-alignment.g_B0)), calibrated, landmarks)
     problem = adjustment(window.without_last(), imu[:-1], x, cameras, known)
-    solution = adjusted(problem, x, known, roughly=True)
-    window, problem, solution = refined(window, problem, solution, packets[-_HELD_OUT:], calibration, known)
+    x = adjusted(problem, x, known, roughly=True).variables
+    window, problem, solution = refined(window, problem, x, packets[-_HELD_OUT:], calibration, known)
     x = solution.variables
     _, other = adjusted_window(window, x, calibration, doubted, problem.sightings.sigma)
     contradicted = not solution.cost < other.cost + CONTRADICTED * variance_of(problem, x)
