@@ -86,7 +86,7 @@ def seeing_state(
     exact: bool = False,
     calibration: Calibration = CALIBRATION,
 ) -> tuple[FilterState, TrackTable]:
-    """A filter that knows to a centimetre where it has been on a simulated flight, and what it saw from there.
+    """A filter that knows to millimetres where it has been on a simulated flight, and what it saw from there.
 
     With a rolling shutter it estimates the readout. An ``exact`` one sees without noise.
     """
@@ -111,7 +111,7 @@ def seeing_state(
         state.R_WB, state.p_WB, state.v_WB = true.R_WB, true.p_WB, true.v_WB
         state.augment_clone(imu.gyro_B[-1] - true.bias_gyro_B)
         observations.add_frame(tracks)
-    state.cov = 0.01**2 * random_covariance(np.random.default_rng(seed), len(state.cov))
+    state.cov = 0.003**2 * random_covariance(np.random.default_rng(seed), len(state.cov))
     return state, observations
 
 

@@ -107,7 +107,7 @@ def test_gates_accept_inliers_at_their_nominal_rate(flight, calibration, monkeyp
     assert counts.landmarks[1] > 5000
     assert counts.promoted[1] > 200
     # A degree of freedom more or less would make 0.98 or 0.85 of the landmarks' 0.95.
-    assert (np.abs(counts.rates - 0.95) < [0.015, 0.015, 0.04]).all(), counts.rates
+    assert (np.abs(counts.rates - 0.95) < [0.015, 0.02, 0.04]).all(), counts.rates
 
 
 def test_the_gate_follows_its_quantile(monkeypatch):
@@ -126,6 +126,43 @@ def test_noise_of_points_is_found_where_it_is_larger_than_was_taken_for_granted(
     if flown_px >= found_px:
         # With the least noise that is taken for granted the gate would turn most of them away.
         assert counts.rates[0] > 0.85
+
+
+def lasting(sequence: TrackSequence, sigma_px: float, alike: float, seed: int) -> TrackSequence:
+    """Points that are off by ``sigma_px``, from frame to frame by what is correlated by ``alike``."""
+    rng, off = np.random.default_rng(seed), dict[int, Float]()
+
+    def carried(tracks: FrameTracks) -> Float:
+        for track in tracks.ids.tolist():
+            new = sigma_px * rng.normal(size=2)
+            off[track] = alike * off[track] + np.sqrt(1.0 - alike**2) * new if track in off else new
+        return np.array([off[track] for track in tracks.ids.tolist()])
+
+    return moved(sequence, carried)
+
+
+@pytest.mark.parametrize(("alike", "tolerance"), [(0.0, 0.05), (0.5, 0.2)])
+def test_errors_that_last_are_taken_for_as_much_noise_as_tells_as_little(alike, tolerance, monkeypatch):
+    """A sum of errors that hang together by a part a in successive frames varies by (1 + a) / (1 - a) times more."""
+    filters, begin = [], Msckf.begin
+    monkeypatch.setattr(Msckf, "begin", lambda self, start: filters.append(self) or begin(self, start))
+    sequence = simulated_sequence("figure_eight", pixel_sigma=0.02, seed=1, duration_s=10.0)
+    fly(lasting(sequence, 0.3, alike, 1), WHITE, 1, EXACT)
+    expected = 0.3 * np.sqrt((1.0 + alike) / (1.0 - alike))
+    assert filters[-1].point_noise.px == pytest.approx(expected, rel=tolerance)
+
+
+def test_the_covariance_may_be_trusted_where_errors_of_points_last():
+    values = []
+    for seed in range(3):
+        sequence = simulated_sequence("figure_eight", pixel_sigma=0.02, seed=seed, duration_s=12.0)
+        run = fly(lasting(sequence, 0.3, 0.7, seed), WHITE, seed, EXACT)
+        values.append(pose_nees(run.states, {s.t_ns: s for s in sequence.true_states}))
+    low, high = chi2.ppf([0.025, 0.975], 9) / 3
+    orientation, position = np.mean(values, axis=0)
+    # Taken for white they make the latter 9.
+    assert low < orientation < high
+    assert low < position < high
 
 
 def test_outliers_are_rejected_and_do_no_harm(monkeypatch):

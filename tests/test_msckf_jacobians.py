@@ -177,6 +177,29 @@ def test_distance_of_a_track_is_that_of_what_is_free_of_the_landmark():
     assert distance_and_variances(S, H_f, residual, 0.3, 1.0)[0] == pytest.approx(expected, rel=1e-9)
 
 
+@pytest.mark.parametrize("views", [6, 7, 11])
+def test_the_variance_ratio_is_one_for_errors_as_expected_and_more_for_those_that_last(views):
+    """Against Bartlett's weights as a matrix, and in the mean over errors of both kinds."""
+    rng = np.random.default_rng(views)
+    S, H_f = random_covariance(rng, 2 * views), rng.normal(size=(2 * views, 3))
+    N = np.eye(2 * views) - H_f @ np.linalg.pinv(H_f)
+    apart = np.abs(np.subtract.outer(np.arange(views), np.arange(views)))
+    W = np.kron(np.maximum(1.0 - apart / (views // 2), 0.0), np.eye(2))
+
+    def ratio(S, residual):
+        return distance_and_variances(S, H_f, residual, 0.3, 1.0)[2]
+
+    residual = rng.normal(size=2 * views)
+    left, expected = N @ residual, N @ (S + 0.3 * np.eye(2 * views)) @ N
+    sums, single = left @ W @ left / np.trace(W @ expected), left @ left / np.trace(expected)
+    assert ratio(S, residual) == pytest.approx(sums / single, rel=1e-9)
+    white, lasting = rng.normal(size=(4000, 2 * views)), np.linalg.cholesky(np.kron(0.7**apart, np.eye(2)))
+    nothing = np.zeros_like(S)
+    assert np.mean([ratio(nothing, e) for e in white]) == pytest.approx(1.0, abs=0.04)
+    assert np.mean([ratio(nothing, lasting @ e) for e in white]) > 1.4
+    assert ratio(S, nothing[0]) == 1.0
+
+
 def test_no_track_is_believed_where_the_covariance_is_none():
     """What is not positive definite says nothing of how far off a track may be."""
     state, table = seeing_state()
@@ -195,7 +218,7 @@ def test_sightings_that_do_not_fit_get_cauchys_variance():
     left, expected = free @ free.T @ residual, free @ free.T @ (S + 0.3 * np.eye(10)) @ free @ free.T
     squared = (left.reshape(5, 2) ** 2).sum(axis=1) / np.diag(expected).reshape(5, 2).mean(axis=1)
     for cauchy in (0.5, 2.0):
-        _, variances = distance_and_variances(S, H_f, residual, 0.3, cauchy)
+        _, variances, _ = distance_and_variances(S, H_f, residual, 0.3, cauchy)
         np.testing.assert_allclose(variances, 0.3 * (1.0 + squared / cauchy**2), rtol=1e-9)
     assert variances.argmax() == 2
     # Moving the landmark is no misfit.

@@ -261,14 +261,39 @@ def reduce_landmark(H: Float, H_f: Float, residual: Float) -> None:
 
 
 @kernel(inlined=True)
+def variance_ratio(left: Float, S_left: Float) -> float:
+    """How errors of one landmark's sightings last: 1 where they are white, more where neighbours are alike.
+
+    Mean square of sums over half of the sightings (Bartlett's window, as by Newey and West, "A simple, positive
+    semi-definite, heteroskedasticity and autocorrelation consistent covariance matrix", Econometrica 1987) over that of
+    single ones, in units of what the covariance ``S_left`` of ``left`` (2 M,) would give.
+    """
+    m = len(left) // 2
+    width = max(m // 2, 1)
+    sums = expected_sums = single = expected = 0.0
+    for i in range(m):
+        for k in range(max(i - width + 1, 0), min(i + width, m)):
+            weight = 1.0 - abs(i - k) / width
+            for a in range(2 * i, 2 * i + 2):
+                b = a + 2 * (k - i)
+                sums += weight * left[a] * left[b]
+                expected_sums += weight * S_left[a, b]
+        for a in range(2 * i, 2 * i + 2):
+            single += left[a] ** 2
+            expected += S_left[a, a]
+    return sums / single * expected / expected_sums if single > 0.0 else 1.0
+
+
+@kernel(inlined=True)
 def distance_and_variances(
     S: Float, H_f: Float, residual: Float, variance: float, cauchy: float
-) -> tuple[float, Float]:
+) -> tuple[float, Float, float]:
     """Of M sightings of one landmark their squared Mahalanobis distance, and (M,) variances to take them with, px^2.
 
     Of their ``residual`` (2 M,) the state leaves ``S`` (2 M, 2 M) unsure, the landmark anything along ``H_f`` (2 M, 3),
     and ``variance`` is that of the noise. What is left when the landmark is where all agree best may be off by e of its
-    standard deviations; a sighting then has 1 + (e / ``cauchy``)^2 times the ``variance``: Cauchy's loss.
+    standard deviations; a sighting then has 1 + (e / ``cauchy``)^2 times the ``variance``: Cauchy's loss. Last comes
+    the :func:`variance_ratio` of what is left.
     """
     m = len(residual)
     S = S.copy()
@@ -287,18 +312,20 @@ def distance_and_variances(
             add(U_S[a], U[a, row], S[row])
         for row in range(m):
             add(U_S_U[a], U_S[a, row], U[:, row])
+    # Of S what is across U: U_S becomes U S - U S U^T U / 2, with which both sides are taken off at once.
+    left, S_left = residual.copy(), S.copy()
+    for a in range(3):
+        for b in range(3):
+            add(U_S[a], -0.5 * U_S_U[a, b], U[b])
+        add(left, -U_r[a], U[a])
+    for row in range(m):
+        for a in range(3):
+            add(S_left[row], -U[a, row], U_S[a])
+            add(S_left[row], -U_S[a, row], U[a])
     variances = np.empty(m // 2)
     for i in range(m // 2):
-        squared = expected = 0.0
-        for row in range(2 * i, 2 * i + 2):
-            left = residual[row]
-            expected += S[row, row]
-            for a in range(3):
-                left -= U[a, row] * U_r[a]
-                expected -= 2.0 * U[a, row] * U_S[a, row]
-                for b in range(3):
-                    expected += U[a, row] * U_S_U[a, b] * U[b, row]
-            squared += left * left
+        a, b = 2 * i, 2 * i + 1
+        squared, expected = left[a] ** 2 + left[b] ** 2, S_left[a, a] + S_left[b, b]
         variances[i] = variance * (1.0 + 2.0 * squared / expected / (cauchy * cauchy))
     # By S what the landmark explains is the projection onto three whitened columns.
     white = np.empty((m, 4))
@@ -311,22 +338,23 @@ def distance_and_variances(
             add(information[a], white[row, a], white[row])
     along = information[:3, 3:].copy()
     whiten(information[:3, :3], along)
-    return information[3, 3] - along[0, 0] ** 2 - along[1, 0] ** 2 - along[2, 0] ** 2, variances
+    distance = information[3, 3] - along[0, 0] ** 2 - along[1, 0] ** 2 - along[2, 0] ** 2
+    return distance, variances, variance_ratio(left, S_left)
 
 
 @kernel(inlined=True)
 def reduced_track(
     w: Window, xy: Float, xy_normalised: Float, seen: Bool, P: Float, pixel_sigma: float, cauchy: float
-) -> tuple[bool, Float, Float, Float, Float, float]:
-    """One track (C,): whether it was triangulated, p_WF, H, H_f, residual, and its squared Mahalanobis distance.
+) -> tuple[bool, Float, Float, Float, Float, float, float]:
+    """One track (C,): whether it was triangulated, p_WF, H, H_f, residual, squared distance, :func:`variance_ratio`.
 
     Below the third row there is no landmark. ``P`` is the covariance of the columns of H, [cameras, clones]; the noise
     of all rows is white with ``pixel_sigma``, to which those of sightings that do not fit are scaled.
     """
     ok, p_WF, H, H_f, residual = track_rows(w, xy, xy_normalised, seen, pixel_sigma)
-    distance = 0.0
+    distance = ratio = 0.0
     if ok:
-        distance, variances = distance_and_variances(H @ P @ H.T, H_f, residual, pixel_sigma**2, cauchy)
+        distance, variances, ratio = distance_and_variances(H @ P @ H.T, H_f, residual, pixel_sigma**2, cauchy)
         for i in range(len(variances)):
             scale = pixel_sigma / np.sqrt(variances[i])
             for row in range(2 * i, 2 * i + 2):
@@ -336,7 +364,7 @@ def reduced_track(
                     H_f[row, c] *= scale
                 residual[row] *= scale
         reduce_landmark(H, H_f, residual)
-    return ok, p_WF, H, H_f, residual, distance
+    return ok, p_WF, H, H_f, residual, distance, ratio
 
 
 class TrackRows(NamedTuple):
@@ -344,7 +372,8 @@ class TrackRows(NamedTuple):
 
     Of a landmark the rest is known by H_of e + T dp_WF = residual_of, up to the same white noise: ``H_of`` (F, 3, n),
     ``T`` (F, 3, 3), ``residual_of`` (F, 3). ``p_WF`` (F, 3) is where it was linearised; ``squares`` (F,) are squared
-    Mahalanobis distances, zero where there are none. Only what is accepted by its ``verdict`` (F,) is in the rows.
+    Mahalanobis distances and ``ratios`` (F,) each track's :func:`variance_ratio`, zero where there are none. Only what
+    is accepted by its ``verdict`` (F,) is in the rows.
     """
 
     H: Float
@@ -354,6 +383,7 @@ class TrackRows(NamedTuple):
     residual_of: Float
     p_WF: Float
     squares: Float
+    ratios: Float
     verdict: Int
 
 
@@ -370,11 +400,13 @@ def msckf_rows(
     r_all = np.empty(2 * seen.sum())
     H_of, T, residual_of = np.empty((F, 3, n)), np.empty((F, 3, 3)), np.empty((F, 3))
     p_WF = np.empty((F, 3))
-    squares = np.zeros(F)
+    squares, ratios = np.zeros(F), np.zeros(F)
     verdict = np.empty(F, dtype=np.int64)
     rows = 0
     for f in range(F):
-        ok, p, H, H_f, residual, squares[f] = reduced_track(w, xy[f], xy_normalised[f], seen[f], P, pixel_sigma, cauchy)
+        ok, p, H, H_f, residual, squares[f], ratios[f] = reduced_track(
+            w, xy[f], xy_normalised[f], seen[f], P, pixel_sigma, cauchy
+        )
         set_vector(p_WF[f], p)
         if not ok:
             verdict[f] = NOT_TRIANGULATED
@@ -390,4 +422,4 @@ def msckf_rows(
         set_matrix(H_all[rows : rows + free], H[3:])
         set_vector(r_all[rows : rows + free], residual[3:])
         rows += free
-    return TrackRows(H_all[:rows], r_all[:rows], H_of, T, residual_of, p_WF, squares, verdict)
+    return TrackRows(H_all[:rows], r_all[:rows], H_of, T, residual_of, p_WF, squares, ratios, verdict)

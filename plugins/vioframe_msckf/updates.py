@@ -18,7 +18,7 @@ from vioframe_msckf.state import IMU, FilterState, compress
 
 # A landmark is taken in once its distance from the body is known to this part. Before, nothing about it is Gaussian,
 # and it would never be linearised where it is.
-_KNOWN_TO = 0.2
+_KNOWN_TO = 0.1
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,7 +103,7 @@ def update_from_tracks(
     used = np.repeat(use[accepted], 2 * views[accepted] - 3)
     if used.any():
         state.update(*compress(tracks.H[used], tracks.residual[used]), columns, point_noise.px**2)
-    point_noise.add(tracks.squares[ended], views[ended])
+    point_noise.add(tracks.squares[ended], views[ended], tracks.ratios[ended])
     gone = ended | use | (tracks.verdict == GATED)
     return rows[gone], observations.ids[rows[accepted & ended]], tracks.p_WF[accepted & ended]
 

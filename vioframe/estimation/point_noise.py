@@ -11,13 +11,16 @@ from vioframe.arrays import Float, Int
 _AT_FIRST, _AT_MOST = 5.0, 12.0
 # How many tracks it is found by.
 _REMEMBERED = 100
+# Views from which on a track tells how its errors last: of fewer its landmark leaves nothing.
+_LONG = 6
 
 
 class PointNoise:
     """The standard deviation of a tracked point, px: at least what the options say, and more where tracks fit worse.
 
     A gate or a robust loss that takes noise for smaller than it is turns good tracks away, the long ones first; what is
-    too large for a while does less harm, and so it begins.
+    too large for a while does less harm, and so it begins. Errors that last from one sighting to the next, as those of
+    a blurred patch do, tell a filter that takes them for white less than as many others would, and so count for more.
     """
 
     def __init__(self, least_px: float) -> None:
@@ -26,19 +29,25 @@ class PointNoise:
 
     def begin(self) -> None:
         """Forget what was found; of a body at rest it says little about the flight to come."""
-        self.px = _AT_FIRST * self._least_px
+        self.px, self._ratio = _AT_FIRST * self._least_px, 1.0
 
-    def add(self, squares: Float, views: Int) -> None:
+    def add(self, squares: Float, views: Int, ratios: Float | None = None) -> None:
         """Go by what (N,) tracks are off by, seen by ``views`` (N,): sums of squares, in standard deviations.
 
         Not all that is accepted, which would agree with any noise; of several the middle one is no outlier. Each counts
-        for one of the last ``_REMEMBERED``; those of zero for none.
+        for one of the last ``_REMEMBERED``; those of zero for none. The variance ``ratios`` (N,) say how errors last:
+        sums of successive ones over what they were if white. As landmarks take up much of what lasts, the square of
+        that is what noise is larger by (``docs/derivations/msckf.md``).
         """
         found = squares > 0.0
+        long = found & (views >= _LONG)
+        if ratios is not None and long.any():
+            share = long.sum() / (long.sum() + _REMEMBERED)
+            self._ratio += share * (ratios[long].mean() - self._ratio)
         if found.any():
             # A landmark takes up three of two residuals a view; where the noise is right, this is 1 in the middle.
             dof = 2.0 * views[found] - 3.0
             excess = float(np.median(squares[found] / (dof - 2.0 / 3.0)))
             share = len(dof) / (len(dof) + _REMEMBERED)
-            px = self.px * excess ** (0.5 * share)
+            px = self.px * (excess * max(self._ratio, 1.0) ** 2) ** (0.5 * share)
             self.px = min(max(px, self._least_px), _AT_MOST * self._least_px)
