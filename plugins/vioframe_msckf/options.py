@@ -23,7 +23,7 @@ class MsckfOptions:
     landmark_drift_px: NonNegativeFloat = 0.1
     """How far a followed point slides off its landmark from one frame to the next, px; 0 where noise is white."""
     pixel_sigma: PositiveFloat = 0.2
-    """Standard deviation of a tracked feature's position, px, at least; more is found where tracks fit worse, or errors last."""
+    """Standard deviation of a tracked feature's position, px, at least; more where tracks fit worse or errors last."""
     cauchy_sigmas: PositiveFloat = 1.0
     """Where Cauchy's robust loss begins to discount an observation, standard deviations."""
     gate_quantile: Annotated[float, Field(gt=0.0, lt=1.0)] = 0.95
