@@ -21,7 +21,7 @@ from tempfile import TemporaryDirectory
 
 import click
 from common import SHARED_DATA, present
-from speed import first_frame_s, on_cores
+from speed import first_and_last_frame_s, on_cores
 
 from vioframe.bench import Row
 
@@ -60,9 +60,8 @@ def _rows(data: Path, rounds: int, out: Path) -> Iterator[Row]:
         found: defaultdict[str, float] = defaultdict(float)
         for cores in (1, 2):
             rmtree(out, ignore_errors=True)
-            found[f"until the first frame, {cores} core{'s' * (cores > 1)}"] = first_frame_s(
-                [sys.executable, *arguments], cores, out, {}
-            )
+            first_s, _ = first_and_last_frame_s([sys.executable, *arguments], cores, out, {})
+            found[f"until the first frame, {cores} core{'s' * (cores > 1)}"] = first_s
         rmtree(out, ignore_errors=True)
         listed = on_cores([sys.executable, "-X", "importtime", *arguments], 1, {}, stderr=subprocess.PIPE)
         for microseconds, module in _IMPORTED.findall(listed.communicate()[1].decode()):

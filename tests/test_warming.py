@@ -11,6 +11,7 @@ import pytest
 from scipy.stats import chi2
 
 from vioframe import odometry
+from vioframe.frontend.warming import load_kernels
 from vioframe.io.calibration import packaged_calibration
 from vioframe.jit import kernel, waited_s
 from vioframe.odometry import Odometry
@@ -59,6 +60,22 @@ def test_a_start_is_loaded_meanwhile_where_that_is_not_to_compile(monkeypatch, c
     monkeypatch.setattr("vioframe.estimation.initialization.warm_up", loaded.append)
     assert list(loading_meanwhile([1, 2, 3], CALIBRATION.with_camera(0, rotation_known=False))) == [1, 2, 3]
     assert [calibration.cameras[0].rotation_known for calibration in loaded] == [True] * compiled
+
+
+def test_loading_the_kernels_of_a_first_frame_brings_no_compiler_and_no_linear_algebra():
+    """In a process of its own. Each takes 0.1 s of a start, so that kernels do without what numba overloads."""
+    code = """
+import sys
+from vioframe.frontend.warming import load_kernels
+from vioframe.jit import heard
+told = []
+with heard(told.append):
+    load_kernels()
+print(*told, *sorted({"scipy.linalg", "numba.core.typing.arraydecl", "numba.np.arraymath"} & set(sys.modules)))
+"""
+    load_kernels()
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == []
 
 
 @pytest.fixture

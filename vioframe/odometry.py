@@ -208,8 +208,9 @@ class Odometry:
             try:
                 with limited_threads(opencv=cores - 1):
                     packets = self._packets(read_ahead(measurements) if cores > 2 else measurements)
-                    steps = self._follow_ahead(packets, self._frontend)
-                    yield from steps if self._is_warm else loading_meanwhile(steps, self.calibration)
+                    if not self._is_warm:
+                        packets = loading_meanwhile(packets, self.calibration)
+                    yield from self._follow_ahead(packets, self._frontend)
             finally:
                 self._frontend.close()
         else:

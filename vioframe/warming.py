@@ -22,6 +22,7 @@ from vioframe.estimation.standstill import common_motion_px
 from vioframe.frontend.warming import load_kernels
 from vioframe.interfaces import Backend
 from vioframe.io.calibration import packaged_calibration
+from vioframe.io.synchronise import Packet
 from vioframe.parts import registry
 from vioframe.quantiles import gate
 from vioframe.types import (
@@ -32,7 +33,6 @@ from vioframe.types import (
     ImuSegment,
     NavState,
     Start,
-    Step,
     g_W,
 )
 
@@ -75,16 +75,16 @@ def helped(backend: str) -> Iterator[None]:
             helper.wait()
 
 
-def loading_meanwhile(steps: Iterable[Step], calibration: Calibration) -> Iterator[Step]:
-    """The same; from the first on a thread loads what a start needs, for until that is due there is little to do here.
+def loading_meanwhile(packets: Iterable[Packet], calibration: Calibration) -> Iterator[Packet]:
+    """The same; from the first on a thread loads what a start needs, while the other process prepares to follow points.
 
     Only what has been compiled before: to compile takes this process' time as well.
     """
     with ThreadPoolExecutor(1, "loader") as thread:
-        for number, step in enumerate(steps):
-            yield step
+        for number, packet in enumerate(packets):
             if number == 0 and jit.have_been_compiled():
                 thread.submit(_load_start, _with_rotation(calibration))  # what fails here fails in its turn
+            yield packet
 
 
 def _load_start(calibration: Calibration) -> None:

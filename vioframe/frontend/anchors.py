@@ -135,7 +135,11 @@ def _anchor(
         for r in range(side + 2):
             x, y = np.float32(xy[n, 0] - half - 1), np.float32(xy[n, 1] - half - 1 + r)
             _sample(flat, width, x, y, np.float32(1.0), np.float32(0.0), wide[r])
-        mean = wide[1:-1, 1:-1].sum() / np.float32(side * side)
+        total = np.float32(0.0)
+        for r in range(1, side + 1):
+            for c in range(1, side + 1):
+                total += wide[r, c]
+        mean = total / np.float32(side * side)
         square = 0.0
         sums[:] = 0.0
         for r in range(side):

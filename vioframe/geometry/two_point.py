@@ -163,7 +163,11 @@ def _refined(
 def _across(direction: Float) -> Float:
     """(2, 3), perpendicular to the unit vector ``direction`` and to each other."""
     out, axis = np.empty((2, 3)), np.zeros(3)
-    axis[np.argmin(np.abs(direction))] = 1.0
+    least = 0
+    for k in range(1, 3):
+        if abs(direction[k]) < abs(direction[least]):
+            least = k
+    axis[least] = 1.0
     first = cross(direction, axis)
     set_vector(out[0], first / _length(first))
     set_vector(out[1], cross(direction, out[0]))
