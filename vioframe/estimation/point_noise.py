@@ -40,10 +40,8 @@ class PointNoise:
         that is what noise is larger by (``docs/derivations/msckf.md``).
         """
         found = squares > 0.0
-        long = found & (views >= _LONG)
-        if ratios is not None and long.any():
-            share = long.sum() / (long.sum() + _REMEMBERED)
-            self._ratio += share * (ratios[long].mean() - self._ratio)
+        if ratios is not None and len(told := ratios[found & (views >= _LONG) & (ratios > 0.0)]):
+            self._ratio += len(told) / (len(told) + _REMEMBERED) * (told.mean() - self._ratio)
         if found.any():
             # A landmark takes up three of two residuals a view; where the noise is right, this is 1 in the middle.
             dof = 2.0 * views[found] - 3.0
