@@ -82,6 +82,19 @@ def moved(sequence: TrackSequence, by: Callable[[FrameTracks], Float]) -> TrackS
     return replace(sequence, packets=tuple(packets))
 
 
+def carried(sequence: TrackSequence, part: float, first_px: float, more_px: float, seed: int) -> TrackSequence:
+    """Points off by ``first_px`` on either axis, then by a ``part`` of what it was and ``more_px`` in each frame."""
+    rng, off = np.random.default_rng(seed), dict[int, Float]()
+
+    def by(tracks: FrameTracks) -> Float:
+        for track in tracks.ids.tolist():
+            new = rng.normal(size=2)
+            off[track] = part * off[track] + more_px * new if track in off else first_px * new
+        return np.array([off[track] for track in tracks.ids.tolist()])
+
+    return moved(sequence, by)
+
+
 def spoilt(sequence: TrackSequence, ratio: float, seed: int) -> tuple[TrackSequence, frozenset[tuple[float, float]]]:
     """Observations moved by 15 px in a random direction, and which."""
     rng, wrong = np.random.default_rng(seed), set[tuple[float, float]]()
@@ -107,7 +120,7 @@ def test_gates_accept_inliers_at_their_nominal_rate(flight, calibration, monkeyp
     assert counts.landmarks[1] > 5000
     assert counts.promoted[1] > 200
     # A degree of freedom more or less would make 0.98 or 0.85 of the landmarks' 0.95.
-    assert (np.abs(counts.rates - 0.95) < [0.015, 0.02, 0.04]).all(), counts.rates
+    assert (np.abs(counts.rates - 0.95) < [0.015, 0.015, 0.04]).all(), counts.rates
 
 
 def test_the_gate_follows_its_quantile(monkeypatch):
@@ -117,10 +130,19 @@ def test_the_gate_follows_its_quantile(monkeypatch):
     np.testing.assert_allclose(counts.rates, 0.7, atol=0.08)
 
 
+@pytest.fixture
+def filters(monkeypatch):
+    """Those that begin, in turn."""
+    begun, begin = [], Msckf.begin
+    monkeypatch.setattr(Msckf, "begin", lambda self, start: begun.append(self) or begin(self, start))
+    return begun
+
+
 @pytest.mark.parametrize(("flown_px", "found_px"), [(0.1, 0.2), (0.7, 0.7), (1.5, 1.5)])
-def test_noise_of_points_is_found_where_it_is_larger_than_was_taken_for_granted(flown_px, found_px, monkeypatch):
-    counts, filters, begin = GateCounts(monkeypatch), [], Msckf.begin
-    monkeypatch.setattr(Msckf, "begin", lambda self, start: filters.append(self) or begin(self, start))
+def test_noise_of_points_is_found_where_it_is_larger_than_was_taken_for_granted(
+    flown_px, found_px, filters, monkeypatch
+):
+    counts = GateCounts(monkeypatch)
     fly(simulated_sequence("figure_eight", pixel_sigma=flown_px, seed=1, duration_s=15.0), MsckfOptions(), 1)
     assert filters[-1].point_noise.px == pytest.approx(found_px, rel=0.07)
     if flown_px >= found_px:
@@ -130,22 +152,12 @@ def test_noise_of_points_is_found_where_it_is_larger_than_was_taken_for_granted(
 
 def lasting(sequence: TrackSequence, sigma_px: float, alike: float, seed: int) -> TrackSequence:
     """Points that are off by ``sigma_px``, from frame to frame by what is correlated by ``alike``."""
-    rng, off = np.random.default_rng(seed), dict[int, Float]()
-
-    def carried(tracks: FrameTracks) -> Float:
-        for track in tracks.ids.tolist():
-            new = sigma_px * rng.normal(size=2)
-            off[track] = alike * off[track] + np.sqrt(1.0 - alike**2) * new if track in off else new
-        return np.array([off[track] for track in tracks.ids.tolist()])
-
-    return moved(sequence, carried)
+    return carried(sequence, alike, sigma_px, np.sqrt(1.0 - alike**2) * sigma_px, seed)
 
 
 @pytest.mark.parametrize(("alike", "tolerance"), [(0.0, 0.05), (0.5, 0.2)])
-def test_errors_that_last_are_taken_for_as_much_noise_as_tells_as_little(alike, tolerance, monkeypatch):
+def test_errors_that_last_are_taken_for_as_much_noise_as_tells_as_little(alike, tolerance, filters):
     """A sum of errors that hang together by a part a in successive frames varies by (1 + a) / (1 - a) times more."""
-    filters, begin = [], Msckf.begin
-    monkeypatch.setattr(Msckf, "begin", lambda self, start: filters.append(self) or begin(self, start))
     sequence = simulated_sequence("figure_eight", pixel_sigma=0.02, seed=1, duration_s=10.0)
     fly(lasting(sequence, 0.3, alike, 1), WHITE, 1, EXACT)
     expected = 0.3 * np.sqrt((1.0 + alike) / (1.0 - alike))
@@ -199,14 +211,7 @@ def test_points_that_jump_do_less_harm_by_a_robust_loss():
 
 def sliding(sequence: TrackSequence, drift_px: float, seed: int) -> TrackSequence:
     """Points that walk off their landmarks by ``drift_px`` a frame on either axis."""
-    rng, off = np.random.default_rng(seed), dict[int, Float]()
-
-    def walked(tracks: FrameTracks) -> Float:
-        for track in tracks.ids.tolist():
-            off[track] = off.get(track, np.zeros(2)) + drift_px * rng.normal(size=2)
-        return np.array([off[track] for track in tracks.ids.tolist()])
-
-    return moved(sequence, walked)
+    return carried(sequence, 1.0, drift_px, drift_px, seed)
 
 
 def test_landmarks_that_points_slide_off_are_not_believed_for_long():

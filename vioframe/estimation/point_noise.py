@@ -47,5 +47,5 @@ class PointNoise:
             dof = 2.0 * views[found] - 3.0
             excess = float(np.median(squares[found] / (dof - 2.0 / 3.0)))
             share = len(dof) / (len(dof) + _REMEMBERED)
-            px = self.px * (excess * max(self._ratio, 1.0) ** 2) ** (0.5 * share)
+            px = self.px * (excess * self._ratio**2) ** (0.5 * share)
             self.px = min(max(px, self._least_px), _AT_MOST * self._least_px)
