@@ -9,7 +9,7 @@ Robotics 2010). Derivation: ``docs/derivations/sliding_window.md``.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -133,8 +133,11 @@ class Problem:
     first_estimates: bool
 
     def cost(self, x: Variables) -> float:
-        """Half the sum of squares, robust for the sightings, up to a constant."""
-        return self.linearise(x).cost
+        """Half the sum of squares, robust for the sightings, up to a constant; a third of the work of the equations."""
+        d, of_readings = self.prior.difference(x), self.reading_residuals(x.states).ravel()
+        cost = d @ (0.5 * self.prior.H @ d + self.prior.b) + 0.5 * of_readings @ of_readings
+        cost += self.sightings.cost(x.poses, x.cameras, x.landmarks)
+        return float(cost + sum(0.5 * r @ r for _, _, r in self._stillness(x)))
 
     def linearise(self, x: Variables) -> Normal:
         """The normal equations at ``x``, and the cost."""
@@ -143,8 +146,7 @@ class Problem:
             self.prior._parts, self.readings, self.sightings, self.first_estimates, states, x.cameras, x.landmarks
         )
         normal = Normal(*equations, self.sightings.seen, len(x.cameras.p_BC))
-        for k, still in self.still.items():
-            residual = still.residual(*(part[k] for part in states if part is not x.states.p_WB)) / still.sigma
+        for k, still, residual in self._stillness(x):
             first = self.prior.first(x.states) if self.first_estimates else x.states
             J = -still.jacobian(first.R_WB[k], first.v_WB[k]) / still.sigma[:, None]
             at = slice(STATE_SIZE * k, STATE_SIZE * (k + 1))
@@ -152,6 +154,12 @@ class Problem:
             normal.b[at] += J.T @ residual
             normal.cost += 0.5 * float(residual @ residual)
         return normal
+
+    def _stillness(self, x: Variables) -> Iterator[tuple[int, Standstill, Float]]:
+        """The states that stand still, and what speaks against it, whitened."""
+        for k, still in self.still.items():
+            parts = (part[k] for part in x.states.parts if part is not x.states.p_WB)
+            yield k, still, still.residual(*parts) / still.sigma
 
     def reading_residuals(self, states: StateArrays) -> Float:
         """Of the readings between each state and the next, whitened, (count, 15)."""
