@@ -28,9 +28,10 @@ from vioframe.types import CalibrationEstimate, CameraSigma, Estimate, FrameSet,
 from vioframe_pose_graph import vioframe_loop_closers
 from vioframe_pose_graph.closer import PoseGraph
 from vioframe_pose_graph.consistency import agreed, measured
+from vioframe_pose_graph.corners import located
 from vioframe_pose_graph.keyframes import KeyframeSelector
 from vioframe_pose_graph.matching import DescriptorIndex, distance, match
-from vioframe_pose_graph.place import image_angle_deg
+from vioframe_pose_graph.place import Place, View, image_angle_deg
 from vioframe_pose_graph.recognition import Recogniser
 from vioframe_pose_graph.verification import Correspondences, _refined, hypotheses, ransac, residuals
 
@@ -182,6 +183,68 @@ def test_descriptors_turn_with_the_camera():
     assert image_angle_deg(level) == pytest.approx(90.0)
     rolled = level @ so3.exp(np.array([0.0, 0.0, np.radians(40.0)]))
     assert image_angle_deg(rolled) == pytest.approx(50.0)
+
+
+def a_row_of_keyframes(rng, sigma):
+    """Three keyframes, a third of a metre apart, that see the same points: where these are, and what is remembered.
+
+    Of the last keyframe the first 60 points are known; the odometry has strayed by 6 cm between any two of them.
+    """
+    look = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])  # level, along x
+    p_WF = np.column_stack([rng.uniform(3.0, 8.0, 300), rng.uniform(-1.5, 1.5, (300, 2))])
+    descriptors = random_descriptors(rng, 300)
+    seen = []
+    for k in (2, 1, 0):
+        p_WC = np.array([0.05 * k, 0.35 * k, 0.02 * k])
+        ahead = (p_WF - p_WC) @ look
+        xy = (ahead[:, :2] / ahead[:, 2:] + sigma * rng.standard_normal((300, 2))).astype(np.float32)
+        order = rng.permutation(300) if k else np.arange(300)
+        known = np.where(np.arange(300)[:, None] < (0 if k else 60), p_WF, np.nan).astype(np.float32)[order]
+        said = p_WC + k * np.array([0.02, 0.06, -0.02])
+        place = Place(k, 0, np.eye(3), said, said, look, said, np.full((4, 4), np.nan))
+        seen.append(
+            (place, View(xy[order], known, np.full(300, 0.02, np.float32), flipped(descriptors, 12, rng)[order]))
+        )
+    return p_WF, seen
+
+
+def test_corners_are_where_the_keyframes_before_saw_them_whatever_the_odometry_says_of_the_way():
+    sigma = 1.0 / 460.0
+    p_WF, (*before, (place, view)) = a_row_of_keyframes(np.random.default_rng(8), sigma)
+    corners = located(place, view, before, sigma, 10.0 / 460.0)
+    np.testing.assert_array_equal(corners.p_WF[:60], view.p_WF[:60])
+    found = np.isfinite(corners.p_WF[:, 0])
+    assert found.mean() > 0.9
+    far, true = (np.linalg.norm(p - place.p_WC, axis=1)[60:] for p in (corners.p_WF, p_WF))
+    off = (far / true - 1.0)[found[60:]]
+    # The way that the odometry has strayed by is a sixth of what it has gone.
+    assert abs(off.mean()) < 0.02
+    assert 0.6 < np.sqrt(np.mean((off / corners.depth_sigma[60:][found[60:]]) ** 2)) < 1.4
+
+
+def test_what_is_no_corner_gets_no_position():
+    """Of the other keyframes every third descriptor sits elsewhere: hardly one of them is taken for the same point."""
+    rng, sigma = np.random.default_rng(9), 1.0 / 460.0
+    _, (*before, (place, view)) = a_row_of_keyframes(rng, sigma)
+    wrong = np.arange(60, 300, 3)
+    moved = []
+    for at, other in before:
+        xy = other.xy_normalised.copy()
+        rows = [np.argmin([distance(other.descriptors[k], view.descriptors[i]) for k in range(300)]) for i in wrong]
+        xy[rows] = rng.uniform(-0.4, 0.4, (len(rows), 2))
+        moved.append((at, replace(other, xy_normalised=xy)))
+    corners = located(place, view, moved, sigma, 10.0 / 460.0)
+    found = np.isfinite(corners.p_WF[:, 0])
+    right = np.setdiff1d(np.arange(60, 300), wrong)
+    assert found[right].mean() > 0.9
+    assert found[wrong].mean() < 0.05
+
+
+def test_too_few_known_points_place_no_corner():
+    _, (*before, (place, view)) = a_row_of_keyframes(np.random.default_rng(10), 1.0 / 460.0)
+    few = np.where(np.arange(300)[:, None] < 9, view.p_WF, np.float32(np.nan))
+    corners = located(place, replace(view, p_WF=few), before, 1.0 / 460.0, 10.0 / 460.0)
+    assert np.isfinite(corners.p_WF[:, 0]).sum() == 9
 
 
 def closure_of(flown, steps=None):

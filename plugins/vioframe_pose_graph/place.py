@@ -23,8 +23,10 @@ from vioframe.types import Float, Image, Int, NavState
 from vioframe_pose_graph.keyframes import Keyframe
 
 _MAX_SIGMAS = 4.0
-# How well the distance of a landmark is known at best, as a part of it, and the least angle of its rays, rad.
-_LEAST_DEPTH_SIGMA, _PARALLEL = 0.02, 1e-3
+LEAST_DEPTH_SIGMA = 0.02
+"""How well the distance of a landmark is known at best, as a part of it."""
+# The least angle of its rays, rad.
+_PARALLEL = 1e-3
 
 Float32 = NDArray[np.float32]
 Words = NDArray[np.uint64]
@@ -33,8 +35,8 @@ _LEVELS, _SCALE_FACTOR, _FAST_THRESHOLD = 4, 1.3, 12
 _PATCH_PX = 31
 # Sine of the angle between the optical axis and the vertical below which the world's x axis says what is up.
 _STEEP = 0.35
-# How well the odometry knows its camera against what it sees: to a degree, and to 3 cm.
-_PRIOR = np.repeat([np.radians(1.0), 0.03], 3) ** -2.0
+PRIOR = np.repeat([np.radians(1.0), 0.03], 3) ** -2.0
+"""How well the odometry knows its camera against what it sees: to a degree, and to 3 cm."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -84,10 +86,10 @@ def describe(keyframe: Keyframe, orb: cv2.ORB, sigma_px: float) -> tuple[Place, 
     p_WF = np.where(which[:, None] >= 0, keyframe.p_WF[which], np.nan)
     known = np.flatnonzero(np.isfinite(p_WF[:, 0]))
     sigma = sigma_px / camera.focal_px
-    R_WC, p_WC, _, squared = resect(keyframe.R_WC, keyframe.p_WC, p_WF[known], xy_normalised[known], sigma, 1.0, _PRIOR)
+    R_WC, p_WC, _, squared = resect(keyframe.R_WC, keyframe.p_WC, p_WF[known], xy_normalised[known], sigma, 1.0, PRIOR)
     p_WF[known[squared > _MAX_SIGMAS**2]] = np.nan
     p_WB_seen = state.p_WB + p_WC - keyframe.p_WC
-    depth_sigma = np.hypot(_LEAST_DEPTH_SIGMA, sigma / np.maximum(keyframe.parallax[which], _PARALLEL))
+    depth_sigma = np.hypot(LEAST_DEPTH_SIGMA, sigma / np.maximum(keyframe.parallax[which], _PARALLEL))
     place = Place(state.t_ns, keyframe.segment, state.R_WB, state.p_WB, p_WB_seen, R_WC, p_WC, _levelled(state))
     xy_seen, p_known, sigma_known = (array.astype(np.float32) for array in (xy_normalised, p_WF, depth_sigma))
     return place, View(xy_seen, p_known, sigma_known, descriptors)

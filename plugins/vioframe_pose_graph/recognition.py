@@ -8,11 +8,12 @@ import numpy as np
 
 from vioframe.stopwatch import Stopwatch
 from vioframe.types import NS_PER_S, Float
+from vioframe_pose_graph.corners import located
 from vioframe_pose_graph.keyframes import Keyframe
 from vioframe_pose_graph.matching import DescriptorIndex
 from vioframe_pose_graph.options import PoseGraphOptions
 from vioframe_pose_graph.place import Float32, Place, View, corner_finder, describe
-from vioframe_pose_graph.verification import REPROJECTION_PX, Relation, relate
+from vioframe_pose_graph.verification import APART_PX, REPROJECTION_PX, Relation, relate
 
 # Earlier places that each keyframe is compared with in detail: an aliased world has more than one that look alike.
 _MOST_CANDIDATES = 3
@@ -20,6 +21,9 @@ _MOST_CANDIDATES = 3
 _NEIGHBOURS = 3
 # Enough points to know a place by; the tracked features come first.
 _ASKED = 300
+# Keyframes in which the corners of a new one are looked for, to know where they are.
+_LOOKED_BACK = 2
+_SIGMA_PX = 0.5 * REPROJECTION_PX
 # Places whose looks are remembered: some 80 kB each.
 _MOST_REMEMBERED = 2000
 
@@ -53,8 +57,11 @@ class Recogniser:
     def add(self, keyframe: Keyframe) -> None:
         """Look for the place of ``keyframe`` among the earlier ones, then remember it."""
         watch = Stopwatch()
-        place, view = describe(keyframe, self._orb, 0.5 * REPROJECTION_PX)
+        place, view = describe(keyframe, self._orb, _SIGMA_PX)
         watch.lap("describe")
+        if before := self._just_before(place):
+            view = located(place, view, before, _SIGMA_PX / self._focal_px, APART_PX / self._focal_px)
+        watch.lap("locate")
         candidates = self._retrieve(place, view)
         number = len(self.places)
         rows = self._index.add(view.descriptors, number)
@@ -75,6 +82,11 @@ class Recogniser:
         watch.lap("verify")
         for stage, seconds in watch.seconds.items():
             self.seconds[stage] = self.seconds.get(stage, 0.0) + seconds
+
+    def _just_before(self, place: Place) -> list[tuple[Place, View]]:
+        """The last keyframes before ``place``, of one world with it."""
+        last = range(max(len(self.places) - _LOOKED_BACK, 0), len(self.places))
+        return [(self.places[n], self._view(n)) for n in last if self.places[n].segment == place.segment]
 
     def _view(self, number: int) -> View:
         xy_normalised, p_WF, depth_sigma, rows = self._remembered[number]

@@ -23,15 +23,17 @@ from vioframe_pose_graph.place import Place, View
 REPROJECTION_PX = 3.0
 """Within which a point of one keyframe must be seen in the other to support a loop."""
 _MAX_DISTANCE, _RATIO = 64, 0.85
-_APART_PX = 10.0
+APART_PX = 10.0
 _HYPOTHESES = 300
+# Points that each of them is tried on: of two views of one place most agree, and a part says so as well.
+_TRIED_ON = 100
 # The pairs know nothing of tilt, so their support is counted more generously than that of the fit.
 _COARSE = 2.0
 # As many standard deviations of where a point is seen are tolerated.
 _TOLERATED = 3.0
 _TILT_SIGMA, _MAX_TILT = np.radians(0.5), np.radians(2.0)
 _LEAST_SIGMA = 0.2
-_ITERATIONS, _CONVERGED = 10, 1e-6
+_ITERATIONS, _CONVERGED = 10, 1e-4
 _PARALLEL = 1e-6
 
 
@@ -52,6 +54,12 @@ class Correspondences:
     R_WC: Float
     p_WC: Float
     pairs: Int
+
+    def few(self, most: int) -> Correspondences:
+        """Every so manieth of them, ``most`` at the most."""
+        of = slice(None, None, -(-len(self.side) // most))
+        points, depth_sigma, xy = self.points[of], self.depth_sigma[of], self.xy[of]
+        return Correspondences(points, depth_sigma, xy, self.side[of], self.R_WC, self.p_WC, self.pairs[of])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -74,11 +82,12 @@ Seen = tuple[Place, View]
 def relate(earlier: Seen, later: Seen, focal_px: float, min_inliers: int) -> Relation | None:
     """The relation of two keyframes by the points they share, or None where those do not agree on one."""
     tolerance = REPROJECTION_PX / focal_px
-    seen = correspondences(earlier, later, _APART_PX / focal_px)
+    seen = correspondences(earlier, later, APART_PX / focal_px)
     if len(np.unique(seen.pairs[:, 1])) < min_inliers:
         return None
-    support, yaw, t = ransac(seen, _draw_pairs(seen.side), _COARSE * tolerance)
-    if support < min_inliers:
+    few = seen.few(_TRIED_ON)
+    support, yaw, t = ransac(few, _draw_pairs(few.side), _COARSE * tolerance)
+    if support * len(seen.side) < min_inliers * len(few.side):
         return None
     return _refined(seen, rotation_z(yaw), t, earlier[0].p_WB_seen, later[0].p_WB_seen, tolerance, min_inliers)
 

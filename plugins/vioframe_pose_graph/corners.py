@@ -1,0 +1,80 @@
+"""Where the corners are that nobody tracks: found again in the keyframes just before, and triangulated from there.
+
+Corners are what one place is best known again by, and a detector need not have chosen any of them to be tracked.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from vioframe.geometry.resection import resect
+from vioframe.geometry.triangulation import triangulate
+from vioframe.jit import kernel
+from vioframe.types import Float
+from vioframe_pose_graph.matching import match
+from vioframe_pose_graph.place import LEAST_DEPTH_SIGMA, PRIOR, Place, View
+
+# From one keyframe to the next a corner looks much as before.
+_MAX_DISTANCE, _RATIO = 48, 0.85
+_TOLERATED = 3.0
+# Points that must say from where a keyframe before was seen.
+_LEAST_KNOWN = 10
+
+
+def located(place: Place, view: View, before: Sequence[tuple[Place, View]], sigma: float, apart: float) -> View:
+    """``view`` with positions of more of its points, as far as they were seen ``before`` from elsewhere.
+
+    From where that was, those points say of which the position is known: how far the odometry has come since does not
+    count, and so corners and landmarks agree. Points are seen to ``sigma`` on the z = 1 plane, on which those closer
+    together than ``apart`` may be one.
+    """
+    unknown = np.isnan(view.p_WF[:, 0])
+    poses, seen = [(place.R_WC, place.p_WC)], [view.xy_normalised[unknown]]
+    for at, other in before:
+        target_xy = other.xy_normalised.astype(np.float64)
+        found = match(view.descriptors, other.descriptors, target_xy, _MAX_DISTANCE, _RATIO, apart)
+        xy = np.where(found[:, None] >= 0, target_xy[found], np.nan)
+        both = ~unknown & (found >= 0)
+        if np.count_nonzero(both) >= _LEAST_KNOWN:
+            known = view.p_WF[both].astype(np.float64)
+            poses.append(resect(at.R_WC, at.p_WC, known, xy[both], sigma, 1.0, PRIOR)[:2])
+            seen.append(xy[unknown])
+    p_WF, depth_sigma = view.p_WF.copy(), view.depth_sigma.copy()
+    R_WC, p_WC = (np.stack(parts) for parts in zip(*poses, strict=True))
+    p_WF[unknown], depth_sigma[unknown] = _triangulated(R_WC, p_WC, np.stack(seen, axis=1, dtype=np.float64), sigma)
+    return replace(view, p_WF=p_WF, depth_sigma=depth_sigma)
+
+
+@kernel
+def _triangulated(R_WC: Float, p_WC: Float, xy: Float, sigma: float) -> tuple[Float, Float]:
+    """Positions (N, 3) of points seen at ``xy`` (N, V, 2), NaN where not seen, and how well their distance is known.
+
+    NaN where fewer than two of the V cameras saw one, or what they saw is not one point.
+    """
+    N, V = xy.shape[:2]
+    p_WF, depth_sigma = np.full((N, 3), np.nan), np.full(N, np.inf)
+    views = np.empty(V, np.intp)
+    for i in range(N):
+        count = 0
+        for k in range(V):
+            if np.isfinite(xy[i, k, 0]):
+                views[count] = k
+                count += 1
+        if count < 2:
+            continue
+        by = views[:count]
+        good, p = triangulate(R_WC[by], p_WC[by], xy[i][by], sigma)
+        least = 1.0
+        for k in by:
+            away = p - p_WC[k]
+            x, y, z = R_WC[k].T @ away
+            good &= np.hypot(x / z - xy[i, k, 0], y / z - xy[i, k, 1]) < _TOLERATED * sigma
+            first = p - p_WC[by[0]]
+            least = min(least, (away @ first) / np.sqrt((away @ away) * (first @ first)))
+        if good:
+            p_WF[i] = p
+            depth_sigma[i] = np.hypot(LEAST_DEPTH_SIGMA, sigma / max(np.arccos(least), 1e-6))
+    return p_WF, depth_sigma
