@@ -243,7 +243,8 @@ def test_what_is_no_corner_gets_no_position():
 def test_too_few_known_points_place_no_corner():
     _, (*before, (place, view)) = a_row_of_keyframes(np.random.default_rng(10), 1.0 / 460.0)
     few = np.where(np.arange(300)[:, None] < 9, view.p_WF, np.float32(np.nan))
-    corners = located(place, replace(view, p_WF=few), before, 1.0 / 460.0, 10.0 / 460.0)
+    dark = (before[0][0], View(*(part[:0] for part in (view.xy_normalised, few, view.depth_sigma, view.descriptors))))
+    corners = located(place, replace(view, p_WF=few), [*before, dark], 1.0 / 460.0, 10.0 / 460.0)
     assert np.isfinite(corners.p_WF[:, 0]).sum() == 9
 
 

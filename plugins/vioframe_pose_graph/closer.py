@@ -19,6 +19,7 @@ from vioframe.geometry.trajectory import Trajectory
 from vioframe.stopwatch import working_s
 from vioframe.types import NS_PER_S, Calibration, Float, Int, Loop, LoopClosure, MapCorrection, Status, Step
 from vioframe_pose_graph.consistency import REPEAT_NS, Odometry, agreed, corrected, measured, within_drift
+from vioframe_pose_graph.corners import triangulated
 from vioframe_pose_graph.graph import wrapped
 from vioframe_pose_graph.keyframes import Keyframe, KeyframeSelector
 from vioframe_pose_graph.matching import DescriptorIndex, match
@@ -193,3 +194,4 @@ def warm_up() -> None:
     index.add(descriptors, 0)
     index.similarity(descriptors, 1)
     match(descriptors, descriptors, np.zeros((2, 2)), 1, 1.0, 1.0)
+    triangulated(np.stack([np.eye(3)] * 2), np.eye(2, 3), np.zeros((1, 2, 2)), 1.0)

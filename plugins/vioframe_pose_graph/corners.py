@@ -36,20 +36,22 @@ def located(place: Place, view: View, before: Sequence[tuple[Place, View]], sigm
     for at, other in before:
         target_xy = other.xy_normalised.astype(np.float64)
         found = match(view.descriptors, other.descriptors, target_xy, _MAX_DISTANCE, _RATIO, apart)
-        xy = np.where(found[:, None] >= 0, target_xy[found], np.nan)
-        both = ~unknown & (found >= 0)
+        again = found >= 0
+        xy = np.full((len(found), 2), np.nan)
+        xy[again] = target_xy[found[again]]
+        both = again & ~unknown
         if np.count_nonzero(both) >= _LEAST_KNOWN:
             known = view.p_WF[both].astype(np.float64)
             poses.append(resect(at.R_WC, at.p_WC, known, xy[both], sigma, 1.0, PRIOR)[:2])
             seen.append(xy[unknown])
     p_WF, depth_sigma = view.p_WF.copy(), view.depth_sigma.copy()
     R_WC, p_WC = (np.stack(parts) for parts in zip(*poses, strict=True))
-    p_WF[unknown], depth_sigma[unknown] = _triangulated(R_WC, p_WC, np.stack(seen, axis=1, dtype=np.float64), sigma)
+    p_WF[unknown], depth_sigma[unknown] = triangulated(R_WC, p_WC, np.stack(seen, axis=1, dtype=np.float64), sigma)
     return replace(view, p_WF=p_WF, depth_sigma=depth_sigma)
 
 
 @kernel
-def _triangulated(R_WC: Float, p_WC: Float, xy: Float, sigma: float) -> tuple[Float, Float]:
+def triangulated(R_WC: Float, p_WC: Float, xy: Float, sigma: float) -> tuple[Float, Float]:
     """Positions (N, 3) of points seen at ``xy`` (N, V, 2), NaN where not seen, and how well their distance is known.
 
     NaN where fewer than two of the V cameras saw one, or what they saw is not one point.
