@@ -35,8 +35,8 @@ _LOST_SPEED_M_S, _LOST_M, _LOST_YAW = 5.0, 5.0, 1.0
 REPEAT_NS = 3 * NS_PER_S
 """Within which another keyframe must say the same."""
 # Points seen to a pixel place a camera to millimetres; but the points themselves were placed by the odometry, whose
-# scale is off by a per cent, and what is wrong with them is wrong with many: a fit is off by twice what it says. So have
-# it the loops of MH_02, MH_03 and V1_01, rendered in worlds for tuning.
+# scale is off by a per cent, and what is wrong with them is wrong with many: a fit is off by twice what it says.
+# That is what the loops of MH_02, MH_03 and V1_01 show, rendered in worlds for tuning.
 _SIGMA_M, _SIGMA_PART, _SIGMA_YAW, _OF_FIT = 0.005, 0.01, np.radians(0.1), 2.0
 
 
