@@ -10,9 +10,11 @@ import pytest
 
 from vioframe.geometry.so3 import rotation_z
 from vioframe_pose_graph.closer import carry
-from vioframe_pose_graph.consistency import Odometry, corrected
+from vioframe_pose_graph.consistency import Odometry, corrected, measured
 from vioframe_pose_graph.graph import Edges, mahalanobis_squared, residuals, solve, solve_robustly, uncertainty
 from vioframe_pose_graph.options import PoseGraphOptions
+from vioframe_pose_graph.recognition import Sighting
+from vioframe_pose_graph.verification import Relation
 
 # The odometry of these tests drifts a few times as fast as a good one.
 OPTIONS = PoseGraphOptions(position_drift=0.1)
@@ -55,6 +57,23 @@ def random_edges(rng, nodes=6, count=12):
     A = rng.standard_normal((count, 4, 4))
     cov = A @ A.transpose(0, 2, 1) + 0.1 * np.eye(4)
     return Edges(i, j, rng.standard_normal((count, 3)), rng.uniform(-3.0, 3.0, count), cov)
+
+
+def test_a_loop_is_as_sure_as_its_fit_and_less_the_farther_its_views_are_apart():
+    def covariance(way_m, sigma_m, yaw_deg):
+        fit = np.diag([sigma_m**2] * 3 + [np.radians(yaw_deg) ** 2])
+        loops = measured([Sighting(0, 1, Relation(np.array([0.6, 0.0, 0.8]) * way_m, 0.1, fit, 50))])
+        np.testing.assert_array_equal(loops.cov[0], np.diag(np.diag(loops.cov[0])))
+        return np.sqrt(np.diag(loops.cov[0]))
+
+    near, far = covariance(0.0, 0.0, 0.0), covariance(4.0, 0.0, 0.0)
+    np.testing.assert_allclose(near[:3], 0.005)
+    np.testing.assert_allclose(far[:3], np.hypot(0.005, 0.04))
+    np.testing.assert_allclose([near[3], far[3]], np.radians(0.1))
+    # The points of a fit are wrong together: it is off by more than it says.
+    np.testing.assert_allclose(
+        covariance(0.0, 0.03, 0.5), np.hypot(near, 2.0 * np.array([0.03] * 3 + [np.radians(0.5)]))
+    )
 
 
 def test_the_whitened_square_is_the_mahalanobis_distance():
