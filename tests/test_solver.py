@@ -42,9 +42,6 @@ class Valley:
     steep: float
     evaluations: int = 0
 
-    def cost(self, at: At) -> float:
-        return self.linearise(at).cost
-
     def linearise(self, at: At) -> Equations:
         self.evaluations += 1
         x, y = at.place

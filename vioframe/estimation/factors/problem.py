@@ -133,11 +133,15 @@ class Problem:
     first_estimates: bool
 
     def cost(self, x: Variables) -> float:
-        """Half the sum of squares, robust for the sightings, up to a constant; a third of the work of the equations."""
+        """Half the sum of squares, robust for the sightings, up to a constant."""
+        return self.evaluated(x)[0]
+
+    def evaluated(self, x: Variables) -> tuple[float, Float]:
+        """The :meth:`cost`, and the landmarks' errors as in :class:`Normal`: a third of the work of the equations."""
         d, of_readings = self.prior.difference(x), self.reading_residuals(x.states).ravel()
-        cost = d @ (0.5 * self.prior.H @ d + self.prior.b) + 0.5 * of_readings @ of_readings
-        cost += self.sightings.cost(x.poses, x.cameras, x.landmarks)
-        return float(cost + sum(0.5 * r @ r for _, _, r in self._stillness(x)))
+        of_sightings, errors = self.sightings.evaluated(x.poses, x.cameras, x.landmarks)
+        cost = d @ (0.5 * self.prior.H @ d + self.prior.b) + 0.5 * of_readings @ of_readings + of_sightings
+        return float(cost + sum(0.5 * r @ r for _, _, r in self._stillness(x))), errors
 
     def linearise(self, x: Variables) -> Normal:
         """The normal equations at ``x``, and the cost."""

@@ -131,11 +131,15 @@ class Sightings(NamedTuple):
 
     def cost(self, poses: Poses, cameras: Calibrated, landmarks: Float) -> float:
         """Half the robust sum of squares."""
-        return _evaluate(poses, cameras, self, landmarks)[0]
+        return self.evaluated(poses, cameras, landmarks)[0]
 
     def errors(self, poses: Poses, cameras: Calibrated, landmarks: Float) -> Float:
         """(L,) root mean square residual of each landmark, standard deviations; infinite behind a camera."""
-        return _evaluate(poses, cameras, self, landmarks)[1]
+        return self.evaluated(poses, cameras, landmarks)[1]
+
+    def evaluated(self, poses: Poses, cameras: Calibrated, landmarks: Float) -> tuple[float, Float]:
+        """Both of these."""
+        return _evaluate(poses, cameras, self, landmarks)
 
     def linearise(self, poses: Poses, first: Poses, cameras: Calibrated, landmarks: Float) -> Linearised:
         """H (n, n), b (n,) of poses and calibration, V (L, 3, 3), W (L, 3, n), c (L, 3) of the landmarks; cost, errors.

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.linalg.lapack import dpotrf, dpotri, dpotrs
@@ -20,16 +20,19 @@ _FIRST_DAMPING, _LEAST_DAMPING, _LARGEST_DAMPING = 1e-8, 1e-12, 1e3
 
 @dataclass(frozen=True, slots=True)
 class Solution:
-    """Where the solver came to, the cost of that, and the equations there, or where its last, small step began.
+    """Where the solver came to, and the equations there; cost and errors apart, or where its last, small step began.
 
     ``iterations`` counts the steps it took, which may not have been enough.
     """
 
     variables: Variables
     normal: Normal
-    cost: float
     iterations: int
     converged: bool
+
+    @property
+    def cost(self) -> float:
+        return self.normal.cost
 
 
 def solve(
@@ -44,14 +47,9 @@ def solve(
     """Minimise from ``x`` over the entries ``active`` of the error vector; the others stay.
 
     It has converged where a step lowers the cost by less than ``decrease`` or, as a part of it, ``relative_decrease``;
-    one that promises no more is the last, and the equations are not asked again. ``max_seconds`` ends it early, where
-    it is not zero. Raises ``LinAlgError`` where nothing finite comes out.
+    one that promises less than half of ``decrease`` is the last, and the equations are not set up again.
+    ``max_seconds`` ends it early, where it is not zero. Raises ``LinAlgError`` where nothing finite comes out.
     """
-
-    def enough(cost: float) -> float:
-        """What a step has to lower it by for another to follow."""
-        return max(decrease, relative_decrease * max(abs(cost), 1.0))
-
     begin_s = working_s()
     damping, growth, normal = _FIRST_DAMPING, 2.0, problem.linearise(x)
     for iteration in range(max_iterations):
@@ -59,10 +57,12 @@ def solve(
             step, landmark_step = _step(normal, active, damping)
             promised = -0.5 * float(normal.b @ step + (normal.c * landmark_step).sum())
             trial = x.retract(step, landmark_step)
-            if promised < enough(normal.cost) and damping <= _FIRST_DAMPING:  # one that is damped promises little
-                cost = problem.cost(trial)
+            # Robust losses give more than was promised; a step that is damped promises little.
+            if promised < 0.5 * decrease and damping <= _FIRST_DAMPING:
+                cost, errors = problem.evaluated(trial)
                 if cost <= normal.cost:
-                    return _finite(Solution(trial, normal, cost, iteration + 1, True))
+                    known = replace(normal, cost=cost, errors=errors)
+                    return _finite(Solution(trial, known, iteration + 1, True))
             # Nearly all steps lead down: their equations are those of the next one.
             trial_normal = problem.linearise(trial)
             if trial_normal.cost <= normal.cost:
@@ -70,16 +70,16 @@ def solve(
             damping, growth = growth * damping, 2.0 * growth
             if damping > _LARGEST_DAMPING or not np.isfinite(trial_normal.cost):
                 # No step leads down: a minimum to rounding.
-                return _finite(Solution(x, normal, normal.cost, iteration, bool(np.isfinite(trial_normal.cost))))
+                return _finite(Solution(x, normal, iteration, bool(np.isfinite(trial_normal.cost))))
         decreased = normal.cost - trial_normal.cost
-        small = decreased < enough(trial_normal.cost)
+        small = decreased < max(decrease, relative_decrease * max(abs(trial_normal.cost), 1.0))
         # The damping falls the more, the better a step does what the equations promised: as Nielsen has it there.
         ratio = decreased / promised if promised > 0.0 else 0.0
         damping = max(damping * max(1.0 / 3.0, 1.0 - (2.0 * ratio - 1.0) ** 3), _LEAST_DAMPING)
         x, normal, growth = trial, trial_normal, 2.0
         if small or 0.0 < max_seconds < working_s() - begin_s:
-            return _finite(Solution(x, normal, normal.cost, iteration + 1, small))
-    return _finite(Solution(x, normal, normal.cost, max_iterations, False))
+            return _finite(Solution(x, normal, iteration + 1, small))
+    return _finite(Solution(x, normal, max_iterations, False))
 
 
 def _step(normal: Normal, active: Int, damping: float) -> tuple[Float, Float]:

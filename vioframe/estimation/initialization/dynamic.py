@@ -118,8 +118,7 @@ def initialise(
     x = _start_of_adjustment(window.without_last(), structure, alignment, calibration)
     problem = adjustment(window.without_last(), imu[:-1], x, calibration.cameras, doubted)
     scale_sigma = _SCALE_SIGMA_FOUND if found else _SCALE_SIGMA
-    normal = problem.linearise(x)
-    guess = Solution(x, normal, normal.cost, iterations=0, converged=False)
+    guess = Solution(x, problem.linearise(x), iterations=0, converged=False)
     check_uncertainty(x.states, covariance(problem, guess, doubted), scale_sigma, _HOPELESS)
     solution = adjusted(problem, x, doubted, roughly=True)
     cov = covariance(problem, solution, doubted)
