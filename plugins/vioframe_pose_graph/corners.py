@@ -15,7 +15,7 @@ from vioframe.geometry.triangulation import triangulate
 from vioframe.jit import kernel
 from vioframe.types import Float
 from vioframe_pose_graph.matching import match
-from vioframe_pose_graph.place import LEAST_DEPTH_SIGMA, PRIOR, Place, View
+from vioframe_pose_graph.place import PRIOR, Place, View, depth_sigma_of
 
 # From one keyframe to the next a corner looks much as before.
 _MAX_DISTANCE, _RATIO = 48, 0.85
@@ -46,18 +46,20 @@ def located(place: Place, view: View, before: Sequence[tuple[Place, View]], sigm
             seen.append(xy[unknown])
     p_WF, depth_sigma = view.p_WF.copy(), view.depth_sigma.copy()
     R_WC, p_WC = (np.stack(parts) for parts in zip(*poses, strict=True))
-    p_WF[unknown], depth_sigma[unknown] = triangulated(R_WC, p_WC, np.stack(seen, axis=1, dtype=np.float64), sigma)
+    p_WF[unknown], parallax = triangulated(R_WC, p_WC, np.stack(seen, axis=1, dtype=np.float64), sigma)
+    depth_sigma[unknown] = depth_sigma_of(parallax, sigma)
     return replace(view, p_WF=p_WF, depth_sigma=depth_sigma)
 
 
 @kernel
 def triangulated(R_WC: Float, p_WC: Float, xy: Float, sigma: float) -> tuple[Float, Float]:
-    """Positions (N, 3) of points seen at ``xy`` (N, V, 2), NaN where not seen, and how well their distance is known.
+    """Positions (N, 3) of points seen at ``xy`` (N, V, 2), NaN where not seen, and by how much their rays diverge, rad.
 
-    NaN where fewer than two of the V cameras saw one, or what they saw is not one point.
+    NaN and zero where fewer than two of the V cameras saw one, or what they saw is not one point. The angle is the
+    largest that any ray makes with the first.
     """
     N, V = xy.shape[:2]
-    p_WF, depth_sigma = np.full((N, 3), np.nan), np.full(N, np.inf)
+    p_WF, parallax = np.full((N, 3), np.nan), np.zeros(N)
     views = np.empty(V, np.intp)
     for i in range(N):
         count = 0
@@ -69,14 +71,14 @@ def triangulated(R_WC: Float, p_WC: Float, xy: Float, sigma: float) -> tuple[Flo
             continue
         by = views[:count]
         good, p = triangulate(R_WC[by], p_WC[by], xy[i][by], sigma)
-        least = 1.0
+        cosine = 1.0
+        first = p - p_WC[by[0]]
         for k in by:
             away = p - p_WC[k]
             x, y, z = R_WC[k].T @ away
             good &= np.hypot(x / z - xy[i, k, 0], y / z - xy[i, k, 1]) < _TOLERATED * sigma
-            first = p - p_WC[by[0]]
-            least = min(least, (away @ first) / np.sqrt((away @ away) * (first @ first)))
+            cosine = min(cosine, (away @ first) / np.sqrt((away @ away) * (first @ first)))
         if good:
             p_WF[i] = p
-            depth_sigma[i] = np.hypot(LEAST_DEPTH_SIGMA, sigma / max(np.arccos(least), 1e-6))
-    return p_WF, depth_sigma
+            parallax[i] = np.arccos(cosine)
+    return p_WF, parallax

@@ -23,10 +23,8 @@ from vioframe.types import Float, Image, Int, NavState
 from vioframe_pose_graph.keyframes import Keyframe
 
 _MAX_SIGMAS = 4.0
-LEAST_DEPTH_SIGMA = 0.02
-"""How well the distance of a landmark is known at best, as a part of it."""
-# The least angle of its rays, rad.
-_PARALLEL = 1e-3
+# How well the distance of a landmark is known at best, as a part of it, and the least angle of its rays, rad.
+_LEAST_DEPTH_SIGMA, _PARALLEL = 0.02, 1e-3
 
 Float32 = NDArray[np.float32]
 Words = NDArray[np.uint64]
@@ -89,10 +87,15 @@ def describe(keyframe: Keyframe, orb: cv2.ORB, sigma_px: float) -> tuple[Place, 
     R_WC, p_WC, _, squared = resect(keyframe.R_WC, keyframe.p_WC, p_WF[known], xy_normalised[known], sigma, 1.0, PRIOR)
     p_WF[known[squared > _MAX_SIGMAS**2]] = np.nan
     p_WB_seen = state.p_WB + p_WC - keyframe.p_WC
-    depth_sigma = np.hypot(LEAST_DEPTH_SIGMA, sigma / np.maximum(keyframe.parallax[which], _PARALLEL))
+    depth_sigma = depth_sigma_of(keyframe.parallax[which], sigma)
     place = Place(state.t_ns, keyframe.segment, state.R_WB, state.p_WB, p_WB_seen, R_WC, p_WC, _levelled(state))
     xy_seen, p_known, sigma_known = (array.astype(np.float32) for array in (xy_normalised, p_WF, depth_sigma))
     return place, View(xy_seen, p_known, sigma_known, descriptors)
+
+
+def depth_sigma_of(parallax: Float, sigma: float) -> Float:
+    """(K,) how well distances are known, as a part of them, along rays that diverge by ``parallax`` (K,) rad."""
+    return np.asarray(np.hypot(_LEAST_DEPTH_SIGMA, sigma / np.maximum(parallax, _PARALLEL)))
 
 
 def _levelled(state: NavState) -> Float:

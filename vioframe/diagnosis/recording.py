@@ -42,6 +42,8 @@ _POINTS = 120
 # What ails images ails many: some of them tell.
 _LOOK_EVERY = 3
 _SATURATED = 250
+# The least that a coarse image bends by, in quarters of a grey level: where it does less there is nothing to be sharp.
+_LEAST_BEND = 4.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -205,7 +207,7 @@ def sharpness_of(image: Image) -> float:
         bends = (cv2.Sobel(i, cv2.CV_16S, *order) for i in smooth)
         # At the same places of both: to look everywhere takes ten times as long and tells no more.
         fine, coarse = (_sharpest(bend[::step, ::step]) for bend, step in zip(bends, (4, 1), strict=True))
-        ratios.append(fine / max(coarse, 4.0))
+        ratios.append(fine / max(coarse, _LEAST_BEND))
     return min(ratios)
 
 
