@@ -109,7 +109,7 @@ class PoseGraph:
         nodes, number = np.unique(nodes, return_inverse=True)
         i, j = number[1:-1].reshape(2, -1)
         few = odometry.at(nodes)
-        p, yaw, _ = corrected(few, replace(loops, i=i, j=j), t_ns[nodes], likely)
+        p, yaw, _ = corrected(few, replace(loops, i=i, j=j), likely)
         R_MW = rotation_z(yaw[-1])
         return MapCorrection(R_MW, p[-1] - R_MW @ few.p[-1])
 
@@ -128,7 +128,7 @@ class PoseGraph:
         said = measured(sightings)
         sound, likely = agreed(said, odometry, t_ns), within_drift(said, odometry)
         accepted = np.zeros(len(sightings), bool)
-        p, yaw, accepted[sound] = corrected(odometry, said.select(sound), t_ns, likely[sound])
+        p, yaw, accepted[sound] = corrected(odometry, said.select(sound), likely[sound])
         trajectory = self._carried(t_ns, segment, odometry.p, p, yaw)
         loops = tuple(_loop(s, places, good) for s, good in zip(sightings, accepted.tolist(), strict=True))
         seconds = {"solve_so_far": self._solving_s, "solve": working_s() - begin}

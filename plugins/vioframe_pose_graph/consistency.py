@@ -38,6 +38,9 @@ REPEAT_NS = 3 * NS_PER_S
 # scale is off by a per cent, and what is wrong with them is wrong with many: a fit is off by twice what it says.
 # That is what the loops of MH_02, MH_03 and V1_01 show, rendered in worlds for tuning.
 _SIGMA_M, _SIGMA_PART, _SIGMA_YAW, _OF_FIT = 0.005, 0.01, np.radians(0.1), 2.0
+# What is wrong with the points is wrong, in part, with all loops by them: each counts as a quarter of one that knew
+# nothing of the others, with which the paths of those flights come out best.
+_SHARED = 4.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -146,30 +149,26 @@ def agreed(loops: Edges, odometry: Odometry, t_ns: Int) -> Bool:
     return np.asarray(repeated & ~contradicted)
 
 
-def corrected(odometry: Odometry, loops: Edges, t_ns: Int, trusted: Bool) -> tuple[Float, Float, Bool]:
+def corrected(odometry: Odometry, loops: Edges, trusted: Bool) -> tuple[Float, Float, Bool]:
     """Positions (N, 3), yaws (N,) and which of the ``loops`` (L,) were believed; ``trusted`` (L,) as for
     :func:`~vioframe_pose_graph.graph.solve_robustly`.
-
-    Loops that tie one stretch to one other are of the same landmarks, and off by the same: together they count once.
     """
     p, yaw, used = solve_robustly(odometry.p, odometry.edges(), loops, trusted)
     if used.any():
         believed = loops.select(used)
-        alike = _alike(believed, t_ns)
-        weighed = replace(believed, cov=believed.cov * alike[:, None, None])
-        p, yaw = solve(p, yaw, _as_shown(odometry, believed, alike).edges() + weighed)
+        weighed = replace(believed, cov=_SHARED * believed.cov)
+        p, yaw = solve(p, yaw, _as_shown(odometry, believed).edges() + weighed)
     return p, yaw, used
 
 
-def _as_shown(odometry: Odometry, loops: Edges, alike: Int) -> Odometry:
-    """The odometry drifting as told, or as much farther as ``loops`` (L,) show, ``alike`` (L,) of which are of one.
+def _as_shown(odometry: Odometry, loops: Edges) -> Odometry:
+    """The odometry drifting as told, or as much farther as ``loops`` (L,) show.
 
     Their squared Mahalanobis distances from where it puts them are four in the mean if it drifts as is assumed.
     """
     error, told = _innovation(loops, odometry), odometry.as_told().cov(loops.i, loops.j)
     for times in _TIMES:
-        squares = mahalanobis_squared(error, times**2 * told + loops.cov)
-        if np.average(squares, weights=1.0 / alike) <= 4.0:
+        if mahalanobis_squared(error, times**2 * told + loops.cov).mean() <= 4.0:
             break
     return odometry.as_told(times)
 
@@ -177,13 +176,6 @@ def _as_shown(odometry: Odometry, loops: Edges, alike: Int) -> Odometry:
 def _innovation(loops: Edges, odometry: Odometry) -> Float:
     """(L, 4) how far from where the odometry puts them the loops put their later bodies, and how they turn them."""
     return np.column_stack([loops.z - (odometry.p[loops.j] - odometry.p[loops.i]), loops.turn])
-
-
-def _alike(loops: Edges, t_ns: Int) -> Int:
-    """(L,) how many of the loops, itself among them, tie the stretches of keyframes that each one ties."""
-    a, b = _soon_after(t_ns[loops.j])
-    same = np.abs(t_ns[loops.i[a]] - t_ns[loops.i[b]]) <= REPEAT_NS
-    return 1 + np.bincount(np.concatenate([a[same], b[same]]), minlength=len(loops))
 
 
 def _soon_after(t_ns: Int) -> tuple[Int, Int]:
