@@ -26,6 +26,7 @@ from vioframe_pose_graph.matching import DescriptorIndex, match
 from vioframe_pose_graph.options import PoseGraphOptions
 from vioframe_pose_graph.place import Place
 from vioframe_pose_graph.recognition import Recogniser, Sighting
+from vioframe_pose_graph.verification import supported
 
 # What a keyframe tells counts from so much later on by the stamps: by then the thread is through with it.
 _LATENCY_NS = NS_PER_S
@@ -194,4 +195,6 @@ def warm_up() -> None:
     index.add(descriptors, 0)
     index.similarity(descriptors, 1)
     match(descriptors, descriptors, np.zeros((2, 2)), 1, 1.0, 1.0)
-    triangulated(np.stack([np.eye(3)] * 2), np.eye(2, 3), np.zeros((1, 2, 2)), 1.0)
+    poses = np.stack([np.eye(3)] * 2), np.eye(2, 3)
+    triangulated(*poses, np.zeros((1, 2, 2)), 1.0)
+    supported(np.zeros(1), np.zeros((1, 3)), np.ones((1, 3)), np.zeros((1, 2)), np.zeros(1, np.int64), *poses, 1.0)

@@ -16,6 +16,7 @@ from vioframe.geometry import so3
 from vioframe.geometry.resection import projected
 from vioframe.geometry.so3 import rotation_z, yaw_of
 from vioframe.geometry.two_view import rays
+from vioframe.jit import kernel
 from vioframe.types import Float, Int
 from vioframe_pose_graph.matching import match
 from vioframe_pose_graph.place import Place, View
@@ -25,8 +26,6 @@ REPROJECTION_PX = 3.0
 _MAX_DISTANCE, _RATIO = 64, 0.85
 APART_PX = 10.0
 _HYPOTHESES = 300
-# Points that each of them is tried on: of two views of one place most agree, and a part says so as well.
-_TRIED_ON = 100
 # The pairs know nothing of tilt, so their support is counted more generously than that of the fit.
 _COARSE = 2.0
 # As many standard deviations of where a point is seen are tolerated.
@@ -55,12 +54,6 @@ class Correspondences:
     p_WC: Float
     pairs: Int
 
-    def few(self, most: int) -> Correspondences:
-        """Every so manieth of them, ``most`` at the most."""
-        of = slice(None, None, -(-len(self.side) // most))
-        points, depth_sigma, xy = self.points[of], self.depth_sigma[of], self.xy[of]
-        return Correspondences(points, depth_sigma, xy, self.side[of], self.R_WC, self.p_WC, self.pairs[of])
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Relation:
@@ -85,9 +78,8 @@ def relate(earlier: Seen, later: Seen, focal_px: float, min_inliers: int) -> Rel
     seen = correspondences(earlier, later, APART_PX / focal_px)
     if len(np.unique(seen.pairs[:, 1])) < min_inliers:
         return None
-    few = seen.few(_TRIED_ON)
-    support, yaw, t = ransac(few, _draw_pairs(few.side), _COARSE * tolerance)
-    if support * len(seen.side) < min_inliers * len(few.side):
+    support, yaw, t = ransac(seen, _draw_pairs(seen.side), _COARSE * tolerance)
+    if support < min_inliers:
         return None
     return _refined(seen, rotation_z(yaw), t, earlier[0].p_WB_seen, later[0].p_WB_seen, tolerance, min_inliers)
 
@@ -224,17 +216,36 @@ def ransac(seen: Correspondences, pairs: Int, tolerance: float) -> tuple[int, fl
     from_A = np.repeat(side == 1, 2)  # these lead from A to B
     t[from_A] = _turned(-t[from_A], -yaw[from_A])
     yaw[from_A] *= -1.0
-    support = np.zeros(len(yaw), np.int64)
-    for there, (R, p) in enumerate(((rotation_z(yaw), t), (rotation_z(-yaw), _turned(-t, -yaw)))):
-        of = seen.side == there
-        R_C, p_C = seen.R_WC[there].T @ R, (p - seen.p_WC[there]) @ seen.R_WC[there]
-        points_C = seen.points[of] @ np.swapaxes(R_C, 1, 2) + p_C[:, None]  # (hypotheses, points, 3)
-        ahead = points_C[..., 2] > 0.0
-        depth = np.where(ahead, points_C[..., 2], np.nan)[..., None]
-        off = points_C[..., :2] / depth - seen.xy[of]
-        support += (np.sum(off * off, axis=2) < tolerance**2).sum(axis=1)
+    support = supported(yaw, t, seen.points, seen.xy, seen.side, seen.R_WC, seen.p_WC, tolerance)
     best = int(np.argmax(support))
     return int(support[best]), float(yaw[best]), t[best]
+
+
+@kernel
+def supported(
+    yaw: Float, t: Float, points: Float, xy: Float, side: Int, R_WC: Float, p_WC: Float, tolerance: float
+) -> Int:
+    """(H,) how many points reproject to within ``tolerance`` if the worlds lie to one another by yaw (H,) and t (H, 3).
+
+    The points are those of :class:`Correspondences`.
+    """
+    support = np.zeros(len(yaw), np.int64)
+    for h in range(len(yaw)):
+        cos, sin = np.cos(yaw[h]), np.sin(yaw[h])
+        for m in range(len(points)):
+            x, y, z = points[m]
+            if side[m] == 0:
+                x, y, z = cos * x - sin * y + t[h, 0], sin * x + cos * y + t[h, 1], z + t[h, 2]
+            else:
+                x, y, z = x - t[h, 0], y - t[h, 1], z - t[h, 2]
+                x, y = cos * x + sin * y, cos * y - sin * x
+            R, p = R_WC[side[m]], p_WC[side[m]]
+            x, y, z = x - p[0], y - p[1], z - p[2]
+            depth = R[0, 2] * x + R[1, 2] * y + R[2, 2] * z
+            off_x = R[0, 0] * x + R[1, 0] * y + R[2, 0] * z - xy[m, 0] * depth
+            off_y = R[0, 1] * x + R[1, 1] * y + R[2, 1] * z - xy[m, 1] * depth
+            support[h] += depth > 0.0 and off_x**2 + off_y**2 < (tolerance * depth) ** 2
+    return support
 
 
 def _turned(vectors: Float, yaw: Float) -> Float:
