@@ -19,6 +19,7 @@ import vioframe.cli
 import vioframe.cli.run as cli_run
 from vioframe import pipeline
 from vioframe.cli import main
+from vioframe.cores import ONE_BLAS_THREAD
 from vioframe.frontend_process import FrontendProcess
 from vioframe.parts import config
 from vioframe.runs.folder import RunFolder
@@ -111,10 +112,32 @@ def test_nothing_heavy_is_loaded_before_it_is_needed(statement):
     assert not loaded & (HEAVY if statement in WITHOUT_NUMPY else HEAVY - {"numpy"})
 
 
+BEGIN_A_RUN = """
+import sys
+from vioframe.cores import limited_threads
+from vioframe.parts import registry
+import vioframe.frontend_worker, vioframe.pipeline
+installed = registry.load()
+backends = [installed.create_backend(name) for name in ("msckf", "sliding_window")]
+with limited_threads():
+    loaded = "scipy.linalg" in sys.modules
+    import scipy.linalg
+    from threadpoolctl import threadpool_info
+    print(loaded, {each["num_threads"] for each in threadpool_info() if each["user_api"] == "blas"})
+"""
+
+
+@pytest.mark.parametrize(("said", "loaded"), [({}, True), (ONE_BLAS_THREAD, False)])
+def test_scipy_comes_late_and_with_one_thread(said, loaded):
+    environment = {name: value for name, value in os.environ.items() if not name.endswith("_NUM_THREADS")} | said
+    begin = [sys.executable, "-c", BEGIN_A_RUN]
+    done = subprocess.run(begin, check=True, capture_output=True, text=True, env=environment)
+    assert done.stdout == f"{loaded} {{1}}\n"
+
+
 def test_what_scipy_copies_of_numpy_is_loaded_when_somebody_looks_into_it():
     code = """
-import sys, vioframe.pipeline
-assert "scipy.linalg" in sys.modules
+import sys, vioframe.pipeline, scipy.linalg
 assert not {"numpy.f2py.f2py2e", "numpy.testing._private.utils", "unittest"} & set(sys.modules)
 import numpy.f2py
 from numpy.testing import assert_array_equal

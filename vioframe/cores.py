@@ -12,6 +12,9 @@ from typing import Any
 # More threads than this gain nothing on images of this size, and cost on machines that have many.
 _MAX_OPENCV_THREADS = 4
 
+ONE_BLAS_THREAD = {"OPENBLAS_NUM_THREADS": "1"}
+"""The environment of a process whose BLAS comes with one thread; what of it is not loaded yet need not be limited."""
+
 
 def usable_cores() -> int:
     """Cores that this process may run on, which can be fewer than the machine has."""
@@ -63,7 +66,8 @@ _one_blas_thread = _OneBlasThread()
 @cache
 def _blas_libraries() -> Any:
     """A handle on the libraries that are loaded by now: finding them takes a while, so it is done once."""
-    import scipy.linalg  # noqa: F401  its BLAS is to be among them
+    if not os.environ.items() >= ONE_BLAS_THREAD.items():
+        import scipy.linalg  # noqa: F401  its BLAS is to be among them
     from threadpoolctl import ThreadpoolController
 
     return ThreadpoolController().select(user_api="blas")

@@ -21,6 +21,7 @@ from tempfile import TemporaryFile
 from typing import IO, TYPE_CHECKING, Any, Self
 from weakref import finalize
 
+from vioframe.cores import ONE_BLAS_THREAD
 from vioframe.errors import RunError, VioframeError
 
 if TYPE_CHECKING:
@@ -104,7 +105,7 @@ class FrontendProcess:
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             pass_fds=[descriptor],
-            env={**os.environ, **_KEPT_MEMORY},
+            env={**os.environ, **_KEPT_MEMORY, **ONE_BLAS_THREAD},
         )
         self._end = finalize(self, _end, self._process)
         self._is_ready = False

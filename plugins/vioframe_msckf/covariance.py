@@ -6,9 +6,8 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.linalg.blas import dsyrk, dtrsm
-from scipy.linalg.lapack import dpotrf
 
+from vioframe import lapack
 from vioframe.errors import DivergedError
 from vioframe.jit import kernel
 from vioframe.types import Float, Int
@@ -21,13 +20,13 @@ def reduce(P: Float, HP: Float, S: Float, residual: Float) -> Float:
     three are used up. In square-root form, P -= W^T W with W = L^-1 H P and S = L L^T, which keeps ``P`` symmetric.
     Raises :class:`DivergedError` where S is not positive.
     """
-    L, bad = dpotrf(S, lower=1, overwrite_a=1)
+    L, bad = lapack.dpotrf(S, lower=1, overwrite_a=1)
     if bad or not np.isfinite(residual).all():
         raise DivergedError("the innovation covariance is not positive definite")
     # BLAS counts by columns: what is transposed here, it sees as it is.
-    W_T = dtrsm(1.0, L, HP.T, side=1, lower=1, trans_a=1, overwrite_b=1)
-    white = dtrsm(1.0, L, residual[:, None], lower=1)[:, 0]
-    dsyrk(-1.0, W_T, beta=1.0, c=P.T, lower=1, overwrite_c=1)
+    W_T = lapack.dtrsm(1.0, L, HP.T, side=1, lower=1, trans_a=1, overwrite_b=1)
+    white = lapack.dtrsm(1.0, L, residual[:, None], lower=1)[:, 0]
+    lapack.dsyrk(-1.0, W_T, beta=1.0, c=P.T, lower=1, overwrite_c=1)
     _mirror(P)
     return np.asarray(W_T @ white)
 

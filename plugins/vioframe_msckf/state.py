@@ -12,8 +12,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg.lapack import dgeqrf
 
+from vioframe import lapack
 from vioframe.errors import DivergedError
 from vioframe.estimation import rig
 from vioframe.estimation.inertial.propagation import propagate, yaw_consistent_transition
@@ -302,6 +302,6 @@ def compress(H: Float, residual: Float) -> tuple[Float, Float]:
     rows, columns = H.shape
     if rows <= columns:
         return H, residual
-    packed, *_ = dgeqrf(np.asfortranarray(np.column_stack([H, residual])), overwrite_a=1)
+    packed, *_ = lapack.dgeqrf(np.asfortranarray(np.column_stack([H, residual])), overwrite_a=1)
     R = np.triu(packed[:columns])
     return R[:, :columns], R[:, columns]

@@ -5,6 +5,7 @@ What takes long to import is imported where it is needed, when the front-end's p
 
 from __future__ import annotations
 
+import os
 import signal
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
@@ -16,7 +17,7 @@ import click
 
 from vioframe.cli import EXIT_FAILED
 from vioframe.cli.common import FILE, Bar, PartName, calibration_option, cameras_option, print_notes, quiet_option
-from vioframe.cores import usable_cores
+from vioframe.cores import ONE_BLAS_THREAD, usable_cores
 from vioframe.errors import DatasetError, TrajectoryError
 from vioframe.frontend_process import FrontendProcess
 
@@ -94,6 +95,7 @@ def run(
     """
     if view and save_view is not None:
         raise click.UsageError("--view opens a window and --save-view writes a file; choose one")
+    os.environ |= ONE_BLAS_THREAD
     with _begun(cores or usable_cores()) as pipelined:
         from vioframe.parts import registry
         from vioframe.pipeline import prepare, record

@@ -7,8 +7,8 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.linalg.lapack import dpotrf, dpotri, dpotrs
 
+from vioframe import lapack
 from vioframe.arrays import Float, Int
 from vioframe.estimation.factors.problem import Normal, Problem, Variables, symmetric
 from vioframe.jit import kernel
@@ -86,7 +86,7 @@ def _step(normal: Normal, active: Int, damping: float) -> tuple[Float, Float]:
     """Of the states and the calibration (n,), and of the landmarks (L, 3)."""
     S, g, eliminated = normal.reduced(damping)
     L, right, scale = _factored(S, g, active)
-    solved, _ = dpotrs(L, right, lower=1, overwrite_b=1)
+    solved, _ = lapack.dpotrs(L, right, lower=1, overwrite_b=1)
     step = np.zeros(len(g))
     step[active] = -scale * solved
     return step, normal.landmark_step(step, eliminated)
@@ -97,14 +97,14 @@ def covariance(normal: Normal, active: Int, last: int) -> Float:
     S, g, _ = normal.reduced(0.0)
     L, _, scale = _factored(S, g, active)
     # The last rows of the factor are that of the equations which remain, all others being eliminated.
-    cov, _ = dpotri(L[-last:, -last:], lower=1)
+    cov, _ = lapack.dpotri(L[-last:, -last:], lower=1)
     return np.asarray(symmetric(cov.T) * np.outer(scale[-last:], scale[-last:]))
 
 
 def _factored(S: Float, g: Float, active: Int) -> tuple[Float, Float, Float]:
     """Cholesky's factor of the ``active`` equations, of which the lower half counts, right side and scaling of both."""
     scaled, right, scale = _scaled(S, g, active)
-    L, bad = dpotrf(scaled.T, lower=1, clean=0, overwrite_a=1)
+    L, bad = lapack.dpotrf(scaled.T, lower=1, clean=0, overwrite_a=1)
     if bad:
         raise np.linalg.LinAlgError("the window's equations are not positive definite")
     return L, right, scale

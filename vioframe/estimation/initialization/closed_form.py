@@ -25,7 +25,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import eigh
 
 from vioframe.arrays import Bool, Float, Int
 from vioframe.estimation.factors.inertial import StateArrays
@@ -206,6 +205,8 @@ def _null_vector(Q: Float, use: Bool) -> tuple[Float, Float]:
     S[np.arange(K), :, np.arange(K)] += Q.sum(axis=1)
     S = S.reshape(3 * K, 3 * K)[3:, 3:]
     c = np.zeros((K, 3))
+    from scipy.linalg import eigh
+
     c[1:] = eigh(S, subset_by_index=(0, 0))[1].reshape(K - 1, 3)
     return c, (V_inv @ (right.T @ c.ravel()).reshape(L, 3, 1))[..., 0]
 
