@@ -95,7 +95,7 @@ def run(
     """
     if view and save_view is not None:
         raise click.UsageError("--view opens a window and --save-view writes a file; choose one")
-    os.environ |= ONE_BLAS_THREAD
+    os.environ |= ONE_BLAS_THREAD  # before anything brings one
     with _begun(cores or usable_cores()) as pipelined:
         from vioframe.parts import registry
         from vioframe.pipeline import prepare, record

@@ -195,6 +195,8 @@ def _null_vector(Q: Float, use: Bool) -> tuple[Float, Float]:
 
     ``Q`` (K, L, 3, 3); only the landmarks ``use`` (L,) take part, the others come out as zero.
     """
+    from scipy.linalg import eigh
+
     K, L = Q.shape[:2]
     V_inv = np.zeros((L, 3, 3))
     V_inv[use] = np.linalg.inv(Q[:, use].sum(axis=0))
@@ -205,8 +207,6 @@ def _null_vector(Q: Float, use: Bool) -> tuple[Float, Float]:
     S[np.arange(K), :, np.arange(K)] += Q.sum(axis=1)
     S = S.reshape(3 * K, 3 * K)[3:, 3:]
     c = np.zeros((K, 3))
-    from scipy.linalg import eigh
-
     c[1:] = eigh(S, subset_by_index=(0, 0))[1].reshape(K - 1, 3)
     return c, (V_inv @ (right.T @ c.ravel()).reshape(L, 3, 1))[..., 0]
 
