@@ -85,7 +85,7 @@ def _steps(
         ids = k * _FEATURES + np.arange(len(xy))
         unknown = np.zeros(3)
         state = NavState(t_ns, odometry.R_WB[k], odometry.p_WB[k], unknown, unknown, unknown)
-        estimate = Estimate(Status.TRACKING, state, ids, p_OF, is_keyframe=True)
+        estimate = Estimate(Status.TRACKING, state, ids, p_OF)
         tracks = FrameTracks(t_ns, ids, np.zeros_like(ids), xy, xy_normalised)
         yield Step(FrameSet(t_ns, (image,)), tracks, estimate, {})
 

@@ -512,7 +512,7 @@ def test_the_parallax_of_a_feature_is_between_where_it_was_seen_first_and_last()
         ids, camera = np.array([0, *([1, 2, 2] if k <= 4 else [])]), np.array([0, *([0, 0, 1] if k <= 4 else [])])
         xy, p_WF = np.zeros((len(ids), 2)), np.tile(left.p_BC + ahead, (3, 1))
         state = NavState(t_ns, np.eye(3), across * t_ns * 1e-9, across, zero, zero)
-        estimate = Estimate(Status.TRACKING, state, np.arange(3), p_WF, is_keyframe=True)
+        estimate = Estimate(Status.TRACKING, state, np.arange(3), p_WF)
         keyframes += selector.add(Step(FrameSet(t_ns, (image,)), FrameTracks(t_ns, ids, camera, xy, xy), estimate, {}))
     apart = 0.2 * across + baseline
     by_two = np.arctan2(np.linalg.norm(np.cross(ahead, ahead - apart)), ahead @ (ahead - apart))

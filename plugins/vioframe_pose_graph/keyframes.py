@@ -84,7 +84,7 @@ class KeyframeSelector:
         self._previous = state
         image, tracks = next(iter(step.frames.images), None), step.tracks.of_camera(0)
         self._see(step.tracks, state)
-        due = self._last is None or (estimate.is_keyframe and self._moved_on(self._last, tracks, R_WC))
+        due = self._last is None or self._moved_on(self._last, tracks, R_WC)
         if due and image is not None and len(tracks.ids):
             pose, known = (R_WC, p_WC), (_UNKNOWN, _UNKNOWN)
             self._last = Keyframe(state, self.segment, image, tracks, self._camera.model, *pose, *known)

@@ -61,7 +61,7 @@ def _steps(sequence: TrackSequence) -> list[Step]:
             ahead_C = np.column_stack([tracks.xy_normalised, np.ones(len(tracks.ids))]) * 4.0
             R_WC = state.R_WB @ sequence.calibration.cameras[0].R_BC
             p_WC = state.p_WB + state.R_WB @ sequence.calibration.cameras[0].p_BC
-            estimate = Estimate(Status.TRACKING, state, tracks.ids, ahead_C @ R_WC.T + p_WC, is_keyframe=True)
+            estimate = Estimate(Status.TRACKING, state, tracks.ids, ahead_C @ R_WC.T + p_WC)
         steps.append(Step(FrameSet(tracks.t_ns, (image,)), tracks, estimate, {}))
     return steps
 
