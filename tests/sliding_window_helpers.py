@@ -27,7 +27,7 @@ from vioframe.geometry import so3
 from vioframe.geometry.cameras import Camera, intrinsics_of
 from vioframe.io.calibration import packaged_calibration
 from vioframe.simulation import simulated_sequence
-from vioframe.types import Float
+from vioframe.types import Float, Int
 
 CALIBRATION = packaged_calibration("euroc")
 CAMERA = CALIBRATION.cameras[0].model
@@ -139,15 +139,20 @@ def numeric(function: Callable[[Float], Float], sizes: Float, eps: float = 1e-4)
     return np.stack(columns, axis=-1)
 
 
-def row_poses(states: StateArrays, cameras: Calibrated, shutter: Shutter, row: int, view: int) -> tuple[Float, Float]:
-    """R_WC (3, 3) and p_WC (3,) when the landmark ``row`` was seen in ``view``."""
-    frame, camera = divmod(view, len(cameras.p_BC))
+def row_poses(states: StateArrays, cameras: Calibrated, shutter: Shutter, row: Int, view: Int) -> tuple[Float, Float]:
+    """R_WC (..., 3, 3) and p_WC (..., 3) when each landmark ``row`` was seen in its ``view``."""
+    frame, camera = np.divmod(view, len(cameras.p_BC))
     R_WB, p_WB = states.R_WB[frame], states.p_WB[frame]
     if shutter.rolling:
-        late_s = cameras.readout_s[camera] * shutter.row[row, view]
-        p_WB = p_WB + R_WB @ shutter.velocity_B[frame] * late_s
+        late_s = (cameras.readout_s[camera] * shutter.row[row, view])[..., None]
+        p_WB = p_WB + turned(R_WB, shutter.velocity_B[frame] * late_s)
         R_WB = R_WB @ so3.exp(shutter.rate_B[frame] * late_s)
-    return R_WB @ cameras.R_BC[camera], R_WB @ cameras.p_BC[camera] + p_WB
+    return R_WB @ cameras.R_BC[camera], turned(R_WB, cameras.p_BC[camera]) + p_WB
+
+
+def turned(R: Float, vectors: Float) -> Float:
+    """(..., 3), each of the ``vectors`` (..., 3) by its own ``R`` (..., 3, 3)."""
+    return np.asarray((R @ vectors[..., None])[..., 0])
 
 
 def _sightings(
@@ -169,8 +174,8 @@ def _sightings(
     if calibrated.readout_s.any():
         own = np.random.default_rng(1)
         shutter = Shutter(True, own.uniform(-0.5, 0.5, (drawn, views)), *own.normal(size=(2, frames, 3)))
-    poses = [[row_poses(states, calibrated, shutter, i, v) for v in range(views)] for i in range(drawn)]
-    p_CF = np.array([[(p - p_WC) @ R_WC for R_WC, p_WC in own] for own, p in zip(poses, p_WF, strict=True)])
+    R_WC, p_WC = row_poses(states, calibrated, shutter, np.arange(drawn)[:, None], np.arange(views))
+    p_CF = turned(np.swapaxes(R_WC, -1, -2), p_WF[:, None] - p_WC)
     in_view = (p_CF[..., 2] > 1.0) & (np.abs(p_CF[..., :2]) < 0.7 * p_CF[..., 2:]).all(axis=2)
     seen = in_view & (rng.random((drawn, views)) < 0.7) & (np.arange(views) > hosts[:, None])
     seen[np.arange(drawn), hosts] = True

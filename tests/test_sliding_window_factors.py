@@ -18,6 +18,7 @@ from sliding_window_helpers import (
     retracted,
     row_poses,
     standing,
+    turned,
     without_sightings,
 )
 
@@ -50,8 +51,8 @@ def residuals(x: Variables, s: Sightings) -> Float:
     row, view = np.nonzero(s.seen)
     of = view % len(x.cameras.p_BC)
     p_WF = positions(x.states, x.cameras, s.seen.argmax(axis=1), x.landmarks)
-    poses = [row_poses(x.states, x.cameras, s.shutter, *at) for at in zip(row, view, strict=True)]
-    p_C = np.array([(p - p_WC) @ R_WC for p, (R_WC, p_WC) in zip(p_WF[row], poses, strict=True)])
+    R_WC, p_WC = row_poses(x.states, x.cameras, s.shutter, row, view)
+    p_C = turned(np.swapaxes(R_WC, 1, 2), p_WF[row] - p_WC)
     xy = s.xy[row, view] - x.cameras.offset_s[of, None] * s.velocity[row, view]
     if s.on_sphere:
         r = (across(xy) @ (p_C / np.linalg.norm(p_C, axis=1, keepdims=True))[..., None])[..., 0]
