@@ -145,14 +145,9 @@ def row_poses(states: StateArrays, cameras: Calibrated, shutter: Shutter, row: I
     R_WB, p_WB = states.R_WB[frame], states.p_WB[frame]
     if shutter.rolling:
         late_s = (cameras.readout_s[camera] * shutter.row[row, view])[..., None]
-        p_WB = p_WB + turned(R_WB, shutter.velocity_B[frame] * late_s)
+        p_WB = p_WB + np.einsum("...ij,...j", R_WB, shutter.velocity_B[frame] * late_s)
         R_WB = R_WB @ so3.exp(shutter.rate_B[frame] * late_s)
-    return R_WB @ cameras.R_BC[camera], turned(R_WB, cameras.p_BC[camera]) + p_WB
-
-
-def turned(R: Float, vectors: Float) -> Float:
-    """(..., 3), each of the ``vectors`` (..., 3) by its own ``R`` (..., 3, 3)."""
-    return np.asarray((R @ vectors[..., None])[..., 0])
+    return R_WB @ cameras.R_BC[camera], np.einsum("...ij,...j", R_WB, cameras.p_BC[camera]) + p_WB
 
 
 def _sightings(
@@ -175,7 +170,7 @@ def _sightings(
         own = np.random.default_rng(1)
         shutter = Shutter(True, own.uniform(-0.5, 0.5, (drawn, views)), *own.normal(size=(2, frames, 3)))
     R_WC, p_WC = row_poses(states, calibrated, shutter, np.arange(drawn)[:, None], np.arange(views))
-    p_CF = turned(np.swapaxes(R_WC, -1, -2), p_WF[:, None] - p_WC)
+    p_CF = np.einsum("...ji,...j", R_WC, p_WF[:, None] - p_WC)
     in_view = (p_CF[..., 2] > 1.0) & (np.abs(p_CF[..., :2]) < 0.7 * p_CF[..., 2:]).all(axis=2)
     seen = in_view & (rng.random((drawn, views)) < 0.7) & (np.arange(views) > hosts[:, None])
     seen[np.arange(drawn), hosts] = True

@@ -21,7 +21,7 @@ from vioframe.simulation.tracks import TrackOptions, TrackSimulator
 from vioframe.types import NS_PER_S, FrameTracks, ImuSegment, Status
 
 BACKENDS = ("msckf", "sliding_window", "loose_ekf")
-FAILS_S, DURATION_S = 7.0, 15.0
+FAILS_S, DURATION_S = 7.0, 18.0
 OTHERS = 1_000_000
 """Added to ids after a failure: what is tracked then was never seen before."""
 

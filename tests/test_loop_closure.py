@@ -399,9 +399,8 @@ def test_one_texture_all_over_closes_no_loop():
     assert all(is_identity(correction) for correction in corrections_of(flown))
 
 
-@pytest.mark.parametrize(
-    "seed", [*range(5), *(pytest.param(seed, marks=pytest.mark.very_slow) for seed in range(5, 10))]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(10))
 def test_no_place_is_recognised_on_a_way_without_return(seed):
     x = np.linspace(0.0, 30.0, 30)
     truth = path_along(np.column_stack([x, 3.0 * np.sin(x / 6.0 + seed), 0.4 * np.sin(x / 3.0)]), interval_s=1.0)

@@ -18,7 +18,6 @@ from sliding_window_helpers import (
     retracted,
     row_poses,
     standing,
-    turned,
     without_sightings,
 )
 
@@ -52,7 +51,7 @@ def residuals(x: Variables, s: Sightings) -> Float:
     of = view % len(x.cameras.p_BC)
     p_WF = positions(x.states, x.cameras, s.seen.argmax(axis=1), x.landmarks)
     R_WC, p_WC = row_poses(x.states, x.cameras, s.shutter, row, view)
-    p_C = turned(np.swapaxes(R_WC, 1, 2), p_WF[row] - p_WC)
+    p_C = np.einsum("...ji,...j", R_WC, p_WF[row] - p_WC)
     xy = s.xy[row, view] - x.cameras.offset_s[of, None] * s.velocity[row, view]
     if s.on_sphere:
         r = (across(xy) @ (p_C / np.linalg.norm(p_C, axis=1, keepdims=True))[..., None])[..., 0]
