@@ -17,7 +17,7 @@ from vioframe_msckf.state import IMU, FilterState
 
 CALIBRATION = packaged_calibration("euroc", cameras=["cam0"])
 STEREO = packaged_calibration("euroc")
-EXACT = EstimationOptions(gyro_noise_factor=1.0, accel_noise_factor=1.0)
+EXACT = EstimationOptions(gyro_noise_factor=1.0, accel_noise_factor=1.0, accel_walk_factor=1.0)
 """Readings are as noisy as stated, and no more."""
 START_COV = np.diag(np.repeat([0.005, 0.001, 0.02, 0.005, 0.05], 3) ** 2)
 """How well a drawn start is known: rad, m, m/s, rad/s, m/s^2."""

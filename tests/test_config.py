@@ -89,6 +89,7 @@ def test_a_bad_file_is_refused_with_the_place(tmp_path, text, why):
         ({"frontend": {"max_points": 0}}, "max_points must be at least 1"),
         ({"estimation": {"gyro_noise": 3}}, r"the estimation has no option 'gyro_noise' \(did you mean 'gyro_noise_f"),
         ({"estimation": {"gyro_noise_factor": float("nan")}}, "gyro_noise_factor must be more than zero, got nan"),
+        ({"estimation": {"accel_walk_factor": 0}}, "accel_walk_factor must be more than zero"),
         ({"estimation": {"max_blind_s": 0}}, "max_blind_s must be more than zero"),
         ({"estimation": {"standstill_disparity_px": -1}}, "standstill_disparity_px must be zero or more"),
         ({"dataset": {"path": "nowhere.bag"}}, r"nowhere\.bag does not exist"),

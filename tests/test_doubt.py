@@ -236,11 +236,15 @@ class TestNoise:
 
     @pytest.mark.parametrize(("times", "expected"), [(0.1, 1.0), (1.0, 1.0), (2.0, 3.0), (10.0, 4.0)])
     def test_between_rest_and_flight(self, times: float, expected: float):
-        """Noise of the sensor's own is what its calibration says; vibration counts twice what is rougher than that."""
-        rest, flight = EUROC.imu, EUROC.imu.times(4.0, 4.0)
+        """Noise of the sensor's own is what its calibration says; vibration counts twice what is rougher than that.
+
+        The accelerometer's bias walks faster by as much, and the gyroscope's does not.
+        """
+        rest, flight = EUROC.imu, EUROC.imu.times(4.0, 4.0, 2.5)
         noise = noise_over(self.readings(times), rest, flight)
         assert noise.gyro_density == pytest.approx(expected * rest.gyro_density, rel=0.15)
         assert noise.accel_density == pytest.approx(expected * rest.accel_density, rel=0.15)
+        assert noise.accel_walk == pytest.approx(min(expected, 2.5) * rest.accel_walk, rel=0.15)
         assert noise.gyro_walk == rest.gyro_walk
 
     @pytest.mark.parametrize("flight", ["figure_eight", "aggressive"])
@@ -248,9 +252,10 @@ class TestNoise:
         """The readings of a frame are few, and rough by chance, too: in the mean they are taken for what they are."""
         sequence = simulated_sequence(flight, duration_s=20.0)
         own = sequence.calibration.imu
-        found = [noise_over(imu, own, own.times(4.0, 4.0)) for imu, _ in sequence.packets]
+        found = [noise_over(imu, own, own.times(4.0, 4.0, 4.0)) for imu, _ in sequence.packets]
         assert np.mean([n.gyro_density for n in found]) == pytest.approx(own.gyro_density, rel=0.1)
         assert np.mean([n.accel_density for n in found]) == pytest.approx(own.accel_density, rel=0.1)
+        assert np.mean([n.accel_walk for n in found]) == pytest.approx(own.accel_walk, rel=0.1)
 
     @pytest.mark.parametrize("times", [1.0, 10.0])
     def test_how_rough_a_recording_is_is_told(self, times: float):
@@ -269,6 +274,7 @@ class TestNoise:
         assert short == without
         assert (across.gyro_density - without.gyro_density) * 0.1**0.5 == pytest.approx(0.5 * 0.1)
         assert (across.accel_density - without.accel_density) * 0.1**0.5 == pytest.approx(2.0 * 0.1)
+        assert across.accel_walk == without.accel_walk
         # From five readings on that are missing in a row.
         assert noise_over(self.readings(1.0, 0.025), rest, flight).gyro_density > 0.05
         with pytest.raises(DivergedError, match="no inertial readings for"):

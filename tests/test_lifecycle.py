@@ -79,7 +79,8 @@ def begun(backend: Any, options: EstimationOptions | None = None, sequence: Trac
 
 def test_it_begins_at_the_state_given_with_the_noise_of_a_flight():
     backend, start = Scripted(), drawn_start(flight(), 0, 0)
-    life = LifeCycle(backend, CALIBRATION, EstimationOptions(gyro_noise_factor=3.0, accel_noise_factor=5.0), start)
+    options = EstimationOptions(gyro_noise_factor=3.0, accel_noise_factor=5.0, accel_walk_factor=2.0)
+    life = LifeCycle(backend, CALIBRATION, options, start)
     estimate = life.process(*flight().packets[0])
     assert estimate.events == ("initialised (state given)",)
     assert estimate.state is start
@@ -88,7 +89,7 @@ def test_it_begins_at_the_state_given_with_the_noise_of_a_flight():
     assert begin.noise_at_rest == given
     in_flight = begin.calibration.calibration.imu
     assert (in_flight.gyro_density, in_flight.accel_density) == (3 * given.gyro_density, 5 * given.accel_density)
-    assert (in_flight.gyro_walk, in_flight.accel_walk) == (given.gyro_walk, given.accel_walk)
+    assert (in_flight.gyro_walk, in_flight.accel_walk) == (given.gyro_walk, 2 * given.accel_walk)
     assert begin.tracks.ids.tolist() == flight().packets[0][1].ids.tolist()
     # What is assumed in flight is no knowledge of the IMU.
     assert estimate.calibration.calibration.imu == given

@@ -364,11 +364,8 @@ def test_ctrl_c_ends_all_processes_and_leaves_nothing(parts, tmp_path):
 
 @pytest.mark.very_slow
 def test_the_msckf_is_accurate_and_honest_and_not_without_first_estimates():
-    """25 flights of 60 s at EuRoC's noise, with its own initialisation: every figure promised.
-
-    It is told that points stay on their landmarks, as simulated ones do.
-    """
-    honest, nees = flown(25, landmark_drift_px=0.0)
+    """25 flights of 60 s at EuRoC's noise, with its own initialisation and its defaults: every figure promised."""
+    honest, nees = flown(25)
     assert sum(honest["failures"].values()) == 0
     assert honest["resets"] == 0
     assert honest["completion"] == 1.0
@@ -377,7 +374,7 @@ def test_the_msckf_is_accurate_and_honest_and_not_without_first_estimates():
     for each in nees.values():
         assert 0.7 <= each.per_axis <= 1.5
 
-    _, sure = flown(6, landmark_drift_px=0.0, first_estimate_jacobians=False)
+    _, sure = flown(6, first_estimate_jacobians=False)
     for each in sure.values():
         assert each.per_axis > 1.5
         assert each.verdict == "overconfident"

@@ -22,7 +22,7 @@ from vioframe_msckf.backend import Msckf
 from vioframe_msckf.measurement import ACCEPTED, GATED
 from vioframe_msckf.options import MsckfOptions
 
-WHITE = MsckfOptions(landmark_drift_px=0.0)
+WHITE = MsckfOptions(landmark_drift=0.0)
 """Points that are simulated stay on their landmarks."""
 CALIBRATED = replace(WHITE, calibrate_extrinsics=False, calibrate_time_offset=False, calibrate_intrinsics=False)
 
@@ -219,7 +219,7 @@ def test_landmarks_that_points_slide_off_are_not_believed_for_long():
     for seed in range(3):
         clean = simulated_sequence("figure_eight", pixel_sigma=0.3, seed=seed, duration_s=15.0)
         truth = {s.t_ns: s for s in clean.true_states}
-        runs = [fly(sliding(clean, 0.3, seed), o, seed, EXACT) for o in (WHITE, MsckfOptions(landmark_drift_px=0.3))]
+        runs = [fly(sliding(clean, 0.3, seed), o, seed, EXACT) for o in (WHITE, MsckfOptions())]
         ratios.append([sum(pose_nees(run.states, truth)) for run in runs])
     believed, doubted = np.mean(ratios, axis=0)
     assert doubted < 0.7 * believed

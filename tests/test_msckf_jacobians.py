@@ -272,7 +272,7 @@ def test_a_landmark_that_does_not_fit_is_discounted_and_gated_as_it_is(cauchy):
     for row in full:
         _, p_WF, *_ = rows_of(table, row, Window.of(state, True), 1.0)
         add_independent(state, int(table.ids[row]), p_WF, 0.01**2 * np.eye(3))
-    options, noise = MsckfOptions(cauchy_sigmas=cauchy, landmark_drift_px=0.0), PointNoise(2.0)
+    options, noise = MsckfOptions(cauchy_sigmas=cauchy, landmark_drift=0.0), PointNoise(2.0)
     index, first, newest = np.arange(4), np.zeros(4, np.int64), len(state.clones) - 1
     xy = table.xy[full, -1].copy()
 

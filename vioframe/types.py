@@ -178,9 +178,14 @@ class ImuNoise:
     """Diffusion of the accelerometer's bias, m/s^3/sqrt(Hz)."""
     rate_hz: float = 200.0
 
-    def times(self, gyro: float, accel: float) -> ImuNoise:
-        """With so many times the white noise of either sensor."""
-        return replace(self, gyro_density=gyro * self.gyro_density, accel_density=accel * self.accel_density)
+    def times(self, gyro: float, accel: float, accel_walk: float = 1.0) -> ImuNoise:
+        """With so many times the white noise of either sensor, and of the walk of the accelerometer's bias."""
+        return replace(
+            self,
+            gyro_density=gyro * self.gyro_density,
+            accel_density=accel * self.accel_density,
+            accel_walk=accel_walk * self.accel_walk,
+        )
 
 
 @dataclass(frozen=True, slots=True)

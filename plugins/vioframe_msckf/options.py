@@ -20,8 +20,9 @@ class MsckfOptions:
     """Long-lived landmarks kept in the state; 0 makes this a pure MSCKF."""
     shared_every_s: NonNegativeFloat = 0.5
     """Of what a camera ahead of it in the rig sees, too, a camera counts once in so many seconds; 0: always."""
-    landmark_drift_px: NonNegativeFloat = 0.1
-    """How far a followed point slides off its landmark from one frame to the next, px; 0 where noise is white."""
+    landmark_drift: NonNegativeFloat = 0.1
+    """How far a followed point slides off its landmark from one frame to the next, as a share of its noise that lasts;
+    where noise is white none does."""
     pixel_sigma: PositiveFloat = 0.2
     """Standard deviation of a tracked feature's position, px, at least; more where tracks fit worse or errors last."""
     cauchy_sigmas: PositiveFloat = 1.0

@@ -171,7 +171,7 @@ def update_from_landmarks(
     state.keep_landmarks(np.isin(state.landmark_ids, in_sight))
     if not len(state.landmark_ids):
         return 0
-    state.slide_landmarks(options.landmark_drift_px)
+    state.slide_landmarks(options.landmark_drift * point_noise.lasting_px)
     landmarks, rows = np.nonzero(state.landmark_ids[:, None] == tracks.ids)
     if not len(landmarks):
         return 0

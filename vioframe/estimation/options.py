@@ -12,11 +12,13 @@ from vioframe.types import ImuNoise
 class EstimationOptions:
     """What every back-end's estimate has in common; raises :class:`ConfigError` on a value out of range."""
 
-    gyro_noise_factor: float = 4.0
+    gyro_noise_factor: float = 3.0
     """How many times the calibration's white noise of the gyroscope is assumed at most, where vibration adds to the
     sensor's own; how much it adds is told from the readings."""
-    accel_noise_factor: float = 2.0
+    accel_noise_factor: float = 1.0
     """Likewise for the accelerometer."""
+    accel_walk_factor: float = 2.5
+    """Likewise for the walk of the accelerometer's bias, which vibration moves."""
     zero_velocity_update: bool = True
     """Recognise standstill and use it."""
     standstill_disparity_px: float = 0.7
@@ -25,7 +27,7 @@ class EstimationOptions:
     """Seconds in which nothing seen corrects the estimate, after which it is given up and begun anew."""
 
     def __post_init__(self) -> None:
-        for name in ("gyro_noise_factor", "accel_noise_factor", "max_blind_s"):
+        for name in ("gyro_noise_factor", "accel_noise_factor", "accel_walk_factor", "max_blind_s"):
             if not getattr(self, name) > 0.0:
                 raise ConfigError(f"estimation option {name} must be more than zero, got {getattr(self, name)!r}")
         if not self.standstill_disparity_px >= 0.0:
@@ -34,5 +36,5 @@ class EstimationOptions:
             )
 
     def in_flight(self, imu: ImuNoise) -> ImuNoise:
-        """At most what the readings of ``imu`` are off by in flight: vibration adds to the sensor's own white noise."""
-        return imu.times(self.gyro_noise_factor, self.accel_noise_factor)
+        """At most what the readings of ``imu`` are off by in flight, where vibration adds to the sensor's own."""
+        return imu.times(self.gyro_noise_factor, self.accel_noise_factor, self.accel_walk_factor)

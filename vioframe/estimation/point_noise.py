@@ -31,6 +31,11 @@ class PointNoise:
         """Forget what was found; of a body at rest it says little about the flight to come."""
         self.px, self._ratio = _AT_FIRST * self._least_px, 1.0
 
+    @property
+    def lasting_px(self) -> float:
+        """What of ``px`` lasts from one sighting to the next: 0 where errors are white."""
+        return max(self._ratio - 1.0, 0.0) * self.px
+
     def add(self, squares: Float, views: Int, ratios: Float | None = None) -> None:
         """Go by what (N,) tracks are off by, seen by ``views`` (N,): sums of squares, in standard deviations.
 

@@ -38,7 +38,8 @@ def roughness(t_ns: Int, values: Float, order: int = 2) -> float:
 def noise_over(imu: ImuSegment, at_rest: ImuNoise, in_flight: ImuNoise) -> ImuNoise:
     """That of the readings ``imu``: the sensor's own, ``at_rest``, and what vibration adds, to ``in_flight`` at most.
 
-    The sensor's own noise makes readings rough, too; what is rougher than that shakes.
+    The sensor's own noise makes readings rough, too; what is rougher than that shakes. What shakes an accelerometer
+    moves its bias as well: the walk of that grows as its white noise does.
 
     It is raised where readings are missing: the straight line drawn over a gap is only a guess. A rate that is off by w
     for a gap of T turns the body by w T, as white noise of density w sqrt(T) would. Raises :class:`DivergedError` where
@@ -47,14 +48,18 @@ def noise_over(imu: ImuSegment, at_rest: ImuNoise, in_flight: ImuNoise) -> ImuNo
     gap_s = imu.largest_gap_s
     if gap_s > _MAX_IMU_GAP_S:
         raise DivergedError(f"no inertial readings for {gap_s:.2f} s")
-    gyro = _shaken(roughness(imu.t_ns, imu.gyro_B), at_rest.gyro_density, in_flight.gyro_density)
-    accel = _shaken(roughness(imu.t_ns, imu.accel_B), at_rest.accel_density, in_flight.accel_density)
+    gyro_times = _shaken(roughness(imu.t_ns, imu.gyro_B), at_rest.gyro_density)
+    accel_times = _shaken(roughness(imu.t_ns, imu.accel_B), at_rest.accel_density)
+    gyro = min(gyro_times * at_rest.gyro_density, in_flight.gyro_density)
+    accel = min(accel_times * at_rest.accel_density, in_flight.accel_density)
+    accel_walk = min(accel_times * at_rest.accel_walk, in_flight.accel_walk)
     if gap_s >= 5.0 / in_flight.rate_hz:
         gyro += _UNSEEN_TURN * gap_s**0.5
         accel += _UNSEEN_ACCELERATION * gap_s**0.5
-    return replace(in_flight, gyro_density=gyro, accel_density=accel)
+    return replace(in_flight, gyro_density=gyro, accel_density=accel, accel_walk=accel_walk)
 
 
-def _shaken(rough: float, own: float, most: float) -> float:
-    vibration = max(rough**2 - _BY_CHANCE * own**2, 0.0)
-    return min(float(np.sqrt(own**2 + _BEYOND_ROUGHNESS**2 * vibration)), most)
+def _shaken(rough: float, own: float) -> float:
+    """How many times its ``own`` noise a sensor is off by that is as ``rough`` as it is."""
+    vibration = max((rough / own) ** 2 - _BY_CHANCE, 0.0)
+    return float(np.sqrt(1.0 + _BEYOND_ROUGHNESS**2 * vibration))
