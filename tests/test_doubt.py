@@ -267,6 +267,10 @@ class TestNoise:
         noise = noise_over(self.readings(10.0), EUROC.imu, EUROC.imu.times(0.5, 0.5))
         assert noise.gyro_density == 0.5 * EUROC.imu.gyro_density
 
+    def test_a_sensor_that_is_given_no_noise_has_none(self):
+        ideal = EUROC.imu.times(0.0, 0.0)
+        assert noise_over(self.readings(10.0), ideal, ideal.times(4.0, 4.0, 2.5)) == ideal
+
     def test_gaps(self):
         """A turn of 0.5 rad/s and an acceleration of 2 m/s^2, unseen for 0.1 s, are as white noise turns and moves."""
         rest, flight = EUROC.imu, EUROC.imu.times(4.0, 4.0)

@@ -39,7 +39,7 @@ def times_as_rough(imu: ImuSamples, given: ImuNoise) -> tuple[float, float]:
     """How many times as rough as by their densities gyroscope and accelerometer are, in the middle half second of all.
 
     By so much vibration is told from noise; in flight no more is counted with than so many times the density as
-    ``gyro_noise_factor`` and ``accel_noise_factor`` say.
+    ``gyro_noise_factor`` and ``accel_noise_factor`` say, and the walk as ``accel_walk_factor`` does.
     """
     width = max(10, round(_NOISE_WINDOW_S * rate_hz(imu.t_ns)))
     stretches = [slice(begin, begin + width) for begin in range(0, len(imu.t_ns) - width + 1, width)]

@@ -60,6 +60,6 @@ def noise_over(imu: ImuSegment, at_rest: ImuNoise, in_flight: ImuNoise) -> ImuNo
 
 
 def _shaken(rough: float, own: float) -> float:
-    """How many times its ``own`` noise a sensor is off by that is as ``rough`` as it is."""
-    vibration = max((rough / own) ** 2 - _BY_CHANCE, 0.0)
+    """How many times its ``own`` noise a sensor is off by that is as ``rough`` as it is; once, if it is given none."""
+    vibration = max((rough / own) ** 2 - _BY_CHANCE, 0.0) if own else 0.0
     return float(np.sqrt(1.0 + _BEYOND_ROUGHNESS**2 * vibration))
