@@ -374,17 +374,18 @@ def test_the_msckf_is_accurate_and_honest_and_not_without_first_estimates():
     for each in nees.values():
         assert 0.7 <= each.per_axis <= 1.5
 
-    _, sure = flown(25, first_estimate_jacobians=False)
-    for part, each in sure.items():
-        assert each.per_axis > 1.5 * nees[part].per_axis
+    # What is learnt wrongly adds up, so that the longer flight tells.
+    _, sure = flown(12, duration_s=120.0, first_estimate_jacobians=False)
+    for each in sure.values():
+        assert each.per_axis > 1.5
         assert each.verdict == "overconfident"
     # Yaw is what a filter believes to learn where it must not; position follows more slowly.
-    assert sure["orientation"].per_axis > 2.0 * nees["orientation"].per_axis
+    assert sure["orientation"].per_axis > 3.0
     assert sure["pose"].inside < 0.5
 
 
-def flown(seeds, **options):
+def flown(seeds, duration_s=60.0, **options):
     """What so many trials of the MSCKF say together, and their average NEES."""
     part = PartConfig(name="msckf", options=options)
-    trials = map_in_processes(partial(fly, Setup(), part), range(seeds), usable_cores())
+    trials = map_in_processes(partial(fly, Setup(duration_s=duration_s), part), range(seeds), usable_cores())
     return over_trials(pd.DataFrame([t.to_dict() for t in trials])), average_nees([t.nees_over_time() for t in trials])
