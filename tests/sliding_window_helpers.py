@@ -106,8 +106,8 @@ def without_sightings(problem: Problem) -> Problem:
 
 def only(sightings: Sightings, rows: slice | NDArray[np.bool_]) -> Sightings:
     s = sightings
-    lens = s.lens._replace(px=s.lens.px[rows])
-    s = s._replace(seen=s.seen[rows], xy=s.xy[rows], velocity=s.velocity[rows], to_px=s.to_px[rows], lens=lens)
+    s = s._replace(seen=s.seen[rows], share=s.share[rows], lens=s.lens._replace(px=s.lens.px[rows]))
+    s = s._replace(xy=s.xy[rows], velocity=s.velocity[rows], to_px=s.to_px[rows])
     return s._replace(shutter=s.shutter._replace(row=s.shutter.row[rows])) if s.shutter.rolling else s
 
 
@@ -194,4 +194,5 @@ def _sightings(
     assert in_front.all()
     if shutter.rolling:
         shutter = shutter._replace(row=shutter.row[chosen])
-    return Sightings(seen, xy, velocity, to_px, 0.8, 2.0, on_sphere, shutter, lens), landmarks
+    share = rng.uniform(0.1, 1.0, seen.shape)
+    return Sightings(seen, share, xy, velocity, to_px, 0.8, 2.0, on_sphere, shutter, lens), landmarks

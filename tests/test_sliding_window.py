@@ -348,7 +348,7 @@ def test_noisier_readings_are_trusted_less():
     assert loose[-1, :9].sum() > 1.1 * once[-1, :9].sum()
 
 
-@pytest.mark.parametrize(("flown_px", "found_px"), [(0.1, 0.16), (0.7, 0.7), (1.5, 1.5)])
+@pytest.mark.parametrize(("flown_px", "found_px"), [(0.05, 0.08), (0.7, 0.7), (1.5, 1.5)])
 def test_noise_of_points_is_found_where_it_is_larger_than_was_taken_for_granted(flown_px, found_px):
     backend = SlidingWindow()
     sequence = simulated_sequence("figure_eight", pixel_sigma=flown_px, seed=1, duration_s=15.0)

@@ -69,7 +69,7 @@ def expected_normal(x: Variables, at: Variables, s: Sightings) -> tuple[Float, F
     """Gauss-Newton matrix and gradient over states, calibration and landmarks; Jacobians numeric, taken ``at``."""
     J = numeric(lambda d: residuals(retracted(at, d), s), sizes(x))
     r = residuals(x, s)
-    weight = 1.0 / (1.0 + (r * r).sum(axis=1) / (s.sigma * s.cauchy) ** 2)
+    weight = s.share[s.seen] / (1.0 + (r * r).sum(axis=1) / (s.sigma * s.cauchy) ** 2)
     J_w = J * (weight[:, None, None] / s.sigma**2)
     return np.einsum("nai,naj->ij", J_w, J), np.einsum("nai,na->i", J_w, r)
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from msckf_helpers import CALIBRATION, since
+from msckf_helpers import CALIBRATION, STEREO, drawn_start, since
 from sliding_window_helpers import flown_window, moved, natural, only, standing
 
 from vioframe.bench import run_backend
@@ -95,8 +95,8 @@ def part(problem: Problem, prior: Prior, frames: slice, readings: slice, rows: n
     """Some of the factors, over some of the states, with another prior on these."""
     s = only(problem.sightings, rows)
     lens = s.lens._replace(px=s.lens.px[:, frames], at=s.lens.at[frames])
-    s = s._replace(seen=s.seen[:, frames], xy=s.xy[:, frames], velocity=s.velocity[:, frames], to_px=s.to_px[:, frames])
-    s = s._replace(lens=lens)
+    s = s._replace(seen=s.seen[:, frames], share=s.share[:, frames], xy=s.xy[:, frames], lens=lens)
+    s = s._replace(velocity=s.velocity[:, frames], to_px=s.to_px[:, frames])
     f = problem.readings
     some = ImuFactors(*(values[readings] for values in f))
     still = {k - frames.start: still for k, still in problem.still.items() if frames.start <= k < frames.stop}
@@ -281,3 +281,35 @@ def test_what_was_known_of_position_and_yaw_never_grows(flight, monkeypatch):
     assert (np.diff(kept, axis=0) < 1e-6).all()
     assert (kept[-1] < 0.999).all()
     assert (kept[-1] > 0.2).all()
+
+
+@pytest.mark.parametrize("calibration", [CALIBRATION, STEREO], ids=["mono", "stereo"])
+def test_each_sighting_is_told_to_the_prior_once(calibration, monkeypatch):
+    """In parts, while its landmark stays in sight; and what has been told is no longer said by the window."""
+    sequence = simulated_sequence("figure_eight", seed=1, duration_s=12.0, calibration=calibration)
+    backend = SlidingWindow(SlidingWindowOptions())
+    told: dict[tuple[int, int, int], float] = {}
+    parts, left = [], []
+
+    def recorded(problem: Problem, x: Variables) -> Prior:
+        window, s = backend.window, problem.sightings
+        tracks = window.tracks
+        hosted = tracks.ids[tracks.known & (tracks.hosts < tracks.cameras)]
+        before = tracks.untold[np.isin(tracks.ids, hosted)]
+        for i, v in zip(*np.nonzero(s.seen), strict=True):
+            sighting = int(hosted[i]), window._t_ns[v // tracks.cameras], v % tracks.cameras
+            assert before[i, v] == pytest.approx(1.0 - told.get(sighting, 0.0), abs=1e-12)
+            told[sighting] = told.get(sighting, 0.0) + s.share[i, v]
+            parts.append(s.share[i, v])
+            if v < tracks.cameras:
+                left.append(told[sighting])
+        return marginalise_oldest(problem, x)
+
+    monkeypatch.setattr(window_module, "marginalise_oldest", recorded)
+    run_backend(since(sequence, 1), backend, initial_state=drawn_start(sequence, 1, 1))
+    assert len(left) > 300
+    np.testing.assert_allclose(left, 1.0, rtol=1e-12)
+    assert max(told.values()) < 1.0 + 1e-12
+    assert min(parts) > 0.0
+    # Most of them in several parts.
+    assert np.median(parts) < 0.5

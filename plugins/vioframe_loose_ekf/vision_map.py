@@ -102,7 +102,7 @@ def adjust(scene: VisionMap, sigma: float, held: int, iterations: int) -> None:
     n = 15 * len(states) + CALIBRATION_SIZE
     weak = Prior(_UNSEEING * np.eye(n), np.zeros(n), states, camera, np.ones(len(states), bool))
     to_plane = np.tile(np.eye(2), (*seen.shape, 1, 1))
-    sightings = Sightings(seen, xy, np.zeros(xy.shape), to_plane, sigma, _WIDTH)
+    sightings = Sightings(seen, np.ones(seen.shape), xy, np.zeros(xy.shape), to_plane, sigma, _WIDTH)
     problem = Problem(weak, ImuFactors.stack([]), {}, sightings, first_estimates=False)
     solution = solve(problem, Variables(states, camera, landmarks), columns[6 * held :], iterations)
     x = solution.variables

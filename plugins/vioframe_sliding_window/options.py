@@ -26,7 +26,7 @@ class SlidingWindowOptions:
     """Where reprojection errors are measured: on the normalised image plane, or on the unit sphere."""
     shared_every_s: NonNegativeFloat = 0.5
     """Of what a camera ahead of it in the rig sees, too, a camera counts once in so many seconds; 0: always."""
-    pixel_sigma: PositiveFloat = 0.16
+    pixel_sigma: PositiveFloat = 0.08
     """Standard deviation of a tracked feature's position, px, at least; more is found where tracks fit worse."""
     cauchy_sigmas: PositiveFloat = 1.0
     """Where Cauchy's robust loss begins to discount an observation, standard deviations."""

@@ -173,7 +173,7 @@ class Window:
             own = tracks.camera == c
             to_px[own] = pixels_by_residual(int(self._models[c]), lens, tracks.xy_normalised[own], on_sphere)
         at = self.tracks.add_frame(tracks, self._repeats.counting(tracks))
-        self.tracks.to_px[at] = to_px
+        self.tracks.to_px[at], self.tracks.untold[at] = to_px, 1.0
 
     @property
     def is_full(self) -> bool:
@@ -267,19 +267,21 @@ class Window:
     def marginalise_oldest(self) -> None:
         """Turn what the oldest state and the landmarks it hosts say about the rest into the prior, and let go of it.
 
-        Landmarks that are still in sight move to the next frame that saw them. What the newer half of the window saw of
-        them is left for later: the prior would freeze those states at estimates that have hardly begun.
+        Landmarks that are still in sight move to the next frame that saw them, and tell of each sighting a share: the
+        same each time until its frame goes, so that all of it has been told by then, once. The others tell the rest.
         """
         tracks = self.tracks
         rows = np.flatnonzero(tracks.known & (tracks.hosts < tracks.cameras))
-        seen = tracks.seen[rows]
-        seen[tracks.in_sight()[rows], tracks.cameras * ((len(self) + 1) // 2) :] = False
-        sightings = self._sightings(rows)._replace(seen=seen)
+        told, stays = tracks.untold[rows], tracks.in_sight()[rows]
+        told[stays] /= 1.0 + np.arange(tracks.seen.shape[1]) // tracks.cameras
         still = {k: still for k, still in self._still.items() if k == 0}
-        problem = self._problem(self._readings[:1], still, sightings)
+        problem = self._problem(self._readings[:1], still, self._sightings(rows)._replace(share=told))
         self._prior = marginalise_oldest(problem, self._variables(rows))
-        p_WF = positions(self._states, self._cameras, tracks.hosts[rows], tracks.landmarks[rows])
-        ids = tracks.ids[rows]
+        tracks.untold[rows] -= told
+        staying = rows[stays]
+        ids, hosts, landmarks = tracks.ids[staying], tracks.hosts[staying], tracks.landmarks[staying]
+        p_WF = positions(self._states, self._cameras, hosts, landmarks)
+        tracks.drop(rows[~stays])
         tracks.drop_frame(0)
         self._t_ns.pop(0)
         self._readings.pop(0)
@@ -310,6 +312,7 @@ class Window:
         velocity = image_velocities(self._states, self._cameras, self._gyro_B, xy, depth)
         return Sightings(
             tracks.seen[rows],
+            tracks.untold[rows],
             tracks.xy_normalised[rows],
             velocity,
             tracks.to_px[rows],

@@ -116,10 +116,12 @@ class Sightings(NamedTuple):
 
     ``seen`` (L, V); ``xy`` (L, V, 2) on the z = 1 plane, and how they move there, ``velocity`` (L, V, 2) 1/s.
     ``to_px`` (L, V, 2, 2) turns residuals into pixels, in which ``sigma`` is the standard deviation; ``cauchy`` is the
-    scale of the robust loss, in standard deviations. Residuals are on the plane, or on the unit sphere.
+    scale of the robust loss, in standard deviations, and ``share`` (L, V) how much of it counts. Residuals are on the
+    plane, or on the unit sphere.
     """
 
     seen: Bool
+    share: Float
     xy: Float
     velocity: Float
     to_px: Float
@@ -371,7 +373,7 @@ def _residual_jacobian(
 @kernel
 def _evaluate(poses: Poses, cameras: Calibrated, s: Sightings, landmarks: Float) -> tuple[float, Float]:
     """Half the robust sum of squares, and each landmark's root mean square residual."""
-    seen, xy, velocity, to_px, sigma, cauchy, on_sphere, shutter, lens = s
+    seen, share, xy, velocity, to_px, sigma, cauchy, on_sphere, shutter, lens = s
     R_rowC, p_rowC = np.empty((3, 3)), np.empty(3)
     q, b, X, r, T = np.empty(3), np.empty(3), np.empty(3), np.empty(2), np.empty((2, 3))
     count, N = len(seen), len(cameras.p_BC)
@@ -396,7 +398,7 @@ def _evaluate(poses: Poses, cameras: Calibrated, s: Sightings, landmarks: Float)
             if lens.varied:
                 _add_lens(lens, i, v, cameras.intrinsics[c], r)
             squared = r[0] * r[0] + r[1] * r[1]
-            cost += 0.5 * cauchy * cauchy * math.log(1.0 + squared / (sigma * sigma * cauchy * cauchy))
+            cost += share[i, v] * 0.5 * cauchy * cauchy * math.log(1.0 + squared / (sigma * sigma * cauchy * cauchy))
             total += squared / (sigma * sigma)
             if X[2] <= _LEAST_DEPTH_RATIO:
                 total = np.inf
@@ -407,7 +409,7 @@ def _evaluate(poses: Poses, cameras: Calibrated, s: Sightings, landmarks: Float)
 
 @kernel
 def linearise(poses: Poses, first: Poses, cameras: Calibrated, s: Sightings, landmarks: Float) -> Linearised:
-    seen, xy, velocity, to_px, sigma, cauchy, on_sphere, shutter, lens = s
+    seen, share, xy, velocity, to_px, sigma, cauchy, on_sphere, shutter, lens = s
     rolling = shutter.rolling
     count, views = seen.shape
     N = len(cameras.p_BC)
@@ -460,11 +462,11 @@ def linearise(poses: Poses, first: Poses, cameras: Calibrated, s: Sightings, lan
                 if lens.varied:
                     _add_lens(lens, i, view, cameras.intrinsics[of], r)
                 squared = (r[0] * r[0] + r[1] * r[1]) / (sigma * sigma)
-                cost += 0.5 * cauchy * cauchy * math.log(1.0 + squared / (cauchy * cauchy))
+                cost += share[i, view] * 0.5 * cauchy * cauchy * math.log(1.0 + squared / (cauchy * cauchy))
                 squares[i] += squared
                 sightings[i] += 1.0
                 behind[i] |= X[2] <= _LEAST_DEPTH_RATIO
-                scale = math.sqrt(1.0 / (1.0 + squared / (cauchy * cauchy))) / sigma
+                scale = math.sqrt(share[i, view] / (1.0 + squared / (cauchy * cauchy))) / sigma
 
                 _direction(then, m_x, m_y, rho, X)
                 _residual_jacobian(X, vx, vy, px, on_sphere, T, D, by_offset)

@@ -96,17 +96,18 @@ class LandmarkTable(TrackTable):
     ``landmarks`` (F, 3) are [x y rho]: the point on the z = 1 plane of the track's host, the first that sees it,
     and the inverse depth there, 1/m (Civera, Davison, Montiel, "Inverse Depth Parametrization for Monocular SLAM",
     T-RO 2008). They mean something where ``known`` (F,). ``to_px`` (F, V, 2, 2) are the pixels by residual of each
-    sighting.
+    sighting, and ``untold`` (F, V) is the share of it that the prior does not know yet.
     """
 
     _by_track = ("ids", "landmarks", "known")
-    _by_sighting = ("in_view", "seen", "xy", "xy_normalised", "to_px")
+    _by_sighting = ("in_view", "seen", "xy", "xy_normalised", "to_px", "untold")
 
     def __init__(self, cameras: int = 1) -> None:
         super().__init__(cameras)
         self.landmarks: Float = np.empty((0, 3))
         self.known: Bool = np.empty(0, dtype=bool)
         self.to_px: Float = np.empty((0, 0, 2, 2))
+        self.untold: Float = np.empty((0, 0))
 
     def drop_frame(self, frame: int) -> None:
         """Forget a frame, and tracks that no other one sees. Landmarks it hosts become unknown."""
