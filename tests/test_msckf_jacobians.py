@@ -330,7 +330,7 @@ def test_a_track_waits_until_its_distance_is_known():
     state, table = seeing_state()
     rows = np.flatnonzero(table.seen.all(axis=1))[:1]
     cov, gate = state.cov.copy(), np.full(40, np.inf)
-    assert not len(promote(state, table, rows, MsckfOptions(), PointNoise(5.6), gate))
+    assert not len(promote(state, table, rows, MsckfOptions(), PointNoise(28.0), gate))
     assert not len(state.landmark_ids)
     np.testing.assert_array_equal(state.cov, cov)
     assert promote(state, table, rows, MsckfOptions(), PointNoise(0.14), gate).tolist() == rows.tolist()

@@ -6,9 +6,10 @@ import numpy as np
 
 from vioframe.arrays import Float, Int
 
-# Times the least noise that is begun with and that is counted with at most. With little at first, a filter that was too
-# sure of its first second stays so, and a robust loss does not find that a calibration is off.
-_AT_FIRST, _AT_MOST = 5.0, 12.0
+# The noise that is begun with, px, where the least is less, and most of it, were it white. With little at first, a
+# filter that was too sure of its first second stays so, and a robust loss does not find that a calibration is off; with
+# too much later on, images that contradict the readings pass for noisy ones.
+_AT_FIRST_PX, _AT_MOST_PX = 1.0, 1.6
 # How many tracks it is found by.
 _REMEMBERED = 100
 # Views from which on a track tells how its errors last: of fewer its landmark leaves nothing.
@@ -29,7 +30,7 @@ class PointNoise:
 
     def begin(self) -> None:
         """Forget what was found; of a body at rest it says little about the flight to come."""
-        self.px, self._ratio = _AT_FIRST * self._least_px, 1.0
+        self.px, self._ratio = max(_AT_FIRST_PX, self._least_px), 1.0
 
     @property
     def lasting_px(self) -> float:
@@ -53,4 +54,4 @@ class PointNoise:
             excess = float(np.median(squares[found] / (dof - 2.0 / 3.0)))
             share = len(dof) / (len(dof) + _REMEMBERED)
             px = self.px * (excess * self._ratio**2) ** (0.5 * share)
-            self.px = min(max(px, self._least_px), _AT_MOST * self._least_px)
+            self.px = max(min(px, _AT_MOST_PX * self._ratio), self._least_px)
