@@ -384,8 +384,21 @@ def test_the_msckf_is_accurate_and_honest_and_not_without_first_estimates():
     assert sure["pose"].inside < 0.5
 
 
-def flown(seeds, duration_s=60.0, **options):
-    """What so many trials of the MSCKF say together, and their average NEES."""
-    part = PartConfig(name="msckf", options=options)
+@pytest.mark.very_slow
+def test_the_sliding_window_is_accurate_and_no_surer_than_it_may_be():
+    """It errs on the side of caution, by how it tells its prior of long tracks; to count them twice it must not."""
+    honest, nees = flown(12, "sliding_window")
+    assert sum(honest["failures"].values()) == 0
+    assert honest["resets"] == 0
+    assert honest["completion"] == 1.0
+    assert honest["orientation_deg"] <= 0.3
+    assert honest["percent"] <= 0.05
+    for each in nees.values():
+        assert 0.4 <= each.per_axis <= 1.3
+
+
+def flown(seeds, backend="msckf", duration_s=60.0, **options):
+    """What so many trials say together, and their average NEES."""
+    part = PartConfig(name=backend, options=options)
     trials = map_in_processes(partial(fly, Setup(duration_s=duration_s), part), range(seeds), usable_cores())
     return over_trials(pd.DataFrame([t.to_dict() for t in trials])), average_nees([t.nees_over_time() for t in trials])
