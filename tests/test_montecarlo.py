@@ -366,9 +366,7 @@ def test_ctrl_c_ends_all_processes_and_leaves_nothing(parts, tmp_path):
 def test_the_msckf_is_accurate_and_honest_and_not_without_first_estimates():
     """25 flights of 60 s at EuRoC's noise, with its own initialisation and its defaults: every figure promised."""
     honest, nees = flown(25)
-    assert sum(honest["failures"].values()) == 0
-    assert honest["resets"] == 0
-    assert honest["completion"] == 1.0
+    assert_came_through(honest)
     assert honest["orientation_deg"] <= 0.4
     assert honest["percent"] <= 0.25
     for each in nees.values():
@@ -388,13 +386,17 @@ def test_the_msckf_is_accurate_and_honest_and_not_without_first_estimates():
 def test_the_sliding_window_is_accurate_and_no_surer_than_it_may_be():
     """It errs on the side of caution, by how it tells its prior of long tracks; to count them twice it must not."""
     honest, nees = flown(12, "sliding_window")
-    assert sum(honest["failures"].values()) == 0
-    assert honest["resets"] == 0
-    assert honest["completion"] == 1.0
-    assert honest["orientation_deg"] <= 0.3
-    assert honest["percent"] <= 0.05
+    assert_came_through(honest)
+    assert honest["orientation_deg"] <= 0.25
+    assert honest["percent"] <= 0.04
     for each in nees.values():
         assert 0.4 <= each.per_axis <= 1.3
+
+
+def assert_came_through(summary):
+    assert sum(summary["failures"].values()) == 0
+    assert summary["resets"] == 0
+    assert summary["completion"] == 1.0
 
 
 def flown(seeds, backend="msckf", duration_s=60.0, **options):

@@ -267,8 +267,8 @@ class Window:
     def marginalise_oldest(self) -> None:
         """Turn what the oldest state and the landmarks it hosts say about the rest into the prior, and let go of it.
 
-        Landmarks that are still in sight move to the next frame that saw them, and tell of each sighting a share: the
-        same each time until its frame goes, so that all of it has been told by then, once. The others tell the rest.
+        Landmarks that are still in sight move to the next frame that saw them, and tell a share of each sighting: an
+        equal one each time until its frame goes, by when it has been told once. The others tell all that is untold.
         """
         tracks = self.tracks
         rows = np.flatnonzero(tracks.known & (tracks.hosts < tracks.cameras))

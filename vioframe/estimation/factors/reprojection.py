@@ -116,8 +116,8 @@ class Sightings(NamedTuple):
 
     ``seen`` (L, V); ``xy`` (L, V, 2) on the z = 1 plane, and how they move there, ``velocity`` (L, V, 2) 1/s.
     ``to_px`` (L, V, 2, 2) turns residuals into pixels, in which ``sigma`` is the standard deviation; ``cauchy`` is the
-    scale of the robust loss, in standard deviations, and ``share`` (L, V) how much of it counts. Residuals are on the
-    plane, or on the unit sphere.
+    scale of the robust loss, in standard deviations, and ``share`` (L, V) how much of each sighting counts. Residuals
+    are on the plane, or on the unit sphere.
     """
 
     seen: Bool

@@ -96,7 +96,7 @@ class LandmarkTable(TrackTable):
     ``landmarks`` (F, 3) are [x y rho]: the point on the z = 1 plane of the track's host, the first that sees it,
     and the inverse depth there, 1/m (Civera, Davison, Montiel, "Inverse Depth Parametrization for Monocular SLAM",
     T-RO 2008). They mean something where ``known`` (F,). ``to_px`` (F, V, 2, 2) are the pixels by residual of each
-    sighting, and ``untold`` (F, V) is the share of it that the prior does not know yet.
+    sighting, and ``untold`` (F, V) is the share of each that the prior does not know yet.
     """
 
     _by_track = ("ids", "landmarks", "known")

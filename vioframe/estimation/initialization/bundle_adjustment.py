@@ -76,8 +76,8 @@ def adjustment(
     lens = Lens(True, by_intrinsics, np.tile(np.stack(intrinsics), (len(gyro_B), 1)))
     velocity = image_velocities(x.states, x.cameras, gyro_B, at, depth)
     shutter = Shutter(True, row, *motion_in_body(x.states, gyro_B)) if rolling else GLOBAL_SHUTTER
-    sigma_px, every = PIXEL_SIGMA if sigma is None else sigma, np.ones(seen.shape)
-    sightings = Sightings(seen, every, xy, velocity, to_px, sigma_px, _CAUCHY, shutter=shutter, lens=lens)
+    sigma_px, share = PIXEL_SIGMA if sigma is None else sigma, np.ones(seen.shape)
+    sightings = Sightings(seen, share, xy, velocity, to_px, sigma_px, _CAUCHY, shutter=shutter, lens=lens)
     prior = _prior(x, 0, _HELD, Calibrated.of(*cameras), known)
     problem = Problem(prior, ImuFactors.stack(imu), {}, sightings, first_estimates=False)
     if sigma is None:
