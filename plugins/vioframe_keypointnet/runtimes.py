@@ -68,6 +68,8 @@ def _by_openvino(weights: Weights, descriptors: bool, int8: bool, threads: int) 
     """OpenVINO's graph on a CPU, compiled for each size of image when the first comes."""
     core, see = import_openvino().Core(), Eye(weights.architecture, eight_bits=int8)
     settings: dict[str, Any] = {"INFERENCE_PRECISION_HINT": "f32", "PERFORMANCE_HINT": "LATENCY"}
+    # It would wait for one core while the back-end is on that, though the other is free.
+    settings["ENABLE_CPU_PINNING"] = False
     # A small network is through before a second thread would pay, and the other core has a back-end to run.
     if threads := threads or int(weights.architecture.peaks):
         settings["INFERENCE_NUM_THREADS"] = threads
