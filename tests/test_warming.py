@@ -56,7 +56,7 @@ def test_what_a_thread_computes_is_counted_without_compiling():
 @pytest.mark.parametrize("compiled", [True, False])
 def test_a_start_is_loaded_meanwhile_where_that_is_not_to_compile(monkeypatch, compiled):
     loaded = []
-    monkeypatch.setattr("vioframe.jit.have_been_compiled", lambda: compiled)
+    monkeypatch.setattr("vioframe.jit.have_been_compiled", lambda module: compiled)
     monkeypatch.setattr("vioframe.estimation.initialization.warm_up", loaded.append)
     assert list(loading_meanwhile([1, 2, 3], CALIBRATION.with_camera(0, rotation_known=False))) == [1, 2, 3]
     assert [calibration.cameras[0].rotation_known for calibration in loaded] == [True] * compiled

@@ -17,7 +17,7 @@ from typing import IO
 
 from vioframe.cores import limited_threads, usable_cores
 from vioframe.errors import VioframeError
-from vioframe.frontend import Frontend, warming
+from vioframe.frontend import Frontend, lucas_kanade, warming
 from vioframe.frontend_process import FRAMES_AHEAD, Compiling, Done, Failed, Incident, Job, Setup, put
 from vioframe.incidents import Incidents
 from vioframe.jit import have_been_compiled, heard
@@ -44,7 +44,7 @@ def serve(memory: int) -> None:
 
     with suppress(EOFError, BrokenPipeError), limited_threads(opencv=usable_cores() - 1), heard(compiling):
         try:
-            if have_been_compiled():  # else the first frame needs but some of them
+            if have_been_compiled(lucas_kanade):  # else the first frame needs but some of them
                 warming.load_kernels()  # while the other process is busy with itself
             setup = pickle.load(source)
             _follow(setup, SharedImages(memory, setup.calibration, FRAMES_AHEAD), incidents, source, answers)

@@ -21,12 +21,15 @@ from contextlib import contextmanager, suppress
 from functools import cache, partial
 from pathlib import Path
 from time import perf_counter, thread_time
-from typing import Any, TypeVar, cast, overload
+from types import ModuleType
+from typing import IO, Any, TypeVar, cast, overload
 
 import numba
 from numba.core import event
 from numba.core.caching import FunctionCache
 from numba.core.runtime.nrt import rtsys
+
+from vioframe.locks import locked
 
 FunctionT = TypeVar("FunctionT", bound=Callable[..., object])
 
@@ -69,19 +72,62 @@ def _compiled(function: FunctionT, reorder_sums: bool, inlined: bool) -> Functio
     )
     try:
         compiled = compile_lazily(function)
-        compiled._cache = _Cache(function)  # type: ignore[no-untyped-call]  # where ``cache=True`` would put numba's own
+        compiled._cache = _Cache(function)  # where ``cache=True`` would put numba's own
         return cast(FunctionT, compiled)
     finally:
         settings.CACHE_DIR = before
 
 
 class _Cache(FunctionCache):
-    """numba's own, but what is loaded is not preceded by all that compiling needs: 0.1 s before anything else."""
+    """numba's own, with two differences.
+
+    What is loaded is not preceded by all that compiling needs: 0.1 s before anything else. And of the processes that
+    need what is nowhere yet, one compiles it, while the others wait and load it.
+    """
+
+    def __init__(self, function: Callable[..., object]) -> None:
+        super().__init__(function)  # type: ignore[no-untyped-call]
+        self._lock: IO[str] | None = None
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         rtsys.initialize(target_context)  # arrays are allocated by it
+        found = self._found(sig, target_context)
+        if found is None and self._lock is None:
+            # What it calls is compiled within, never the other way round: nobody waits for one who waits for him.
+            with suppress(OSError):  # a folder that cannot be written to takes no kernels either
+                self._lock = locked(Path(f"{self._cache_file._index_path}.lock"), wait=True)
+            _locking.caches.add(self)
+            found = self._found(sig, target_context)
+            if found is not None:
+                self.unlock()
+        return found
+
+    def save_overload(self, sig: Any, data: Any) -> None:
+        super().save_overload(sig, data)  # type: ignore[no-untyped-call]
+        self.unlock()
+
+    def unlock(self) -> None:
+        """Others may look whether it is there, or compile it."""
+        _locking.caches.discard(self)
+        if self._lock is not None:
+            self._lock.close()
+            self._lock = None
+
+    def is_filled(self) -> bool:
+        """Whether something lies in it."""
+        return Path(self._cache_file._index_path).exists()
+
+    def _found(self, sig: Any, target_context: Any) -> Any:
         with self._guard_against_spurious_io_errors():
             return self._load_overload(sig, target_context)  # type: ignore[no-untyped-call]
+
+
+class _Locking(threading.local):
+    def __init__(self) -> None:
+        self.caches = set[_Cache]()
+
+
+_locking = _Locking()
 
 
 @contextmanager
@@ -128,6 +174,8 @@ class _Waiting(event.Listener):
             thread.seconds = {clock: self.seconds(clock) + clock() - begin_s for clock, begin_s in ends_s}
             if thread.collected:
                 gc.enable()
+            for left in tuple(_locking.caches):  # what could not be compiled
+                left.unlock()
 
     def seconds(self, clock: Callable[[], float]) -> float:
         waited: dict[Callable[[], float], float] = getattr(self._thread, "seconds", {})
@@ -138,10 +186,11 @@ _waiting = _Waiting()
 event.register("numba:compiler_lock", _waiting)  # type: ignore[no-untyped-call]
 
 
-def have_been_compiled() -> bool:
-    """Whether vioframe's kernels lie in the cache, some of them at least: then what is loaded ahead costs little."""
-    settings: Any = numba.config
-    return any((_folder(settings.CACHE_DIR) / _fingerprint(_PACKAGE)).rglob("*.nbc"))
+def have_been_compiled(module: ModuleType) -> bool:
+    """Whether all kernels of ``module`` lie in the cache: then to load them costs little."""
+    own = [each for each in vars(module).values() if getattr(each, "__module__", None) == module.__name__]
+    kernels = [each for each in own if isinstance(getattr(each, "_cache", None), _Cache)]
+    return all(each._cache.is_filled() for each in kernels if each.targetoptions["inline"] == "never")
 
 
 def waited_s(clock: Callable[[], float] = perf_counter) -> float:

@@ -11,6 +11,7 @@ from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -18,6 +19,8 @@ from vioframe import jit
 from vioframe.cores import limited_threads, usable_cores
 from vioframe.errors import DivergedError
 from vioframe.estimation import initialization
+from vioframe.estimation.factors import problem
+from vioframe.estimation.initialization import closed_form
 from vioframe.estimation.standstill import common_motion_px
 from vioframe.frontend.warming import load_kernels
 from vioframe.interfaces import Backend
@@ -38,25 +41,29 @@ from vioframe.types import (
 
 # The flight that compiles everything: frames, and how far the camera moves between two.
 _FRAMES, _PERIOD_NS, _STEP_M = 30, NS_PER_S // 10, 0.2
+# What it takes first and last.
+_OF_A_START = closed_form, problem
 
 
-def warm_up(backend: Backend, calibration: Calibration) -> None:
+def warm_up(backend: Backend, calibration: Calibration, *, start_first: bool = True) -> None:
     """Come once through all that is compiled for ``backend`` and its starts, or load it.
 
-    ``backend`` is of no use afterwards; it may find its flight too odd to follow.
+    What a start needs is ``start_first``, as it is in flight; who helps begins at the other end. ``backend`` is of no
+    use afterwards; it may find its flight too odd to follow.
     """
     calibration = _with_rotation(calibration)
+    steps = [partial(initialization.warm_up, calibration), partial(_fly_along_a_wall, backend, calibration)]
     with limited_threads():
-        with suppress(DivergedError, np.linalg.LinAlgError):
-            _fly_along_a_wall(backend, calibration)
-        initialization.warm_up(calibration)
+        for step in steps if start_first else reversed(steps):
+            with suppress(DivergedError, np.linalg.LinAlgError):
+                step()
 
 
 @contextmanager
 def helped(backend: str) -> Iterator[None]:
     """Within it, from the first kernel that has to be compiled on, another process compiles those of ``backend``.
 
-    It begins with those that points are followed by, at the other end; what is needed next then lies in the cache.
+    It begins with those that points are followed by, at the other end, and with what comes after a start.
     """
     helpers: list[subprocess.Popen[bytes]] = []
 
@@ -82,7 +89,7 @@ def loading_meanwhile(packets: Iterable[Packet], calibration: Calibration) -> It
     """
     with ThreadPoolExecutor(1, "loader") as thread:
         for number, packet in enumerate(packets):
-            if number == 0 and jit.have_been_compiled():
+            if number == 0 and all(map(jit.have_been_compiled, _OF_A_START)):
                 thread.submit(_load_start, _with_rotation(calibration))  # what fails here fails in its turn
             yield packet
 
@@ -133,4 +140,5 @@ def _fly_along_a_wall(backend: Backend, calibration: Calibration) -> None:
 
 if __name__ == "__main__":
     load_kernels()
-    warm_up(registry.load().create_backend(sys.argv[1], {}), packaged_calibration("euroc", cameras=["cam0"]))
+    found = registry.load().create_backend(sys.argv[1], {})
+    warm_up(found, packaged_calibration("euroc", cameras=["cam0"]), start_first=False)

@@ -14,6 +14,7 @@ from vioframe.bench.suites.suite import Suite
 from vioframe.errors import RunError
 from vioframe.io.calibration import CALIBRATION_FILES, sidecar_folder
 from vioframe.io.replace import remove_written
+from vioframe.locks import locked
 from vioframe.parts.config import read_tree, to_yaml
 from vioframe.runs.recorder import write_whole
 from vioframe.runs.results import RESULT_FILES, RUNS_FOLDER, SUITE_FILE, Row, read_rows, write_rows
@@ -111,16 +112,10 @@ class Store:
 
 @contextmanager
 def _locked(folder: Path) -> Iterator[None]:
-    """Hold ``folder`` for this process; the system lets go of it when the process ends, however it does."""
+    """Hold ``folder`` for this process."""
     try:
-        import fcntl
-    except ImportError:  # not on Windows
-        yield
-        return
-    folder.mkdir(parents=True, exist_ok=True)
-    with (folder / ".lock").open("w") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise RunError(f"another sweep is at work in {folder}; wait for it, or choose another --out") from None
+        file = locked(folder / ".lock", wait=False)
+    except BlockingIOError:
+        raise RunError(f"another sweep is at work in {folder}; wait for it, or choose another --out") from None
+    with file:
         yield
