@@ -86,6 +86,7 @@ class Window:
         self._options = options
         self._focal_px = np.array([camera.model.focal_px for camera in calibration.cameras])
         self.point_noise = PointNoise(options.pixel_sigma)
+        self._worth = worth_of_weights(options.cauchy_sigmas)
         self._t_ns = [state.t_ns]
         self._states = StateArrays.stack([state])
         self._gyro_B = start.imu.gyro_B[-1:]
@@ -269,13 +270,15 @@ class Window:
 
         Landmarks that are still in sight move to the next frame that saw them, and tell a share of each sighting: an
         equal one each time until its frame goes, by when it has been told once. The others tell all that is untold.
+        Each counts for what the estimate knows by it, which is more than its weight.
         """
         tracks = self.tracks
         rows = np.flatnonzero(tracks.known & (tracks.hosts < tracks.cameras))
         told, stays = tracks.untold[rows], tracks.in_sight()[rows]
         told[stays] /= 1.0 + np.arange(tracks.seen.shape[1]) // tracks.cameras
         still = {k: still for k, still in self._still.items() if k == 0}
-        problem = self._problem(self._readings[:1], still, self._sightings(rows)._replace(share=told))
+        sightings = self._sightings(rows)._replace(share=self._worth * told)
+        problem = self._problem(self._readings[:1], still, sightings)
         self._prior = marginalise_oldest(problem, self._variables(rows))
         tracks.untold[rows] -= told
         staying = rows[stays]
@@ -360,6 +363,18 @@ def _calibrated(options: SlidingWindowOptions) -> Bool:
     out[:OFFSET], out[OFFSET] = options.calibrate_extrinsics, options.calibrate_time_offset
     out[READOUT], out[INTRINSICS] = True, options.calibrate_intrinsics
     return out
+
+
+def worth_of_weights(cauchy: float) -> float:
+    """What an estimate by Cauchy's loss at ``cauchy`` standard deviations is worth, over what its weights add up to.
+
+    They are w = 1 / (1 + x / cauchy^2), x being the squared length of a residual of two entries. The loss has the
+    curvature E[w^2] on average and its gradient the variance E[x w^2] / 2, where Gauss-Newton's matrix has E[w].
+    """
+    n = 10_000
+    x = -2.0 * np.log1p(-(np.arange(n) + 0.5) / n)  # equally likely values
+    w = 1.0 / (1.0 + x / cauchy**2)
+    return float((w**2).mean() ** 2 / (0.5 * (x * w**2).mean() * w.mean()))
 
 
 def parallax(tracks: TrackTable, R_WC: Float, focal_px: Float) -> tuple[int, float]:
