@@ -383,14 +383,14 @@ def test_the_msckf_is_accurate_and_honest_and_not_without_first_estimates():
 
 
 @pytest.mark.very_slow
-def test_the_sliding_window_is_accurate_and_no_surer_than_it_may_be():
-    """It errs on the side of caution, by how it tells its prior of long tracks; to count them twice it must not."""
+def test_the_sliding_window_is_accurate_and_honest():
+    """On the side of caution, by how it tells its prior of long tracks; to count them twice it must not."""
     honest, nees = flown(12, "sliding_window")
     assert_came_through(honest)
     assert honest["orientation_deg"] <= 0.25
     assert honest["percent"] <= 0.04
     for each in nees.values():
-        assert 0.4 <= each.per_axis <= 1.3
+        assert 0.6 <= each.per_axis <= 1.3
 
 
 def assert_came_through(summary):
