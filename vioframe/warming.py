@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import replace
@@ -41,7 +41,7 @@ from vioframe.types import (
 
 # The flight that compiles everything: frames, and how far the camera moves between two.
 _FRAMES, _PERIOD_NS, _STEP_M = 30, NS_PER_S // 10, 0.2
-# What it takes first and last.
+# Where the kernels lie that a start takes first and last.
 _OF_A_START = closed_form, problem
 
 
@@ -52,11 +52,15 @@ def warm_up(backend: Backend, calibration: Calibration, *, start_first: bool = T
     use afterwards; it may find its flight too odd to follow.
     """
     calibration = _with_rotation(calibration)
-    steps = [partial(initialization.warm_up, calibration), partial(_fly_along_a_wall, backend, calibration)]
+
+    def fly() -> None:
+        with suppress(DivergedError, np.linalg.LinAlgError):
+            _fly_along_a_wall(backend, calibration)
+
+    steps: list[Callable[[], None]] = [partial(initialization.warm_up, calibration), fly]
     with limited_threads():
         for step in steps if start_first else reversed(steps):
-            with suppress(DivergedError, np.linalg.LinAlgError):
-                step()
+            step()
 
 
 @contextmanager
