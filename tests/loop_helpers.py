@@ -77,7 +77,7 @@ def _steps(
         image = np.clip(255.0 * light, 0.0, 255.0).astype(np.uint8)
         xy = cv2.goodFeaturesToTrack(image, _FEATURES, 0.01, 8).reshape(-1, 2).astype(np.float64)
         xy_normalised = CAMERA.model.undistort(xy)
-        depth, rays = _depths(scene, R_WC, p_WC, xy_normalised)
+        depth, rays = depths(scene, R_WC, p_WC, xy_normalised)
         # A landmark is known to a per cent of its distance.
         depth = depth * (1.0 + 0.01 * rng.standard_normal(len(depth)))
         p_WF = p_WC + depth[:, None] * rays
@@ -90,7 +90,8 @@ def _steps(
         yield Step(FrameSet(t_ns, (image,)), tracks, estimate, {})
 
 
-def _depths(scene: object, R_WC: Float, p_WC: Float, xy_normalised: Float) -> tuple[Float, Float]:
+def depths(scene: object, R_WC: Float, p_WC: Float, xy_normalised: Float) -> tuple[Float, Float]:
+    """(N,) how far along its ray (N, 3), of depth 1, each point ``xy_normalised`` (N, 2) of the z = 1 plane lies, m."""
     import open3d
 
     rays = np.column_stack([xy_normalised, np.ones(len(xy_normalised))]) @ R_WC.T

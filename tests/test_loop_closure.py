@@ -10,12 +10,13 @@ from time import sleep
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from loop_helpers import CALIBRATION, CAMERA, fly, hall, path_along, tiled_corridor
+from loop_helpers import CALIBRATION, CAMERA, depths, fly, hall, path_along, tiled_corridor
 from rendered_flight import rendered_flight
 
 from vioframe.cli import main
 from vioframe.evaluation import evaluate
 from vioframe.geometry import so3
+from vioframe.geometry.meshes import ray_scene
 from vioframe.geometry.so3 import rotation_z
 from vioframe.incidents import Incidents
 from vioframe.io.calibration import packaged_calibration
@@ -23,15 +24,16 @@ from vioframe.runs.evaluated import Evaluated
 from vioframe.runs.folder import RunFolder
 from vioframe.runs.recorder import Recorder
 from vioframe.simulation.config import RIGS
+from vioframe.simulation.renderer import Renderer
 from vioframe.testing import check_loop_closer
 from vioframe.types import CalibrationEstimate, CameraSigma, Estimate, FrameSet, FrameTracks, NavState, Status, Step
-from vioframe_pose_graph import vioframe_loop_closers
+from vioframe_pose_graph import verification, vioframe_loop_closers
 from vioframe_pose_graph.closer import PoseGraph
 from vioframe_pose_graph.consistency import agreed, measured
 from vioframe_pose_graph.corners import located
 from vioframe_pose_graph.keyframes import KeyframeSelector
 from vioframe_pose_graph.matching import DescriptorIndex, distance, match
-from vioframe_pose_graph.place import Place, View, image_angle_deg
+from vioframe_pose_graph.place import Place, View, corner_finder, image_angle_deg, peaks
 from vioframe_pose_graph.recognition import Recogniser
 from vioframe_pose_graph.verification import Correspondences, _refined, hypotheses, ransac, residuals, supported
 
@@ -108,15 +110,20 @@ def test_two_points_and_gravity_give_the_pose():
     assert ((np.where(np.isnan(errors), np.inf, errors).min(axis=1) < 1e-6) == rays_ahead).all()
 
 
-def two_views(rng, count=80, outliers=0.0):
-    """Points of both sides, seen by two cameras whose worlds are turned and shifted to one another."""
+def two_views(rng, count=80, outliers=0.0, tilt=(0.0, 0.0), depth_m=(4.0, 10.0)):
+    """Points of both sides, seen by two cameras whose worlds are turned and shifted to one another.
+
+    World B is out of the vertical by ``tilt`` rad about x and y, and turned by that about the camera, which both know.
+    """
     yaw, t = 0.3, np.array([1.0, -2.0, 0.5])
     look = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])  # level, along x
     R_A, p_A = look, np.array([0.0, 0.0, 0.0])
     R_B = rotation_z(-yaw) @ rotation_z(0.1) @ look
     p_B = rotation_z(yaw).T @ (np.array([0.5, 0.3, 0.1]) - t)
-    in_A = np.column_stack([rng.uniform(4.0, 10.0, count), rng.uniform(-3.0, 3.0, (count, 2))])
+    in_A = np.column_stack([rng.uniform(*depth_m, count), rng.uniform(-3.0, 3.0, (count, 2))])
     in_B = (in_A - t) @ rotation_z(yaw)
+    leaning = so3.exp(np.append(tilt, 0.0))
+    R_B, in_B = leaning @ R_B, p_B + (in_B - p_B) @ leaning.T
     half = count // 2
     points = np.concatenate([in_B[:half], in_A[half:]])
     seen_A = (in_A[:half] - p_A) @ R_A
@@ -197,6 +204,89 @@ def test_points_of_uncertain_depth_tell_what_they_can():
     assert np.median(off) < 0.01
 
 
+def fitted(seen, yaw, t):
+    """How far the fit puts the later camera from where it is, m."""
+    p_A, p_B = seen.p_WC
+    found = _refined(seen, rotation_z(np.array(yaw)), t, p_A, p_B, 3.0 / 460.0, 25)
+    return np.linalg.norm(found.z - (rotation_z(np.array(yaw)) @ p_B + t - p_A))
+
+
+def noisy(seen, rng, sigma_px=0.2):
+    return replace(seen, xy=seen.xy + sigma_px / 460.0 * rng.standard_normal(seen.xy.shape))
+
+
+def errors_of_fits(monkeypatch, draw, **constants):
+    """The median error of fits to what ``draw`` draws, as they are and with other ``constants``, of the same draws."""
+    both = []
+    for changed in ({}, constants):
+        rng = np.random.default_rng(11)
+        with monkeypatch.context() as patched:
+            for name, value in changed.items():
+                patched.setattr(verification, name, value)
+            both.append(np.median([fitted(*draw(rng)) for _ in range(60)]))
+    return both
+
+
+def test_matches_beside_their_point_hardly_move_the_fit(monkeypatch):
+    """A fifth of the points is seen 2.5 px beside where it is, all on one side: least squares follow them."""
+
+    def draw(rng):
+        seen, yaw, t, _ = two_views(rng)
+        beside = rng.random(len(seen.xy)) < 0.2
+        return noisy(replace(seen, xy=seen.xy + np.outer(beside, [2.5 / 460.0, 0.0])), rng), yaw, t
+
+    robust, least_squares = errors_of_fits(monkeypatch, draw, _HEAVY=1e9)
+    assert robust < 0.6 * least_squares
+
+
+def test_attitudes_that_agree_tell_what_points_in_one_plane_do_not(monkeypatch):
+    """Of a wall ahead, whether the camera is beside it or turned is told by a few of its points only."""
+
+    def draw(rng):
+        seen, yaw, t, _ = two_views(rng, depth_m=(6.0, 6.2))
+        return noisy(seen, rng), yaw, t
+
+    held, free = errors_of_fits(monkeypatch, draw, _TILT_SIGMA=np.radians(0.5))
+    assert held < 0.7 * free
+
+
+def test_attitudes_that_disagree_yield_to_the_points(monkeypatch):
+    """By half a degree, far more than a good odometry's do; held to what those keep, the fit would be pulled along."""
+
+    def draw(rng):
+        seen, yaw, t, _ = two_views(rng, tilt=np.radians([0.5, -0.4]))
+        return noisy(seen, rng), yaw, t
+
+    yielding, held = errors_of_fits(monkeypatch, draw, _weight=lambda squared: np.ones(np.shape(squared)))
+    assert yielding < 0.5 * held
+
+
+def test_a_corner_is_found_again_to_parts_of_a_pixel():
+    """A hall seen from 40 cm beside, against where exact geometry has its corners."""
+    truth = path_along(np.array([[0.0, 0.0, 0.0], [0.0, 0.4, 0.0]]), np.zeros(2))
+    world, model = hall(truth, 3), CAMERA.model
+    renderer, scene, orb = Renderer(model, world), ray_scene(world.mesh.corners), corner_finder(600)
+    R_WC, p_WC = truth.R_WB @ CAMERA.R_BC, truth.p_WB + truth.R_WB @ CAMERA.p_BC
+    found, placed, looks = [], [], []
+    for R, p in zip(R_WC, p_WC, strict=True):
+        image = np.clip(255.0 * renderer.render(R, p), 0.0, 255.0).astype(np.uint8)
+        corners, descriptors = orb.compute(image, orb.detect(image))
+        looks.append(descriptors.view(np.uint64))
+        found.append(np.array([corner.pt for corner in corners]))
+        placed.append(peaks(image, found[-1], np.array([corner.octave for corner in corners])))
+    matches = match(looks[0], looks[1], found[1], 48, 0.85, 10.0)
+    matched = np.flatnonzero(matches >= 0)
+    off = []
+    for first, second in (found, placed):
+        depth, rays = depths(scene, R_WC[0], p_WC[0], model.undistort(first[matched]))
+        seen = (p_WC[0] + depth[:, None] * rays - p_WC[1]) @ R_WC[1]
+        again = model.project(seen)
+        off.append(np.median(np.linalg.norm(again - second[matches[matched]], axis=1)))
+    assert len(matched) > 60
+    assert off[1] < 0.6
+    assert off[1] < 0.6 * off[0]
+
+
 def test_descriptors_turn_with_the_camera():
     """Rolled by 40 degrees, the direction that stands for down is turned by that in the image."""
     level = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
@@ -239,7 +329,8 @@ def test_corners_are_where_the_keyframes_before_saw_them_whatever_the_odometry_s
     off = (far / true - 1.0)[found[60:]]
     # The way that the odometry has strayed by is a sixth of what it has gone.
     assert abs(off.mean()) < 0.02
-    assert 0.6 < np.sqrt(np.mean((off / corners.depth_sigma[60:][found[60:]]) ** 2)) < 1.4
+    # Where the keyframes before were is not known exactly, either.
+    assert 0.8 < np.sqrt(np.mean((off / corners.depth_sigma[60:][found[60:]]) ** 2)) < 1.6
 
 
 def test_what_is_no_corner_gets_no_position():
@@ -307,11 +398,11 @@ def test_places_seen_again_take_out_the_drift(revisit):
     way = np.linalg.norm(truth.p_WB[j] - truth.p_WB[i], axis=1)
     off = np.abs(np.linalg.norm([loop.p_L for loop in accepted], axis=1) - way)
     turned = np.degrees(np.abs([loop.yaw for loop in accepted]))  # the path is flown without turning
-    assert np.mean((off < 0.1) & (turned < 0.5)) > 0.9
-    assert np.median(off) < 0.03
-    assert off.max() < 0.15
-    assert np.median(turned) < 0.15
-    assert turned.max() < 1.5
+    assert np.mean((off < 0.05) & (turned < 0.2)) > 0.8
+    assert np.median(off) < 0.01
+    assert off.max() < 0.1
+    assert np.median(turned) < 0.06
+    assert turned.max() < 0.8
     before, after = evaluate(revisit.odometry, truth), evaluate(closure.trajectory, truth)
     assert after.ate_m.rmse < 0.3 * before.ate_m.rmse
     ends = [
@@ -337,11 +428,15 @@ def test_the_drift_is_taken_out_while_flying(revisit):
     first = int(np.argmax(corrected))
     assert corrected[first:].all()
     assert 10.0 < (truth.t_ns[first] - truth.t_ns[0]) * 1e-9 < 30.0
+    turned = []
     for k in range(first, len(truth)):
         R_MW, p_MW = corrections[k].R_MW, corrections[k].p_MW
         R_MB, p_MB = R_MW @ odometry.R_WB[k], R_MW @ odometry.p_WB[k] + p_MW
         assert np.linalg.norm(p_MB - truth.p_WB[k]) < 0.75 * np.linalg.norm(odometry.p_WB[k] - truth.p_WB[k])
-        assert np.linalg.norm(so3.log(truth.R_WB[k].T @ R_MB)) < np.radians(0.7)
+        turned.append(np.degrees(np.linalg.norm(so3.log(truth.R_WB[k].T @ R_MB))))
+    # A loop from 4 m away that is wrong by as much as a degree and a half is believed until others contradict it.
+    assert np.mean(turned) < 0.5
+    assert max(turned) < 1.2
     assert np.linalg.norm(odometry.p_WB[-1] - truth.p_WB[-1]) > 0.6
     assert np.linalg.norm(p_MB - truth.p_WB[-1]) < 0.15
 

@@ -10,7 +10,7 @@ import pytest
 
 from vioframe.geometry.so3 import rotation_z
 from vioframe_pose_graph.closer import carry
-from vioframe_pose_graph.consistency import Odometry, corrected, measured
+from vioframe_pose_graph.consistency import _TIMES, Odometry, corrected, measured
 from vioframe_pose_graph.graph import Edges, mahalanobis_squared, residuals, solve, solve_robustly, uncertainty
 from vioframe_pose_graph.options import PoseGraphOptions
 from vioframe_pose_graph.recognition import Sighting
@@ -67,9 +67,9 @@ def test_a_loop_is_as_sure_as_its_fit_and_less_the_farther_its_views_are_apart()
         return np.sqrt(np.diag(loops.cov[0]))
 
     near, far = covariance(0.0, 0.0, 0.0), covariance(4.0, 0.0, 0.0)
-    np.testing.assert_allclose(near[:3], 0.005)
-    np.testing.assert_allclose(far[:3], np.hypot(0.005, 0.04))
-    np.testing.assert_allclose([near[3], far[3]], np.radians(0.1))
+    np.testing.assert_allclose(near[:3], 0.003)
+    np.testing.assert_allclose(far[:3], np.hypot(0.003, 0.04))
+    np.testing.assert_allclose([near[3], far[3]], np.radians(0.03))
     # The points of a fit are wrong together: it is off by more than it says.
     np.testing.assert_allclose(
         covariance(0.0, 0.03, 0.5), np.hypot(near, 2.0 * np.array([0.03] * 3 + [np.radians(0.5)]))
@@ -323,7 +323,7 @@ def test_the_odometry_drifts_by_what_its_back_end_says():
     # Which concerns the limit alone: what it says is what it says, and at least what the best drift by.
     np.testing.assert_array_equal(thrice.told, once.told)
     beside = np.diagonal(once.told - added, axis1=1, axis2=2)[1:]
-    np.testing.assert_allclose(beside, np.square([[0.003] * 3 + [np.radians(0.01)]]) * least_way(t_ns, p), atol=1e-12)
+    np.testing.assert_allclose(beside, np.square([[0.003] * 3 + [np.radians(0.003)]]) * least_way(t_ns, p), atol=1e-12)
     relative = claimed(p[10:31], added[10:31], np.zeros((4, 4)))[-1]
     np.testing.assert_allclose(once.cov(np.array([10]), np.array([30]))[0], relative, atol=1e-8)
 
@@ -354,15 +354,35 @@ def test_images_that_told_more_than_was_lost_take_no_drift_away():
     assert (np.trace(drift[[11, 14]] - walk[[11, 14]], axis1=1, axis2=2) > 0.0).all()
 
 
-def test_loops_count_as_a_quarter_of_what_they_would_if_their_points_were_not_the_same():
+def test_loops_count_as_an_eighth_of_what_they_would_if_their_points_were_not_the_same():
+    """All agree, and what Cauchy's distribution makes of four errors that are none is five times their mean weight."""
     t_ns, p, _ = circle(laps=2)
     odometry, yaw_error = drifted(p, np.random.default_rng(3))
     graph = Odometry.of(t_ns, odometry, np.zeros(len(p), int), OPTIONS)
     loops = true_loops(p, yaw_error, [(2, 42), (12, 52), (22, 62)], sigma=(0.3, 0.05))
-    quarter = graph.edges() + replace(loops, cov=4.0 * loops.cov)
-    path, _, believed = corrected(graph, loops, every(loops))
-    np.testing.assert_allclose(path, solve(odometry, np.zeros(len(p)), quarter)[0], atol=1e-4)
+    path, yaw, believed = corrected(graph, loops, every(loops))
+    left, _, _ = residuals(path, yaw, loops)
+    worth = 5.0 / (1.0 + np.sum(left**2, axis=1))
+    eighth = graph.as_told(_TIMES[0]).edges() + replace(loops, cov=(8.0 / worth)[:, None, None] * loops.cov)
+    np.testing.assert_allclose(path, solve(odometry, np.zeros(len(p)), eighth)[0], atol=1e-3)
     assert believed.all()
+
+
+def test_a_loop_that_is_far_off_counts_little():
+    """By four standard deviations, which no gate tells from chance: three others know better."""
+    t_ns, p, _ = circle(laps=2)
+    odometry, yaw_error = drifted(p, np.random.default_rng(3))
+    graph = Odometry.of(t_ns, odometry, np.zeros(len(p), int), OPTIONS)
+    right = true_loops(p, yaw_error, [(2, 42), (12, 52), (22, 62), (30, 70)], sigma=(0.1, 0.02))
+    z = right.z.copy()
+    z[3, 2] += 0.4
+    off = replace(right, z=z)
+    best = corrected(graph, right, every(right))[0]
+    path, _, believed = corrected(graph, off, every(off))
+    alike = graph.as_told(_TIMES[0]).edges() + replace(off, cov=8.0 / 5.0 * off.cov)
+    equal, _ = solve(odometry, np.zeros(len(p)), alike)
+    assert believed.all()
+    assert np.linalg.norm(path - best, axis=1).max() < 0.5 * np.linalg.norm(equal - best, axis=1).max()
 
 
 def flown(seed, sigma_m, sigma_yaw, said_m, said_yaw, loop_sigma):
@@ -376,7 +396,7 @@ def flown(seed, sigma_m, sigma_yaw, said_m, said_yaw, loop_sigma):
     step = np.diag(np.square([said_m, said_m, said_m, said_yaw]))
     cov = claimed(odometry, np.tile(step, (len(p), 1, 1)), 1e-6 * np.eye(4))
     graph = Odometry.of(t_ns, odometry, np.zeros(len(p), int), OPTIONS, cov)
-    loops = true_loops(p, yaw_error, [(i, i + 40) for i in range(1, 80, 8)], loop_sigma, rng)
+    loops = true_loops(p, yaw_error, [(i, i + 40) for i in range(1, 80, 2)], loop_sigma, rng)
     corrected_p, _, believed = corrected(graph, loops, every(loops))
     assert believed.all()
     return [np.sqrt(np.mean(np.sum((path - p) ** 2, axis=1))) for path in (odometry, corrected_p)]

@@ -18,7 +18,7 @@ import numpy as np
 from vioframe.arrays import Bool
 from vioframe.geometry.so3 import rotation_z
 from vioframe.types import NS_PER_S, Float, Int
-from vioframe_pose_graph.graph import GATE, Edges, mahalanobis_squared, solve, solve_robustly, wrapped
+from vioframe_pose_graph.graph import GATE, Edges, mahalanobis_squared, residuals, solve, solve_robustly, wrapped
 from vioframe_pose_graph.options import PoseGraphOptions
 from vioframe_pose_graph.recognition import Sighting
 
@@ -27,20 +27,22 @@ _SPAN = 4
 # Position also drifts where nothing moves, as far as it would along this many metres a second.
 _HOVERING_M_S = 0.1
 # As little as this an odometry drifts at best, whatever it says: x, y and z, m after 1 m, and yaw, rad after 1 s.
-_LEAST_DRIFT = np.array([0.003, 0.003, 0.003, np.radians(0.01)])
-# By how much more than an odometry says it drifts may be tried, up to a hundred times.
-_TIMES = 1.1 ** np.arange(50)
+_LEAST_DRIFT = np.array([0.003, 0.003, 0.003, np.radians(0.003)])
+# How many times as far as it says an odometry may have drifted. It may be less than once, as what images take away of
+# an error is not taken off what it says, and up to a hundred times where it claims too much.
+_TIMES = 0.7 * 1.1 ** np.arange(54)
 # Between two segments nothing is known but that the body cannot have gone far.
 _LOST_SPEED_M_S, _LOST_M, _LOST_YAW = 5.0, 5.0, 1.0
 REPEAT_NS = 3 * NS_PER_S
 """Within which another keyframe must say the same."""
-# Points seen to a pixel place a camera to millimetres; but the points themselves were placed by the odometry, whose
-# scale is off by a per cent, and what is wrong with them is wrong with many: a fit is off by twice what it says.
-# That is what the loops of MH_02, MH_03 and V1_01 show, rendered in worlds for tuning.
-_SIGMA_M, _SIGMA_PART, _SIGMA_YAW, _OF_FIT = 0.005, 0.01, np.radians(0.1), 2.0
-# What is wrong with the points is wrong, in part, with all loops by them: each counts as a quarter of one that knew
-# nothing of the others, with which the paths of those flights come out best.
-_SHARED = 4.0
+# Points seen to half a pixel place a camera to millimetres; but the points themselves were placed by the odometry, and
+# what is wrong with them is wrong with many: a fit is off by twice what it says, and by more the farther its views are
+# apart. That is what the loops of MH_02, MH_03 and V1_01 show, rendered in worlds for tuning.
+_SIGMA_M, _SIGMA_PART, _SIGMA_YAW, _OF_FIT = 0.003, 0.01, np.radians(0.03), 2.0
+# What is wrong with the points is wrong, in part, with all loops by them: each counts as an eighth of one that knew
+# nothing of the others. Most are far better than they may be, and some are not: they are off by Cauchy's distribution,
+# and the last solution is weighed anew as often. With both the paths of those flights come out best.
+_SHARED, _WEIGHED = 8.0, 4
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -156,8 +158,11 @@ def corrected(odometry: Odometry, loops: Edges, trusted: Bool) -> tuple[Float, F
     p, yaw, used = solve_robustly(odometry.p, odometry.edges(), loops, trusted)
     if used.any():
         believed = loops.select(used)
-        weighed = replace(believed, cov=_SHARED * believed.cov)
-        p, yaw = solve(p, yaw, _as_shown(odometry, believed).edges() + weighed)
+        edges, worth = _as_shown(odometry, believed).edges(), np.ones(len(believed))
+        for _ in range(_WEIGHED):
+            weighed = replace(believed, cov=(_SHARED / worth)[:, None, None] * believed.cov)
+            p, yaw = solve(p, yaw, edges + weighed)
+            worth = 5.0 / (1.0 + np.sum(residuals(p, yaw, believed)[0] ** 2, axis=1))  # Cauchy's of four
     return p, yaw, used
 
 

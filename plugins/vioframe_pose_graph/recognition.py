@@ -13,7 +13,7 @@ from vioframe_pose_graph.keyframes import Keyframe
 from vioframe_pose_graph.matching import DescriptorIndex
 from vioframe_pose_graph.options import PoseGraphOptions
 from vioframe_pose_graph.place import Float32, Place, View, corner_finder, describe
-from vioframe_pose_graph.verification import APART_PX, REPROJECTION_PX, Relation, relate
+from vioframe_pose_graph.verification import APART_PX, Relation, relate
 
 # Earlier places that each keyframe is compared with in detail: an aliased world has more than one that look alike.
 _MOST_CANDIDATES = 3
@@ -22,8 +22,9 @@ _NEIGHBOURS = 3
 # Enough points to know a place by; the tracked features come first.
 _ASKED = 300
 # Keyframes in which the corners of a new one are looked for, to know where they are.
-_LOOKED_BACK = 2
-_SIGMA_PX = 0.5 * REPROJECTION_PX
+_LOOKED_BACK = 4
+# To which corners are found again, and landmarks lie where a keyframe saw them.
+_SIGMA_PX = 0.5
 # Places whose looks are remembered: some 80 kB each.
 _MOST_REMEMBERED = 2000
 

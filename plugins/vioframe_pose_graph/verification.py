@@ -30,8 +30,10 @@ _HYPOTHESES = 300
 _COARSE = 2.0
 # As many standard deviations of where a point is seen are tolerated.
 _TOLERATED = 3.0
-_TILT_SIGMA, _MAX_TILT = np.radians(0.5), np.radians(2.0)
-_LEAST_SIGMA = 0.2
+_TILT_SIGMA, _MAX_TILT = np.radians(0.03), np.radians(2.0)
+_LEAST_SIGMA = 0.1
+# Degrees of freedom of Student's t, by which points and tilt are off.
+_HEAVY = 4.0
 _ITERATIONS, _CONVERGED = 10, 1e-4
 _PARALLEL = 1e-6
 
@@ -147,12 +149,15 @@ def _shortened(values: Float, along: Float, sigma: float) -> Float:
 def _refined(
     seen: Correspondences, R_AB: Float, t: Float, p_A: Float, p_B: Float, tolerance: float, min_inliers: int
 ) -> Relation | None:
-    """Iterate to the least-squares fit of what lies within ``tolerance``, which is decided anew each time.
+    """Iterate to the likeliest fit of what lies within ``tolerance``, which is decided anew each time.
 
     The tilt is free within what two attitudes of an odometry may disagree: forced to zero, half a degree of it would
-    become several centimetres of position, as the points are metres away. How far away is known to some per cent, so a
-    point counts less along the line on which a wrong depth would move it: the farther the two cameras are apart, the
-    more.
+    become several centimetres of position, as the points are metres away. A good odometry's agree to hundredths of a
+    degree, and then the points need not say it. So points and tilt are off by Student's t: what most of them are off by
+    weighs, and what is off by much more hardly (Lange, Little, Taylor, JASA 1989).
+
+    How far away a point is is known to some per cent, so it counts less along the line on which a wrong depth would
+    move it: the farther the two cameras are apart, the more.
     """
     p_AB, sigma = R_AB @ p_B + t, tolerance / _TOLERATED
     for _ in range(_ITERATIONS):
@@ -162,12 +167,15 @@ def _refined(
         if inlier.sum() < min_inliers:
             return None
         white = _shortened(np.concatenate([r[:, :, None], J], axis=2)[inlier], along[inlier], sigma)
-        sigma = max(float(np.sqrt(np.mean(white[:, :, 0] ** 2))), _LEAST_SIGMA * tolerance)
+        squared = np.sum(white[:, :, 0] ** 2, axis=1)
+        sigma = max(float(np.sqrt(np.mean(_weight(squared / sigma**2) * squared) / 2.0)), _LEAST_SIGMA * tolerance)
+        white *= np.sqrt(_weight(squared / sigma**2))[:, None, None] / sigma
         tilt = so3.log(R_AB @ rotation_z(yaw_of(R_AB)).T)[:2]
-        J_in = white[:, :, 1:].reshape(-1, 6) / sigma
-        H, g = J_in.T @ J_in, J_in.T @ white[:, :, 0].ravel() / sigma
-        H[[3, 4], [3, 4]] += 1.0 / _TILT_SIGMA**2
-        g[3:5] += tilt / _TILT_SIGMA**2
+        J_in = white[:, :, 1:].reshape(-1, 6)
+        H, g = J_in.T @ J_in, J_in.T @ white[:, :, 0].ravel()
+        upright = _weight(tilt @ tilt / _TILT_SIGMA**2) / _TILT_SIGMA**2
+        H[[3, 4], [3, 4]] += upright
+        g[3:5] += upright * tilt
         step = np.linalg.solve(H, -g)
         p_AB, R_AB = p_AB + step[:3], so3.exp(step[3:]) @ R_AB
         if np.abs(step).max() < _CONVERGED:
@@ -176,8 +184,13 @@ def _refined(
     if supporting < min_inliers or np.linalg.norm(tilt) > _MAX_TILT:
         return None
     which = [0, 1, 2, 5]
-    cov: Float = np.linalg.inv(H)[np.ix_(which, which)].astype(np.float64, copy=False)
-    return Relation(p_AB - p_A, float(yaw_of(R_AB)), cov, supporting)
+    cov = np.linalg.inv(H)[np.ix_(which, which)] * (_HEAVY + 4.0) / (_HEAVY + 2.0)  # weights say more than t does
+    return Relation(p_AB - p_A, float(yaw_of(R_AB)), cov.astype(np.float64, copy=False), supporting)
+
+
+def _weight(squared: Float) -> Float:
+    """What two errors count for by Student's t that are together ``squared`` (...,) variances off."""
+    return np.asarray((_HEAVY + 2.0) / (_HEAVY + squared))
 
 
 def hypotheses(p_1: Float, p_2: Float, ray_1: Float, ray_2: Float, centre: Float) -> tuple[Float, Float]:
