@@ -204,6 +204,20 @@ def test_the_window_fills_and_never_exceeds_its_size(size):
     assert min(sizes[-20:]) == size
 
 
+def test_cameras_that_take_turns_have_as_many_frames_each():
+    """Else they would share a window, and it would reach back half as far; one that falls silent leaves no room."""
+    size, turns = 4, 80
+    sequence = simulated_sequence("figure_eight", seed=1, duration_s=7.0, calibration=packaged_calibration("euroc"))
+    backend = SlidingWindow(Options(window_size=size))
+    life = LifeCycle(backend, sequence.calibration, initial_state=drawn_start(sequence, 1, 1))
+    sizes = []
+    for k, (imu, tracks) in enumerate(sequence.packets[1:]):
+        life.process(imu, tracks.of_camera(k % 2 if k < turns else 0))
+        sizes.append(len(backend.window))
+    assert max(sizes) == sizes[turns - 1] == 2 * size + 1
+    assert max(sizes[-20:]) == size + 1
+
+
 def test_frames_are_optimised_at_a_rate_and_predicted_between():
     sequence = simulated_sequence("figure_eight", seed=1, duration_s=3.0)
     for rate_hz, every in ((20.0, 1), (10.0, 2), (5.0, 4), (100.0, 1)):

@@ -79,7 +79,7 @@ class SlidingWindow:
         self._check_jump(predicted, newest)
         is_keyframe = not still and window.choose_keyframe()
         corrected = window.in_sight >= _MIN_LANDMARKS or still
-        if window.is_full:
+        while window.is_full:
             window.marginalise_oldest()
         watch.lap("marginalise")
         return Estimate(

@@ -11,7 +11,7 @@ class SlidingWindowOptions:
     """Defaults follow VINS-Mono's published settings for EuRoC where they serve."""
 
     window_size: Annotated[int, Field(ge=3)] = 10
-    """Keyframes in the window beside the newest frame."""
+    """Keyframes in the window beside the newest frame, of each camera where they take turns."""
     max_rate_hz: PositiveFloat = 10.0
     """Frames that are optimised a second, at most; those between are predicted from the readings."""
     keyframe_parallax_px: NonNegativeFloat = 20.0
