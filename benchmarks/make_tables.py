@@ -163,6 +163,7 @@ def one_or_two() -> str:
     for (clip, backend), own in rows.groupby(["clip", "backend"]):
         found = {str(cameras): flown for cameras, flown in own.groupby("cameras")}
         one, both = (found[cameras].set_index("world") for cameras in ("one", "both"))
+        exact_one, exact_both = (found[f"{cameras}, exact points"]["ate_m"] for cameras in ("one", "both"))
 
         def beside(cameras: str, found: dict[str, pd.DataFrame] = found, both: pd.Series = both["ate_m"]) -> str:
             ate = found[cameras].set_index("world")["ate_m"]
@@ -175,6 +176,7 @@ def one_or_two() -> str:
                 "one camera": _ate(one),
                 "both": _ate(both),
                 "of one's ATE": f"{both['ate_m'].mean() / one['ate_m'].mean():.2f}",
+                "exact points, both": f"{_spread(exact_both)}, {exact_both.mean() / exact_one.mean():.2f}",
                 "both begin after": _range(both["initialised_s"], ".2f", "s"),
                 "each black for 5 s": beside("both, black in turn"),
                 "right one 20 ms later": beside("both, apart"),
