@@ -398,6 +398,7 @@ def test_places_seen_again_take_out_the_drift(revisit):
     way = np.linalg.norm(truth.p_WB[j] - truth.p_WB[i], axis=1)
     off = np.abs(np.linalg.norm([loop.p_L for loop in accepted], axis=1) - way)
     turned = np.degrees(np.abs([loop.yaw for loop in accepted]))  # the path is flown without turning
+    assert np.mean((off < 0.1) & (turned < 0.5)) > 0.9
     assert np.mean((off < 0.05) & (turned < 0.2)) > 0.8
     assert np.median(off) < 0.01
     assert off.max() < 0.1

@@ -178,10 +178,15 @@ class Window:
 
     @property
     def is_full(self) -> bool:
-        """Whether the oldest state has to go before another frame comes. Cameras that take turns have as many each."""
-        seeing = self.tracks.in_view.any(axis=0).reshape(-1, self.tracks.cameras)
-        taking = seeing | ~seeing.any(axis=1, keepdims=True)
-        return self._newest_is_keyframe and bool(taking.sum(axis=0).max() > self._options.window_size)
+        """Whether the oldest state has to go before another frame comes.
+
+        Cameras that take turns have as many frames each; one in which none sees anything is of all.
+        """
+        if not self._newest_is_keyframe:
+            return False
+        seeing = self.tracks.seeing()
+        of_camera = seeing | ~seeing.any(axis=1, keepdims=True)
+        return bool(of_camera.sum(axis=0).max() > self._options.window_size)
 
     def choose_keyframe(self) -> bool:
         """Decide whether the newest frame stays in the window, and say so."""

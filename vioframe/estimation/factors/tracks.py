@@ -38,6 +38,10 @@ class TrackTable:
         """(F,) number of views of each track."""
         return np.asarray(self.seen.sum(axis=1))
 
+    def seeing(self) -> Bool:
+        """(K, N) which cameras see anything in which frames."""
+        return np.asarray(self.in_view.any(axis=0).reshape(-1, self.cameras))
+
     def in_sight(self) -> Bool:
         """(F,) which tracks are in the newest frame.
 
@@ -45,9 +49,9 @@ class TrackTable:
         """
         newest = np.arange(-self.cameras, 0)
         if self.cameras > 1 and len(self.ids):
-            by_camera = self.in_view.any(axis=0).reshape(-1, self.cameras)
-            if by_camera[-1].any():
-                newest += self.cameras * -by_camera[::-1].argmax(axis=0)
+            seeing = self.seeing()
+            if seeing[-1].any():
+                newest += self.cameras * -seeing[::-1].argmax(axis=0)
         return np.asarray(self.in_view[:, newest].any(axis=1))
 
     def reach_back(self) -> Bool:
