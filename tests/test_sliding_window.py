@@ -380,6 +380,14 @@ def test_a_take_off_is_not_taken_for_its_mirror_image(seed, shared_data):
     assert backend_row(sequence, done)["ate_m"] < 0.01
 
 
+@pytest.mark.parametrize("seed", [1, 3, 6])
+def test_the_jerk_of_a_slow_take_off_tells_its_scale(seed, shared_data):
+    """With a keyframe a second it is off by 14 mm."""
+    folder = shared_data / "euroc_imu_gt/V1_01_easy"
+    sequence = real_motion_sequence(folder, pixel_sigma=0.1, duration_s=12.0, seed=seed)
+    assert backend_row(sequence, run_backend(sequence, SlidingWindow()))["ate_m"] < 0.0075
+
+
 def test_robust_loss_keeps_outliers_from_harm():
     sequence = simulated_sequence("figure_eight", seed=1, duration_s=10.0, outlier_ratio=0.05)
     neither = {"cauchy_sigmas": 1e6, "outlier_px": 1e6}
