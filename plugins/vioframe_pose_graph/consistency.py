@@ -27,10 +27,10 @@ _SPAN = 4
 # Position also drifts where nothing moves, as far as it would along this many metres a second.
 _HOVERING_M_S = 0.1
 # As little as this an odometry drifts at best, whatever it says: x, y and z, m after 1 m, and yaw, rad after 1 s.
-_LEAST_DRIFT = np.array([0.003, 0.003, 0.003, np.radians(0.003)])
-# How many times as far as it says an odometry may have drifted. It may be less than once, as what images take away of
-# an error is not taken off what it says, and up to a hundred times where it claims too much.
-_TIMES = 0.7 * 1.1 ** np.arange(54)
+_LEAST_DRIFT = np.array([0.001, 0.001, 0.001, np.radians(0.003)])
+# How many times as far as it says an odometry may have drifted. It may be less than once, as an error that images take
+# away again counts twice in what it says, and up to a hundred times where it claims too much.
+_TIMES = 0.5 * 1.1 ** np.arange(57)
 # Between two segments nothing is known but that the body cannot have gone far.
 _LOST_SPEED_M_S, _LOST_M, _LOST_YAW = 5.0, 5.0, 1.0
 REPEAT_NS = 3 * NS_PER_S
@@ -62,7 +62,7 @@ class Odometry:
         """``cov`` (N, 4, 4) is that of [position yaw] of each keyframe by the back-end, NaN where it does not say.
 
         An error of yaw goes on to move all that follows, and counts where it began: ``docs/derivations/pose_graph.md``,
-        section 3. Where images have told more than they lost, the step has taken nothing away.
+        section 3. Where images have told more than was lost, the step has moved the estimate by what they told.
         """
         dt = np.diff(t_ns, prepend=t_ns[:1]) * 1e-9
         steps = np.diff(p, axis=0, prepend=p[:1])
@@ -75,7 +75,7 @@ class Odometry:
             added = cov[1:] - _seen_from_afar(cov[:-1], steps[1:])
             said[1:] = np.isfinite(added).all(axis=(1, 2))
             values, vectors = np.linalg.eigh(added[said[1:]])
-            added = (vectors * np.maximum(values, 0.0)[:, None]) @ np.swapaxes(vectors, 1, 2)
+            added = (vectors * np.abs(values)[:, None]) @ np.swapaxes(vectors, 1, 2)
             drift[said] += options.overconfidence**2 * added
             told[said] += added
         broken = np.diff(segment, prepend=segment[:1]) > 0
