@@ -18,7 +18,7 @@ class SlidingWindowOptions:
     """Mean motion of the tracks since the last keyframe, rotation taken out, that makes a frame a keyframe ..."""
     keyframe_min_tracks: int = 20
     """... as do fewer tracks than this in common with it ..."""
-    keyframe_interval_s: PositiveFloat = 0.35
+    keyframe_interval_s: PositiveFloat = 0.5
     """... and this much time. Farther apart, they tell less of how slow motion speeds up, and so of its scale."""
     min_observations: Annotated[int, Field(ge=2)] = 3
     """Frames that must have seen a landmark before it is used."""
