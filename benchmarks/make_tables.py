@@ -543,8 +543,8 @@ def comparison() -> str:
             "back-end": f"`{row['back-end']}`",
             "detector": f"`{row['detector']}`",
             "n": f"{row['seeds']}",
-            "ATE, mean": f"{row['ATE, position + yaw [m]']:.3f} ± {row['std [m]']:.3f} m",
-            "of the path": f"{row['ATE [% of path]']:.2f} %",
+            "ATE, mean": f"{1e3 * row['ATE, position + yaw [m]']:.1f} ± {1e3 * row['std [m]']:.1f} mm",
+            "of the path": f"{row['ATE [% of path]']:.3f} %",
             "completion": f"{row['completion [%]']:.0f} %",
         }
         for _, row in table.iterrows()
