@@ -276,6 +276,19 @@ def test_a_frame_that_is_no_keyframe_gives_way_to_the_next():
         assert stamps == list(pairwise(inside))
 
 
+def test_cameras_that_take_turns_have_keyframes_as_often_each():
+    sequence = simulated_sequence("figure_eight", seed=1, duration_s=4.0, calibration=packaged_calibration("euroc"))
+    options = Options(**NEVER | {"keyframe_interval_s": 0.5, "max_rate_hz": 20.0})
+    life = LifeCycle(SlidingWindow(options), sequence.calibration, initial_state=drawn_start(sequence, 1, 1))
+    taken = [
+        k for k, (imu, seen) in enumerate(sequence.packets[1:]) if life.process(imu, seen.of_camera(k % 2)).is_keyframe
+    ]
+    for camera in (0, 1):
+        own = [k for k in taken if k % 2 == camera]
+        assert len(own) >= 6
+        assert np.diff(own).tolist() == [10] * (len(own) - 1)
+
+
 def frames(*xy: Float) -> TrackTable:
     table = TrackTable()
     for t_ns, points in enumerate(xy):

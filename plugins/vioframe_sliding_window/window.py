@@ -191,15 +191,20 @@ class Window:
     def choose_keyframe(self) -> bool:
         """Decide whether the newest frame stays in the window, and say so."""
         if not self._newest_is_keyframe:
-            options, k = self._options, len(self) - 1
+            options = self._options
             R_WC, _ = camera_poses(self._states, self._cameras)
             common, moved_px = parallax(self.tracks, R_WC, self._focal_px)
             self._newest_is_keyframe = (
-                moved_px >= options.keyframe_parallax_px
-                or common < options.keyframe_min_tracks
-                or self._t_ns[k] - self._t_ns[k - 1] >= options.keyframe_interval_s * NS_PER_S
+                moved_px >= options.keyframe_parallax_px or common < options.keyframe_min_tracks or self._is_due()
             )
         return self._newest_is_keyframe
+
+    def _is_due(self) -> bool:
+        """Whether the interval is over since a camera of the newest frame had a part in one, as it may never have."""
+        seeing = self.tracks.seeing()
+        before = np.flatnonzero((seeing[:-1] & seeing[-1]).any(axis=1) | ~seeing[-1].any())
+        interval_ns = self._options.keyframe_interval_s * NS_PER_S
+        return not len(before) or self._t_ns[-1] - self._t_ns[before[-1]] >= interval_ns
 
     def hold_still(self, t_ns: int, still: Standstill) -> None:
         """The body has not moved from the newest state until ``t_ns``, which the readings ``still`` bear out."""
