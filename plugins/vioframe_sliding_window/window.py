@@ -178,15 +178,10 @@ class Window:
 
     @property
     def is_full(self) -> bool:
-        """Whether the oldest state has to go before another frame comes.
-
-        Cameras that take turns have as many frames each; one in which none sees anything is of all.
-        """
+        """Whether the oldest state has to go before another frame comes: cameras that take turns have as many each."""
         if not self._newest_is_keyframe:
             return False
-        seeing = self.tracks.seeing()
-        of_camera = seeing | ~seeing.any(axis=1, keepdims=True)
-        return bool(of_camera.sum(axis=0).max() > self._options.window_size)
+        return bool(self.tracks.taking_part().sum(axis=0).max() > self._options.window_size)
 
     def choose_keyframe(self) -> bool:
         """Decide whether the newest frame stays in the window, and say so."""
@@ -200,9 +195,9 @@ class Window:
         return self._newest_is_keyframe
 
     def _is_due(self) -> bool:
-        """Whether the interval is over since a camera of the newest frame had a part in one, as it may never have."""
-        seeing = self.tracks.seeing()
-        before = np.flatnonzero((seeing[:-1] & seeing[-1]).any(axis=1) | ~seeing[-1].any())
+        """Whether the interval is over since a camera of the newest frame last had a part in one, if it ever had."""
+        taking_part = self.tracks.taking_part()
+        before = np.flatnonzero((taking_part[:-1] & taking_part[-1]).any(axis=1))
         interval_ns = self._options.keyframe_interval_s * NS_PER_S
         return not len(before) or self._t_ns[-1] - self._t_ns[before[-1]] >= interval_ns
 

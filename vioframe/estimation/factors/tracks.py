@@ -42,6 +42,11 @@ class TrackTable:
         """(K, N) which cameras see anything in which frames."""
         return np.asarray(self.in_view.any(axis=0).reshape(-1, self.cameras))
 
+    def taking_part(self) -> Bool:
+        """(K, N) which cameras have a part in which frames: those that see anything there, or all where none does."""
+        seeing = self.seeing()
+        return np.asarray(seeing | ~seeing.any(axis=1, keepdims=True))
+
     def in_sight(self) -> Bool:
         """(F,) which tracks are in the newest frame.
 
