@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from time import sleep
 
 import numpy as np
@@ -30,12 +30,22 @@ from vioframe.types import CalibrationEstimate, CameraSigma, Estimate, FrameSet,
 from vioframe_pose_graph import verification, vioframe_loop_closers
 from vioframe_pose_graph.closer import PoseGraph
 from vioframe_pose_graph.consistency import agreed, measured
-from vioframe_pose_graph.corners import located
+from vioframe_pose_graph.corners import located, seen_again
 from vioframe_pose_graph.keyframes import KeyframeSelector
 from vioframe_pose_graph.matching import DescriptorIndex, distance, match
-from vioframe_pose_graph.place import Place, View, corner_finder, image_angle_deg, peaks
+from vioframe_pose_graph.patches import Patches, Picture, laid_over
+from vioframe_pose_graph.place import Place, View, corner_finder, image_angle_deg
 from vioframe_pose_graph.recognition import Recogniser
-from vioframe_pose_graph.verification import Correspondences, _refined, hypotheses, ransac, residuals, supported
+from vioframe_pose_graph.verification import (
+    Correspondences,
+    Relation,
+    _refined,
+    aligned,
+    hypotheses,
+    ransac,
+    residuals,
+    supported,
+)
 
 FOCAL_PX = CAMERA.model.focal_px
 
@@ -113,7 +123,8 @@ def test_two_points_and_gravity_give_the_pose():
 def two_views(rng, count=80, outliers=0.0, tilt=(0.0, 0.0), depth_m=(4.0, 10.0)):
     """Points of both sides, seen by two cameras whose worlds are turned and shifted to one another.
 
-    World B is out of the vertical by ``tilt`` rad about x and y, and turned by that about the camera, which both know.
+    World A is out of the vertical by ``tilt`` rad about x and y, turned by that about its camera, which both know: what
+    is said of where the cameras are is by the vertical of B.
     """
     yaw, t = 0.3, np.array([1.0, -2.0, 0.5])
     look = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])  # level, along x
@@ -122,11 +133,11 @@ def two_views(rng, count=80, outliers=0.0, tilt=(0.0, 0.0), depth_m=(4.0, 10.0))
     p_B = rotation_z(yaw).T @ (np.array([0.5, 0.3, 0.1]) - t)
     in_A = np.column_stack([rng.uniform(*depth_m, count), rng.uniform(-3.0, 3.0, (count, 2))])
     in_B = (in_A - t) @ rotation_z(yaw)
-    leaning = so3.exp(np.append(tilt, 0.0))
-    R_B, in_B = leaning @ R_B, p_B + (in_B - p_B) @ leaning.T
     half = count // 2
-    points = np.concatenate([in_B[:half], in_A[half:]])
     seen_A = (in_A[:half] - p_A) @ R_A
+    leaning = so3.exp(np.append(tilt, 0.0))
+    R_A, in_A = leaning @ R_A, p_A + (in_A - p_A) @ leaning.T
+    points = np.concatenate([in_B[:half], in_A[half:]])
     seen_B = (in_B[half:] - p_B) @ R_B
     seen = np.concatenate([seen_A, seen_B])
     xy = seen[:, :2] / seen[:, 2:]
@@ -261,30 +272,122 @@ def test_attitudes_that_disagree_yield_to_the_points(monkeypatch):
     assert yielding < 0.5 * held
 
 
-def test_a_corner_is_found_again_to_parts_of_a_pixel():
-    """A hall seen from 40 cm beside, against where exact geometry has its corners."""
-    truth = path_along(np.array([[0.0, 0.0, 0.0], [0.0, 0.4, 0.0]]), np.zeros(2))
+def test_where_attitudes_disagree_the_later_one_knows_what_is_upright():
+    seen, yaw, t, _ = two_views(np.random.default_rng(13), tilt=np.radians([0.3, -0.4]))
+    assert fitted(seen, yaw, t) < 0.002
+
+
+@dataclass(frozen=True)
+class Shot:
+    """A picture of the hall: as it is kept, where the camera was, and how far away its points are by exact geometry."""
+
+    place: Place
+    view: View
+    picture: Picture
+
+
+@pytest.fixture(scope="module")
+def shots():
+    """Of one wall: from a place, from 40 cm beside, and from 1.5 m ahead, rolled by 60 degrees; and another way."""
+    p_WB = np.array([[0.0, 0.0, 0.0], [0.0, 0.4, 0.0], [1.5, 0.2, 0.1], [0.0, 0.0, 0.0]])
+    truth = path_along(p_WB, np.array([0.0, 0.0, 0.05, np.pi]))
     world, model = hall(truth, 3), CAMERA.model
     renderer, scene, orb = Renderer(model, world), ray_scene(world.mesh.corners), corner_finder(600)
-    R_WC, p_WC = truth.R_WB @ CAMERA.R_BC, truth.p_WB + truth.R_WB @ CAMERA.p_BC
-    found, placed, looks = [], [], []
-    for R, p in zip(R_WC, p_WC, strict=True):
-        image = np.clip(255.0 * renderer.render(R, p), 0.0, 255.0).astype(np.uint8)
-        corners, descriptors = orb.compute(image, orb.detect(image))
-        looks.append(descriptors.view(np.uint64))
-        found.append(np.array([corner.pt for corner in corners]))
-        placed.append(peaks(image, found[-1], np.array([corner.octave for corner in corners])))
-    matches = match(looks[0], looks[1], found[1], 48, 0.85, 10.0)
-    matched = np.flatnonzero(matches >= 0)
-    off = []
-    for first, second in (found, placed):
-        depth, rays = depths(scene, R_WC[0], p_WC[0], model.undistort(first[matched]))
-        seen = (p_WC[0] + depth[:, None] * rays - p_WC[1]) @ R_WC[1]
-        again = model.project(seen)
-        off.append(np.median(np.linalg.norm(again - second[matches[matched]], axis=1)))
-    assert len(matched) > 60
-    assert off[1] < 0.6
-    assert off[1] < 0.6 * off[0]
+    taken = []
+    for k, (t_ns, R_WB, p) in enumerate(zip(truth.t_ns.tolist(), truth.R_WB, truth.p_WB, strict=True)):
+        R_WC, p_WC = R_WB @ CAMERA.R_BC, p + R_WB @ CAMERA.p_BC
+        if k == 2:
+            R_WC = R_WC @ so3.exp(np.array([0.0, 0.0, np.radians(60.0)]))
+        image = np.clip(255.0 * renderer.render(R_WC, p_WC), 0.0, 255.0).astype(np.uint8)
+        corners = orb.detect(image)
+        for corner in corners:
+            corner.angle = image_angle_deg(R_WC)
+        corners, descriptors = orb.compute(image, corners)
+        xy = model.undistort(np.array([corner.pt for corner in corners])).astype(np.float32)
+        depth, rays = depths(scene, R_WC, p_WC, xy.astype(np.float64))
+        place = Place(t_ns, 0, R_WB, p, p, R_WC, p_WC, np.full((4, 4), np.nan))
+        p_WF = (p_WC + depth[:, None] * rays).astype(np.float32)
+        view = View(xy, p_WF, np.full(len(xy), 0.004, np.float32), descriptors.view(np.uint64))
+        taken.append(Shot(place, view, Picture.of(image, model)))
+    return taken
+
+
+def patches_of(shot):
+    return Patches.of(shot.picture, shot.view.xy_normalised.astype(np.float64))
+
+
+def exact_px(first, second):
+    """Where exact geometry has the points of the first in the second, (K, 2) px."""
+    return CAMERA.model.project((first.view.p_WF - second.place.p_WC) @ second.place.R_WC)
+
+
+def off_px(first, second, xy):
+    return np.linalg.norm(CAMERA.model.distort(xy) - exact_px(first, second), axis=1)
+
+
+@pytest.mark.parametrize("which", [1, 2], ids=["beside", "rolled"])
+def test_a_corner_is_found_again_to_parts_of_a_pixel(shots, which):
+    """Corners alone are found again to a pixel, as they are found to one."""
+    first, second = shots[0], shots[which]
+    apart = 10.0 / FOCAL_PX
+    matches = match(first.view.descriptors, second.view.descriptors, second.view.xy_normalised, 48, 0.85, apart)
+    xy = seen_again(first.place, first.view, patches_of(first), (second.place, second.view, second.picture), apart)
+    found = np.isfinite(xy[:, 0])
+    assert not found[matches < 0].any()
+    assert found[matches >= 0].mean() > 0.75
+    assert found.sum() > 40
+    alone = np.where(found[:, None], second.view.xy_normalised[matches], np.nan)
+    by_patch, by_corner = (np.nanmedian(off_px(first, second, seen)) for seen in (xy, alone))
+    assert by_patch < 0.2
+    assert by_patch < 0.25 * by_corner
+
+
+def laid(first, second, guess_off_px):
+    """Where the patches of the first are found in the second, laid there as geometry says."""
+    first_C, place = (first.view.p_WF - first.place.p_WC) @ first.place.R_WC, second.place
+    R_TS, t_TS = place.R_WC.T @ first.place.R_WC, place.R_WC.T @ (first.place.p_WC - place.p_WC)
+    xy = first.view.xy_normalised.astype(np.float64)
+    guess, warp = laid_over(CAMERA.model, xy, 1.0 / first_C[:, 2], R_TS, t_TS)
+    return guess, warp, patches_of(first).found_in(second.picture, guess + guess_off_px, warp)
+
+
+def test_a_patch_is_found_where_it_is_turned_and_larger(shots):
+    first, _, ahead, _ = shots
+    guess, warp, xy = laid(first, ahead, guess_off_px=1.0)
+    inside = CAMERA.model.contains(guess, 20.0)
+    assert inside.sum() > 100
+    np.testing.assert_allclose(guess[inside], exact_px(first, ahead)[inside], atol=1e-2)
+    assert np.median(np.sqrt(np.linalg.det(warp[inside]))) > 1.1
+    assert np.isfinite(xy[inside, 0]).mean() > 0.5
+    assert np.nanmedian(off_px(first, ahead, xy)) < 0.25
+    upright = patches_of(first).found_in(ahead.picture, guess, np.tile(np.eye(2), (len(xy), 1, 1)))
+    assert np.nanmedian(off_px(first, ahead, upright)) > 4.0 * np.nanmedian(off_px(first, ahead, xy))
+
+
+def related(first, second, moved_m, turned_deg):
+    """The relation of two pictures of one world, off by as much."""
+    z = second.place.p_WB_seen - first.place.p_WB_seen + moved_m
+    return Relation(z, np.radians(turned_deg), np.eye(4), 30)
+
+
+@pytest.mark.parametrize("which", [1, 2], ids=["beside", "ahead"])
+def test_patches_put_a_relation_right(shots, which):
+    first, second = shots[0], shots[which]
+    roughly = related(first, second, np.array([0.02, -0.03, 0.02]), 0.2)
+    known = first.place, first.view
+    found = aligned(roughly, known, patches_of(first), second.place, second.picture, 25)
+    assert found.inliers > 60
+    np.testing.assert_allclose(found.z, related(first, second, 0.0, 0.0).z, atol=0.004)
+    assert abs(found.yaw) < np.radians(0.03)
+
+
+def test_a_relation_stays_where_too_few_patches_tell_better(shots):
+    first, second, *_ = shots
+    few = np.arange(len(first.view.p_WF))[:, None] < 24
+    view = replace(first.view, p_WF=np.where(few, first.view.p_WF, np.float32(np.nan)))
+    roughly = related(first, second, 0.02, 0.2)
+    patches = patches_of(first).select(slice(24))
+    assert aligned(roughly, (first.place, view), patches, second.place, second.picture, 25) is roughly
 
 
 def test_descriptors_turn_with_the_camera():
@@ -296,32 +399,31 @@ def test_descriptors_turn_with_the_camera():
 
 
 def a_row_of_keyframes(rng, sigma):
-    """Three keyframes, a third of a metre apart, that see the same points: where these are, and what is remembered.
+    """Three keyframes, a third of a metre apart, that see the same points: where these are, how the first two saw them,
+    and what the last one saw.
 
     Of the last keyframe the first 60 points are known; the odometry has strayed by 6 cm between any two of them.
     """
     look = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])  # level, along x
     p_WF = np.column_stack([rng.uniform(3.0, 8.0, 300), rng.uniform(-1.5, 1.5, (300, 2))])
-    descriptors = random_descriptors(rng, 300)
-    seen = []
+    before = []
     for k in (2, 1, 0):
         p_WC = np.array([0.05 * k, 0.35 * k, 0.02 * k])
         ahead = (p_WF - p_WC) @ look
-        xy = (ahead[:, :2] / ahead[:, 2:] + sigma * rng.standard_normal((300, 2))).astype(np.float32)
-        order = rng.permutation(300) if k else np.arange(300)
-        known = np.where(np.arange(300)[:, None] < (0 if k else 60), p_WF, np.nan).astype(np.float32)[order]
+        xy = ahead[:, :2] / ahead[:, 2:] + sigma * rng.standard_normal((300, 2))
         said = p_WC + k * np.array([0.02, 0.06, -0.02])
         place = Place(k, 0, np.eye(3), said, said, look, said, np.full((4, 4), np.nan))
-        seen.append(
-            (place, View(xy[order], known, np.full(300, 0.02, np.float32), flipped(descriptors, 12, rng)[order]))
-        )
-    return p_WF, seen
+        before.append((place, xy))
+    place, xy = before.pop()
+    known = np.where(np.arange(300)[:, None] < 60, p_WF, np.nan).astype(np.float32)
+    view = View(xy.astype(np.float32), known, np.full(300, 0.02, np.float32), random_descriptors(rng, 300))
+    return p_WF, before, (place, view)
 
 
 def test_corners_are_where_the_keyframes_before_saw_them_whatever_the_odometry_says_of_the_way():
     sigma = 1.0 / 460.0
-    p_WF, (*before, (place, view)) = a_row_of_keyframes(np.random.default_rng(8), sigma)
-    corners = located(place, view, before, sigma, 10.0 / 460.0)
+    p_WF, before, (place, view) = a_row_of_keyframes(np.random.default_rng(8), sigma)
+    corners = located(place, view, before, sigma)
     np.testing.assert_array_equal(corners.p_WF[:60], view.p_WF[:60])
     found = np.isfinite(corners.p_WF[:, 0])
     assert found.mean() > 0.9
@@ -334,17 +436,16 @@ def test_corners_are_where_the_keyframes_before_saw_them_whatever_the_odometry_s
 
 
 def test_what_is_no_corner_gets_no_position():
-    """Of the other keyframes every third descriptor sits elsewhere: hardly one of them is taken for the same point."""
+    """In the other keyframes every third is seen elsewhere: hardly one of them is taken for the same point."""
     rng, sigma = np.random.default_rng(9), 1.0 / 460.0
-    _, (*before, (place, view)) = a_row_of_keyframes(rng, sigma)
+    _, before, (place, view) = a_row_of_keyframes(rng, sigma)
     wrong = np.arange(60, 300, 3)
     moved = []
-    for at, other in before:
-        xy = other.xy_normalised.copy()
-        rows = [np.argmin([distance(other.descriptors[k], view.descriptors[i]) for k in range(300)]) for i in wrong]
-        xy[rows] = rng.uniform(-0.4, 0.4, (len(rows), 2))
-        moved.append((at, replace(other, xy_normalised=xy)))
-    corners = located(place, view, moved, sigma, 10.0 / 460.0)
+    for at, seen in before:
+        xy = seen.copy()
+        xy[wrong] = rng.uniform(-0.4, 0.4, (len(wrong), 2))
+        moved.append((at, xy))
+    corners = located(place, view, moved, sigma)
     found = np.isfinite(corners.p_WF[:, 0])
     right = np.setdiff1d(np.arange(60, 300), wrong)
     assert found[right].mean() > 0.9
@@ -352,10 +453,10 @@ def test_what_is_no_corner_gets_no_position():
 
 
 def test_too_few_known_points_place_no_corner():
-    _, (*before, (place, view)) = a_row_of_keyframes(np.random.default_rng(10), 1.0 / 460.0)
+    _, before, (place, view) = a_row_of_keyframes(np.random.default_rng(10), 1.0 / 460.0)
     few = np.where(np.arange(300)[:, None] < 9, view.p_WF, np.float32(np.nan))
-    dark = (before[0][0], View(*(part[:0] for part in (view.xy_normalised, few, view.depth_sigma, view.descriptors))))
-    corners = located(place, replace(view, p_WF=few), [*before, dark], 1.0 / 460.0, 10.0 / 460.0)
+    dark = before[0][0], np.full((300, 2), np.nan)
+    corners = located(place, replace(view, p_WF=few), [*before, dark], 1.0 / 460.0)
     assert np.isfinite(corners.p_WF[:, 0]).sum() == 9
 
 

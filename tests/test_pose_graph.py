@@ -67,9 +67,9 @@ def test_a_loop_is_as_sure_as_its_fit_and_less_the_farther_its_views_are_apart()
         return np.sqrt(np.diag(loops.cov[0]))
 
     near, far = covariance(0.0, 0.0, 0.0), covariance(4.0, 0.0, 0.0)
-    np.testing.assert_allclose(near[:3], 0.003)
-    np.testing.assert_allclose(far[:3], np.hypot(0.003, 0.04))
-    np.testing.assert_allclose([near[3], far[3]], np.radians(0.03))
+    np.testing.assert_allclose(near[:3], 0.0005)
+    np.testing.assert_allclose(far[:3], np.hypot(0.0005, 0.012))
+    np.testing.assert_allclose([near[3], far[3]], np.radians(0.01))
     # The points of a fit are wrong together: it is off by more than it says.
     np.testing.assert_allclose(
         covariance(0.0, 0.03, 0.5), np.hypot(near, 2.0 * np.array([0.03] * 3 + [np.radians(0.5)]))

@@ -14,6 +14,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from vioframe.frontend import anchors
 from vioframe.geometry.so3 import rotation_z, yaw_of
 from vioframe.geometry.trajectory import Trajectory
 from vioframe.stopwatch import working_s
@@ -197,4 +198,5 @@ def warm_up() -> None:
     match(descriptors, descriptors, np.zeros((2, 2)), 1, 1.0, 1.0)
     poses = np.stack([np.eye(3)] * 2), np.eye(2, 3)
     triangulated(*poses, np.zeros((1, 2, 2)), 1.0)
+    anchors.warm_up()
     supported(np.zeros(1), np.zeros((1, 3)), np.ones((1, 3)), np.zeros((1, 2)), np.zeros(1, np.int64), *poses, 1.0)

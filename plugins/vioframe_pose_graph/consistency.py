@@ -35,10 +35,10 @@ _TIMES = 0.5 * 1.1 ** np.arange(57)
 _LOST_SPEED_M_S, _LOST_M, _LOST_YAW = 5.0, 5.0, 1.0
 REPEAT_NS = 3 * NS_PER_S
 """Within which another keyframe must say the same."""
-# Points seen to half a pixel place a camera to millimetres; but the points themselves were placed by the odometry, and
+# Patches found to a tenth of a pixel place a camera to a millimetre; but their points were placed by the odometry, and
 # what is wrong with them is wrong with many: a fit is off by twice what it says, and by more the farther its views are
 # apart. That is what the loops of MH_02, MH_03 and V1_01 show, rendered in worlds for tuning.
-_SIGMA_M, _SIGMA_PART, _SIGMA_YAW, _OF_FIT = 0.003, 0.01, np.radians(0.03), 2.0
+_SIGMA_M, _SIGMA_PART, _SIGMA_YAW, _OF_FIT = 0.0005, 0.003, np.radians(0.01), 2.0
 # What is wrong with the points is wrong, in part, with all loops by them: each counts as an eighth of one that knew
 # nothing of the others. Most are far better than they may be, and some are not: they are off by Cauchy's distribution,
 # and the last solution is weighed anew as often. With both the paths of those flights come out best.

@@ -15,6 +15,7 @@ from vioframe.geometry.triangulation import triangulate
 from vioframe.jit import kernel
 from vioframe.types import Float
 from vioframe_pose_graph.matching import match
+from vioframe_pose_graph.patches import Patches, Picture, laid_over
 from vioframe_pose_graph.place import PRIOR, Place, View, depth_sigma_of
 
 # From one keyframe to the next a corner looks much as before.
@@ -23,30 +24,43 @@ _TOLERATED = 3.0
 # Points that must say from where a keyframe before was seen.
 _LEAST_KNOWN = 10
 
+Seen = tuple[Place, View, Picture]
 
-def located(place: Place, view: View, before: Sequence[tuple[Place, View]], sigma: float, apart: float) -> View:
-    """``view`` with positions of more of its points, as far as they were seen ``before`` from elsewhere.
+
+def seen_again(place: Place, view: View, patches: Patches, other: Seen, apart: float) -> Float:
+    """(K, 2) where a keyframe just before saw the points of ``view``, on its z = 1 plane, NaN where it did not.
+
+    Points closer together than ``apart`` on that plane may be one.
+    """
+    at, before, picture = other
+    target_xy = before.xy_normalised.astype(np.float64)
+    found = match(view.descriptors, before.descriptors, target_xy, _MAX_DISTANCE, _RATIO, apart)
+    again = np.flatnonzero(found >= 0)
+    # Next to one another two keyframes see the same but for how they are turned.
+    R, t, far = at.R_WC.T @ place.R_WC, np.zeros(3), np.zeros(len(again))
+    _, warp = laid_over(picture.model, view.xy_normalised[again].astype(np.float64), far, R, t)
+    xy = np.full((len(found), 2), np.nan)
+    xy[again] = patches.select(again).found_in(picture, picture.model.distort(target_xy[found[again]]), warp)
+    return xy
+
+
+def located(place: Place, view: View, before: Sequence[tuple[Place, Float]], sigma: float) -> View:
+    """``view`` with positions of more of its points, as far as they were seen ``before`` from elsewhere, at (K, 2).
 
     From where that was, those points say of which the position is known: how far the odometry has come since does not
-    count, and so corners and landmarks agree. Points are seen to ``sigma`` on the z = 1 plane, on which those closer
-    together than ``apart`` may be one.
+    count, and so corners and landmarks agree. Points are seen to ``sigma`` on the z = 1 plane.
     """
     unknown = np.isnan(view.p_WF[:, 0])
-    poses, seen = [(place.R_WC, place.p_WC)], [view.xy_normalised[unknown]]
-    for at, other in before:
-        target_xy = other.xy_normalised.astype(np.float64)
-        found = match(view.descriptors, other.descriptors, target_xy, _MAX_DISTANCE, _RATIO, apart)
-        again = found >= 0
-        xy = np.full((len(found), 2), np.nan)
-        xy[again] = target_xy[found[again]]
-        both = again & ~unknown
+    poses, seen = [(place.R_WC, place.p_WC)], [view.xy_normalised[unknown].astype(np.float64)]
+    for at, xy in before:
+        both = np.isfinite(xy[:, 0]) & ~unknown
         if np.count_nonzero(both) >= _LEAST_KNOWN:
             known = view.p_WF[both].astype(np.float64)
             poses.append(resect(at.R_WC, at.p_WC, known, xy[both], sigma, 1.0, PRIOR)[:2])
             seen.append(xy[unknown])
     p_WF, depth_sigma = view.p_WF.copy(), view.depth_sigma.copy()
     R_WC, p_WC = (np.stack(parts) for parts in zip(*poses, strict=True))
-    p_WF[unknown], parallax = triangulated(R_WC, p_WC, np.stack(seen, axis=1, dtype=np.float64), sigma)
+    p_WF[unknown], parallax = triangulated(R_WC, p_WC, np.stack(seen, axis=1), sigma)
     depth_sigma[unknown] = depth_sigma_of(parallax, sigma)
     return replace(view, p_WF=p_WF, depth_sigma=depth_sigma)
 

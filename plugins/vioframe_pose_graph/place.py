@@ -31,8 +31,6 @@ Words = NDArray[np.uint64]
 
 _LEVELS, _SCALE_FACTOR, _FAST_THRESHOLD = 4, 1.3, 12
 _PATCH_PX = 31
-# A corner's response has its peak within so many pixels of its level of where it was found.
-_PEAK_WITHIN, _FLAT = 2, 1e-12
 # Sine of the angle between the optical axis and the vertical below which the world's x axis says what is up.
 _STEEP = 0.35
 PRIOR = np.repeat([np.radians(1.0), 0.03], 3) ** -2.0
@@ -123,35 +121,7 @@ def _described(orb: cv2.ORB, image: Image, xy: Float, angle_deg: float) -> tuple
     if descriptors is None:
         return np.empty((0, 2)), np.empty((0, 4), np.uint64), np.empty(0, np.int64)
     places, which = np.array([corner.pt for corner in kept]), np.array([corner.class_id for corner in kept], np.int64)
-    corners = which < 0
-    places[corners] = peaks(image, places[corners], np.array([corner.octave for corner in kept])[corners])
     return places, descriptors.view(np.uint64), which
-
-
-def peaks(image: Image, xy: Float, octave: Int) -> Float:
-    """Corners found at ``xy`` (N, 2) px on levels ``octave`` (N,), placed to parts of a pixel.
-
-    ORB gives them to a whole pixel of their level. The response by which it ranks them (Harris, Stephens, AVC 1988) has
-    its peak there, and a parabola through the pixels beside it says where: seen from elsewhere a corner is then found
-    again to 0.4 px instead of 1.0, as exact geometry of a rendered V1_01 shows. One without a peak stays.
-    """
-    placed, beside = xy.copy(), np.arange(-_PEAK_WITHIN, _PEAK_WITHIN + 1)
-    for level in np.unique(octave).tolist():
-        shape = np.rint(np.array(image.shape) / _SCALE_FACTOR**level).astype(int)
-        scale = (np.array(image.shape) / shape)[::-1]
-        response = cv2.cornerHarris(cv2.resize(image, shape[::-1].tolist(), interpolation=cv2.INTER_AREA), 3, 3, 0.04)
-        on = np.flatnonzero(octave == level)
-        column, row = np.rint((xy[on] + 0.5) / scale - 0.5).astype(int).T
-        near = response[np.add.outer(row, beside)[:, :, None], np.add.outer(column, beside)[:, None, :]]
-        down, right = np.divmod(near.reshape(len(on), -1).argmax(axis=1), len(beside))
-        row, column = row + beside[down], column + beside[right]
-        centre = response[row, column]
-        before, after = ([response[row, column + step], response[row + step, column]] for step in (-1, 1))
-        bend = np.add(before, after) - 2.0 * centre
-        at = np.stack([column, row]) + 0.5 * np.subtract(before, after) / np.minimum(bend, -_FLAT)
-        sharp = ((np.maximum(before, after) <= centre) & (bend < -_FLAT)).all(axis=0)
-        placed[on[sharp]] = ((at.T + 0.5) * scale - 0.5)[sharp]
-    return placed
 
 
 def image_angle_deg(R_WC: Float) -> float:

@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections import deque
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from vioframe.stopwatch import Stopwatch
 from vioframe.types import NS_PER_S, Float
-from vioframe_pose_graph.corners import located
+from vioframe_pose_graph.corners import Seen, located, seen_again
 from vioframe_pose_graph.keyframes import Keyframe
 from vioframe_pose_graph.matching import DescriptorIndex
 from vioframe_pose_graph.options import PoseGraphOptions
+from vioframe_pose_graph.patches import Patches, Picture
 from vioframe_pose_graph.place import Float32, Place, View, corner_finder, describe
-from vioframe_pose_graph.verification import APART_PX, Relation, relate
+from vioframe_pose_graph.verification import APART_PX, Relation, aligned, relate
 
 # Earlier places that each keyframe is compared with in detail: an aliased world has more than one that look alike.
 _MOST_CANDIDATES = 3
@@ -22,10 +24,10 @@ _NEIGHBOURS = 3
 # Enough points to know a place by; the tracked features come first.
 _ASKED = 300
 # Keyframes in which the corners of a new one are looked for, to know where they are.
-_LOOKED_BACK = 4
+_LOOKED_BACK = 2
 # To which corners are found again, and landmarks lie where a keyframe saw them.
 _SIGMA_PX = 0.5
-# Places whose looks are remembered: some 80 kB each.
+# Places whose looks are remembered: some 150 kB each.
 _MOST_REMEMBERED = 2000
 
 
@@ -36,6 +38,18 @@ class Sighting:
     earlier: int
     later: int
     relation: Relation
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Look:
+    """How a place looked: points as in its view, their descriptors as rows of the index, and patches of those that have
+    a position."""
+
+    xy_normalised: Float32
+    p_WF: Float32
+    depth_sigma: Float32
+    rows: slice
+    patches: Patches
 
 
 class Recogniser:
@@ -49,8 +63,8 @@ class Recogniser:
         self._focal_px, self._options = focal_px, options
         self._orb = corner_finder(options.max_corners)
         self._index = DescriptorIndex()
-        # How a place looked: points as in its view; its descriptors are rows of the index.
-        self._remembered: dict[int, tuple[Float32, Float32, Float32, slice]] = {}
+        self._remembered: dict[int, _Look] = {}
+        self._newest: deque[Seen] = deque(maxlen=_LOOKED_BACK)
         self.places: list[Place] = []
         self.sightings: list[Sighting] = []
         self.seconds: dict[str, float] = {}
@@ -59,39 +73,39 @@ class Recogniser:
         """Look for the place of ``keyframe`` among the earlier ones, then remember it."""
         watch = Stopwatch()
         place, view = describe(keyframe, self._orb, _SIGMA_PX)
+        picture = Picture.of(keyframe.image, keyframe.model)
         watch.lap("describe")
-        if before := self._just_before(place):
-            view = located(place, view, before, _SIGMA_PX / self._focal_px, APART_PX / self._focal_px)
+        patches = Patches.of(picture, view.xy_normalised.astype(np.float64))
+        before = [
+            (other[0], seen_again(place, view, patches, other, APART_PX / self._focal_px))
+            for other in self._newest
+            if other[0].segment == place.segment
+        ]
+        view = located(place, view, before, _SIGMA_PX / self._focal_px)
+        self._newest.append((place, view, picture))
         watch.lap("locate")
         candidates = self._retrieve(place, view)
         number = len(self.places)
         rows = self._index.add(view.descriptors, number)
         watch.lap("retrieve")
         for earlier in candidates:
-            relation = relate(
-                (self.places[earlier], self._view(earlier)),
-                (place, view),
-                self._focal_px,
-                self._options.min_inliers,
-            )
+            seen, least = (self.places[earlier], self._view(earlier)), self._options.min_inliers
+            relation = relate(seen, (place, view), self._focal_px, least)
             if relation is not None:
+                relation = aligned(relation, seen, self._remembered[earlier].patches, place, picture, least)
                 self.sightings.append(Sighting(earlier, number, relation))
         self.places.append(place)
-        self._remembered[number] = view.xy_normalised, view.p_WF, view.depth_sigma, rows
+        known = patches.select(np.isfinite(view.p_WF[:, 0]))
+        self._remembered[number] = _Look(view.xy_normalised, view.p_WF, view.depth_sigma, rows, known)
         if len(self._remembered) > _MOST_REMEMBERED:
             self._thin_out()
         watch.lap("verify")
         for stage, seconds in watch.seconds.items():
             self.seconds[stage] = self.seconds.get(stage, 0.0) + seconds
 
-    def _just_before(self, place: Place) -> list[tuple[Place, View]]:
-        """The last keyframes before ``place``, of one world with it."""
-        last = range(max(len(self.places) - _LOOKED_BACK, 0), len(self.places))
-        return [(self.places[n], self._view(n)) for n in last if self.places[n].segment == place.segment]
-
     def _view(self, number: int) -> View:
-        xy_normalised, p_WF, depth_sigma, rows = self._remembered[number]
-        return View(xy_normalised, p_WF, depth_sigma, self._index.descriptors(rows))
+        look = self._remembered[number]
+        return View(look.xy_normalised, look.p_WF, look.depth_sigma, self._index.descriptors(look.rows))
 
     def _retrieve(self, place: Place, view: View) -> list[int]:
         """Numbers of the earlier keyframes that look most like ``place``, no two of them neighbours."""
@@ -105,10 +119,10 @@ class Recogniser:
         old, index = self._remembered, DescriptorIndex()
         older = set(list(old)[1 : len(old) // 2 : 2])
         self._remembered = {}
-        for number, (xy_normalised, p_WF, depth_sigma, rows) in old.items():
+        for number, look in old.items():
             if number not in older:
-                kept = index.add(self._index.descriptors(rows), number)
-                self._remembered[number] = xy_normalised, p_WF, depth_sigma, kept
+                rows = index.add(self._index.descriptors(look.rows), number)
+                self._remembered[number] = replace(look, rows=rows)
         self._index = index
 
 

@@ -19,10 +19,13 @@ from vioframe.geometry.two_view import rays
 from vioframe.jit import kernel
 from vioframe.types import Float, Int
 from vioframe_pose_graph.matching import match
+from vioframe_pose_graph.patches import Patches, Picture, laid_over
 from vioframe_pose_graph.place import Place, View
 
 REPROJECTION_PX = 3.0
 """Within which a point of one keyframe must be seen in the other to support a loop."""
+ALIGNED_PX = 1.5
+"""The same of a patch that was laid over the other's picture."""
 _MAX_DISTANCE, _RATIO = 64, 0.85
 APART_PX = 10.0
 _HYPOTHESES = 300
@@ -84,6 +87,37 @@ def relate(earlier: Seen, later: Seen, focal_px: float, min_inliers: int) -> Rel
     if support < min_inliers:
         return None
     return _refined(seen, rotation_z(yaw), t, earlier[0].p_WB_seen, later[0].p_WB_seen, tolerance, min_inliers)
+
+
+def aligned(
+    relation: Relation, earlier: Seen, patches: Patches, later: Place, picture: Picture, min_inliers: int
+) -> Relation:
+    """``relation`` by the ``patches`` of the earlier keyframe found in the ``picture`` that the later one saw.
+
+    The patches are of those of its points that have a position, in their order. Where too few are found, as that of
+    few was known by then, the relation stays what corners say.
+    """
+    place, view = earlier
+    known = np.flatnonzero(np.isfinite(view.p_WF[:, 0]))
+    points, xy = view.p_WF[known].astype(np.float64), view.xy_normalised[known].astype(np.float64)
+    R_AB, p_AB, p_B = rotation_z(np.array(relation.yaw)), place.p_WB_seen + relation.z, later.p_WB_seen
+    # Of the later camera in the world of the earlier one, and what that is from the earlier camera.
+    R_AC, p_AC = R_AB @ later.R_WC, R_AB @ (later.p_WC - p_B) + p_AB
+    inverse_depth = 1.0 / ((points - place.p_WC) @ place.R_WC[:, 2])
+    guess, warp = laid_over(picture.model, xy, inverse_depth, R_AC.T @ place.R_WC, R_AC.T @ (place.p_WC - p_AC))
+    again = patches.found_in(picture, guess, warp)
+    found = np.flatnonzero(np.isfinite(again[:, 0]))
+    seen = Correspondences(
+        points=points[found],
+        depth_sigma=view.depth_sigma[known[found]].astype(np.float64),
+        xy=again[found],
+        side=np.ones(len(found), np.int64),
+        R_WC=np.stack([place.R_WC, later.R_WC]),
+        p_WC=np.stack([place.p_WC, later.p_WC]),
+        pairs=np.column_stack([known[found], found]),
+    )
+    tolerance = ALIGNED_PX / picture.model.focal_px
+    return _refined(seen, R_AB, p_AB - R_AB @ p_B, place.p_WB_seen, p_B, tolerance, min_inliers) or relation
 
 
 def correspondences(earlier: Seen, later: Seen, apart: float) -> Correspondences:
@@ -154,7 +188,8 @@ def _refined(
     The tilt is free within what two attitudes of an odometry may disagree: forced to zero, half a degree of it would
     become several centimetres of position, as the points are metres away. A good odometry's agree to hundredths of a
     degree, and then the points need not say it. So points and tilt are off by Student's t: what most of them are off by
-    weighs, and what is off by much more hardly (Lange, Little, Taylor, JASA 1989).
+    weighs, and what is off by much more hardly (Lange, Little, Taylor, JASA 1989). Where attitudes disagree after all
+    it is the earlier one that is wrong, as a rule: which way is down an odometry learns as it flies.
 
     How far away a point is is known to some per cent, so it counts less along the line on which a wrong depth would
     move it: the farther the two cameras are apart, the more.
@@ -185,7 +220,9 @@ def _refined(
         return None
     which = [0, 1, 2, 5]
     cov = np.linalg.inv(H)[np.ix_(which, which)] * (_HEAVY + 4.0) / (_HEAVY + 2.0)  # weights say more than t does
-    return Relation(p_AB - p_A, float(yaw_of(R_AB)), cov.astype(np.float64, copy=False), supporting)
+    yaw = yaw_of(R_AB)
+    z = rotation_z(yaw) @ R_AB.T @ (p_AB - p_A)  # by the later one's vertical
+    return Relation(z, float(yaw), cov.astype(np.float64, copy=False), supporting)
 
 
 def _weight(squared: Float) -> Float:
