@@ -37,7 +37,7 @@ from vioframe.simulation.config import SimulationConfig
 from vioframe.types import NS_PER_S, FrameSet, Measurement
 
 BACKENDS = ("msckf", "sliding_window")
-WORLDS = 3
+WORLDS = 6
 # Seconds into the recording in which the left camera sees nothing, and the right one.
 BLACK_S = ((30.0, 35.0), (45.0, 50.0))
 APART_MS = 20.0

@@ -331,7 +331,8 @@ def test_a_corner_is_found_again_to_parts_of_a_pixel(shots, which):
     first, second = shots[0], shots[which]
     apart = 10.0 / FOCAL_PX
     matches = match(first.view.descriptors, second.view.descriptors, second.view.xy_normalised, 48, 0.85, apart)
-    xy = seen_again(first.place, first.view, patches_of(first), (second.place, second.view, second.picture), apart)
+    R_CC = second.place.R_WC.T @ first.place.R_WC
+    xy = seen_again(first.view, patches_of(first), second.view, second.picture, R_CC, apart)
     found = np.isfinite(xy[:, 0])
     assert not found[matches < 0].any()
     assert found[matches >= 0].mean() > 0.75

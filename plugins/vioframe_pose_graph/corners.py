@@ -24,21 +24,19 @@ _TOLERATED = 3.0
 # Points that must say from where a keyframe before was seen.
 _LEAST_KNOWN = 10
 
-Seen = tuple[Place, View, Picture]
 
+def seen_again(view: View, patches: Patches, before: View, picture: Picture, R_CC: Float, apart: float) -> Float:
+    """(K, 2) where the keyframe that took ``picture`` just before saw the points of ``view``; NaN where it did not.
 
-def seen_again(place: Place, view: View, patches: Patches, other: Seen, apart: float) -> Float:
-    """(K, 2) where a keyframe just before saw the points of ``view``, on its z = 1 plane, NaN where it did not.
-
-    Points closer together than ``apart`` on that plane may be one.
+    ``R_CC`` (3, 3) leads from the camera of now to that of then, on whose z = 1 plane points closer together than
+    ``apart`` may be one.
     """
-    at, before, picture = other
     target_xy = before.xy_normalised.astype(np.float64)
     found = match(view.descriptors, before.descriptors, target_xy, _MAX_DISTANCE, _RATIO, apart)
     again = np.flatnonzero(found >= 0)
     # Next to one another two keyframes see the same but for how they are turned.
-    R, t, far = at.R_WC.T @ place.R_WC, np.zeros(3), np.zeros(len(again))
-    _, warp = laid_over(picture.model, view.xy_normalised[again].astype(np.float64), far, R, t)
+    far = np.zeros(len(again))
+    _, warp = laid_over(picture.model, view.xy_normalised[again].astype(np.float64), far, R_CC, np.zeros(3))
     xy = np.full((len(found), 2), np.nan)
     xy[again] = patches.select(again).found_in(picture, picture.model.distort(target_xy[found[again]]), warp)
     return xy

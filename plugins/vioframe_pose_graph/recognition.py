@@ -9,7 +9,7 @@ import numpy as np
 
 from vioframe.stopwatch import Stopwatch
 from vioframe.types import NS_PER_S, Float
-from vioframe_pose_graph.corners import Seen, located, seen_again
+from vioframe_pose_graph.corners import located, seen_again
 from vioframe_pose_graph.keyframes import Keyframe
 from vioframe_pose_graph.matching import DescriptorIndex
 from vioframe_pose_graph.options import PoseGraphOptions
@@ -64,7 +64,7 @@ class Recogniser:
         self._orb = corner_finder(options.max_corners)
         self._index = DescriptorIndex()
         self._remembered: dict[int, _Look] = {}
-        self._newest: deque[Seen] = deque(maxlen=_LOOKED_BACK)
+        self._newest: deque[tuple[Place, View, Picture]] = deque(maxlen=_LOOKED_BACK)
         self.places: list[Place] = []
         self.sightings: list[Sighting] = []
         self.seconds: dict[str, float] = {}
@@ -77,9 +77,9 @@ class Recogniser:
         watch.lap("describe")
         patches = Patches.of(picture, view.xy_normalised.astype(np.float64))
         before = [
-            (other[0], seen_again(place, view, patches, other, APART_PX / self._focal_px))
-            for other in self._newest
-            if other[0].segment == place.segment
+            (at, seen_again(view, patches, other, shot, at.R_WC.T @ place.R_WC, APART_PX / self._focal_px))
+            for at, other, shot in self._newest
+            if at.segment == place.segment
         ]
         view = located(place, view, before, _SIGMA_PX / self._focal_px)
         self._newest.append((place, view, picture))
