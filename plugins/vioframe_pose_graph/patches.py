@@ -20,8 +20,8 @@ from vioframe.types import Bool, Float, Image, Int
 _SIDE_PX = 11
 # Of a patch between pixels, with one more all round for its gradients.
 _CUT_PX = _SIDE_PX + 3
-# Patches are followed as they lie, and grown or shrunk to twice their size.
-_LARGEST = 4.0
+# A patch may have grown to so many times its area, or shrunk to one in so many.
+_GROWN = 4.0
 _NEAREST = 1e-3
 
 
@@ -60,8 +60,8 @@ class Patches:
 
         ``guess`` (K, 2) px is where they ought to be, ``warp`` (K, 2, 2) the map by which they are laid over it.
         """
-        size = np.abs(warp[:, 0, 0] * warp[:, 1, 1] - warp[:, 0, 1] * warp[:, 1, 0])
-        tried = picture.model.contains(guess) & (size > 1.0 / _LARGEST) & (size < _LARGEST)
+        grown = warp[:, 0, 0] * warp[:, 1, 1] - warp[:, 0, 1] * warp[:, 1, 0]
+        tried = picture.model.contains(guess) & (grown > 1.0 / _GROWN) & (grown < _GROWN)
         # One below the other they are an image of their own.
         strip = Pyramid((self.pixels.reshape(-1, _CUT_PX),), 0, _SIDE_PX)
         at = self.xy + np.column_stack([np.zeros(len(self.xy)), _CUT_PX * np.arange(len(self.xy))])

@@ -28,7 +28,7 @@ _LOOKED_BACK = 2
 # To which corners are found again, and landmarks lie where a keyframe saw them.
 _SIGMA_PX = 0.5
 # Places whose looks are remembered: some 150 kB each.
-_MOST_REMEMBERED = 2000
+_MOST_REMEMBERED = 1500
 
 
 @dataclass(frozen=True, slots=True, eq=False)
