@@ -26,6 +26,8 @@ REPROJECTION_PX = 3.0
 """Within which a point of one keyframe must be seen in the other to support a loop."""
 ALIGNED_PX = 1.5
 """The same of a patch that was laid over the other's picture."""
+# Of the patches in sight, so many must say the same.
+_LEAST_SHARE = 0.25
 _MAX_DISTANCE, _RATIO = 64, 0.85
 APART_PX = 10.0
 _HYPOTHESES = 300
@@ -94,8 +96,8 @@ def aligned(
 ) -> Relation:
     """``relation`` by the ``patches`` of the earlier keyframe found in the ``picture`` that the later one saw.
 
-    The patches are of those of its points that have a position, in their order. Where too few are found, as that of
-    few was known by then, the relation stays what corners say.
+    The patches are of those of its points that have a position, in their order. Where few of those in sight are found,
+    the relation stays what corners say: from far elsewhere nothing looks as it did, and one in ten is found by chance.
     """
     place, view = earlier
     known = np.flatnonzero(np.isfinite(view.p_WF[:, 0]))
@@ -117,7 +119,8 @@ def aligned(
         pairs=np.column_stack([known[found], found]),
     )
     tolerance = ALIGNED_PX / picture.model.focal_px
-    return _refined(seen, R_AB, p_AB - R_AB @ p_B, place.p_WB_seen, p_B, tolerance, min_inliers) or relation
+    least = max(min_inliers, round(_LEAST_SHARE * np.count_nonzero(picture.model.contains(guess))))
+    return _refined(seen, R_AB, p_AB - R_AB @ p_B, place.p_WB_seen, p_B, tolerance, least) or relation
 
 
 def correspondences(earlier: Seen, later: Seen, apart: float) -> Correspondences:
