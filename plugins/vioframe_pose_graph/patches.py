@@ -15,7 +15,7 @@ from vioframe.frontend.anchors import Anchors
 from vioframe.frontend.lucas_kanade import Pyramid
 from vioframe.geometry.cameras import Camera
 from vioframe.geometry.two_view import rays
-from vioframe.types import Bool, Float, Image, Int
+from vioframe.types import Float, Image, Int
 
 _SIDE_PX = 11
 # Of a patch between pixels, with one more all round for its gradients.
@@ -52,7 +52,7 @@ class Patches:
         rows, columns = first[:, 1, None] + beside, first[:, 0, None] + beside
         return Patches(picture.pyramid.images[0][rows[:, :, None], columns[:, None, :]], xy - first)
 
-    def select(self, which: Bool | Int | slice) -> Patches:
+    def select(self, which: Int | slice) -> Patches:
         return Patches(self.pixels[which], self.xy[which])
 
     def found_in(self, picture: Picture, guess: Float, warp: Float) -> Float:

@@ -67,6 +67,11 @@ class View:
     depth_sigma: Float32
     descriptors: Words
 
+    @property
+    def known(self) -> Int:
+        """(L,) which of the points have a position."""
+        return np.flatnonzero(np.isfinite(self.p_WF[:, 0]))
+
 
 def corner_finder(max_corners: int) -> cv2.ORB:
     """What finds up to ``max_corners`` corners, and describes any."""

@@ -42,8 +42,7 @@ class Sighting:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Look:
-    """How a place looked: points as in its view, their descriptors as rows of the index, and patches of those that have
-    a position."""
+    """How a place looked: points as in its view, their descriptors as rows of the index, and patches of the known."""
 
     xy_normalised: Float32
     p_WF: Float32
@@ -95,8 +94,8 @@ class Recogniser:
                 relation = aligned(relation, seen, self._remembered[earlier].patches, place, picture, least)
                 self.sightings.append(Sighting(earlier, number, relation))
         self.places.append(place)
-        known = patches.select(np.isfinite(view.p_WF[:, 0]))
-        self._remembered[number] = _Look(view.xy_normalised, view.p_WF, view.depth_sigma, rows, known)
+        kept = patches.select(view.known)
+        self._remembered[number] = _Look(view.xy_normalised, view.p_WF, view.depth_sigma, rows, kept)
         if len(self._remembered) > _MOST_REMEMBERED:
             self._thin_out()
         watch.lap("verify")

@@ -24,8 +24,8 @@ from vioframe_pose_graph.place import Place, View
 
 REPROJECTION_PX = 3.0
 """Within which a point of one keyframe must be seen in the other to support a loop."""
-ALIGNED_PX = 1.5
-"""The same of a patch that was laid over the other's picture."""
+# The same of a patch that was laid over the other's picture.
+_ALIGNED_PX = 1.5
 # Of the patches in sight, so many must say the same.
 _LEAST_SHARE = 0.25
 _MAX_DISTANCE, _RATIO = 64, 0.85
@@ -96,11 +96,11 @@ def aligned(
 ) -> Relation:
     """``relation`` by the ``patches`` of the earlier keyframe found in the ``picture`` that the later one saw.
 
-    The patches are of those of its points that have a position, in their order. Where few of those in sight are found,
-    the relation stays what corners say: from far elsewhere nothing looks as it did, and one in ten is found by chance.
+    The patches are of its known points. Where few of those in sight are found, the relation stays what corners say:
+    from far elsewhere nothing looks as it did, and one in ten is found by chance.
     """
     place, view = earlier
-    known = np.flatnonzero(np.isfinite(view.p_WF[:, 0]))
+    known = view.known
     points, xy = view.p_WF[known].astype(np.float64), view.xy_normalised[known].astype(np.float64)
     R_AB, p_AB, p_B = rotation_z(np.array(relation.yaw)), place.p_WB_seen + relation.z, later.p_WB_seen
     # Of the later camera in the world of the earlier one, and what that is from the earlier camera.
@@ -118,7 +118,7 @@ def aligned(
         p_WC=np.stack([place.p_WC, later.p_WC]),
         pairs=np.column_stack([known[found], found]),
     )
-    tolerance = ALIGNED_PX / picture.model.focal_px
+    tolerance = _ALIGNED_PX / picture.model.focal_px
     least = max(min_inliers, round(_LEAST_SHARE * np.count_nonzero(picture.model.contains(guess))))
     return _refined(seen, R_AB, p_AB - R_AB @ p_B, place.p_WB_seen, p_B, tolerance, least) or relation
 
@@ -127,7 +127,7 @@ def correspondences(earlier: Seen, later: Seen, apart: float) -> Correspondences
     """Match what has a position in one keyframe with all that the other saw, both ways."""
     sides = []
     for source, target in ((later[1], earlier[1]), (earlier[1], later[1])):
-        known = np.flatnonzero(np.isfinite(source.p_WF[:, 0]))
+        known = source.known
         xy = target.xy_normalised.astype(np.float64)
         found = match(source.descriptors[known], target.descriptors, xy, _MAX_DISTANCE, _RATIO, apart)
         known, found = known[found >= 0], found[found >= 0]
