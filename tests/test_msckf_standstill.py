@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from msckf_helpers import CALIBRATION, EXACT, drawn_start, random_covariance, random_state, since
+from msckf_helpers import CALIBRATION, EXACT, drawn_start, prior_of, random_covariance, random_state, since
 
 from vioframe.bench import run_backend
 from vioframe.estimation.lifecycle import LifeCycle
@@ -14,11 +14,12 @@ from vioframe.geometry import so3
 from vioframe.parts import registry
 from vioframe.simulation import simulated_sequence
 from vioframe.simulation.flights import ShapedFlight, levelled
-from vioframe.types import DBA, DBG, DTHETA, DV, Estimate, FrameTracks, ImuNoise, ImuSegment, Status, g_W
+from vioframe.types import DBA, DBG, DTHETA, DV, Estimate, FrameTracks, ImuNoise, ImuSegment, Start, Status, g_W
 from vioframe_msckf.backend import Msckf
 from vioframe_msckf.options import MsckfOptions
 from vioframe_msckf.state import IMU
 from vioframe_msckf.updates import hold_still
+from vioframe_sliding_window.backend import SlidingWindow
 
 NOISE = ImuNoise(gyro_density=1.7e-4, accel_density=2e-3, gyro_walk=2e-5, accel_walk=3e-3, rate_hz=200.0)
 
@@ -119,6 +120,42 @@ def test_take_off_is_followed_from_where_it_begins(name, most):
     assert np.linalg.norm(errors, axis=1)[: 3 * 20].max() < 0.035
     nees = [e @ np.linalg.solve(s.cov[3:6, 3:6], e) for s, e in zip(run.states, errors, strict=True)]
     assert max(nees) < most
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_what_a_body_crept_at_rest_is_no_velocity_of_its_take_off(seed):
+    """For four seconds it creeps by 2 mm/s, which no picture shows in half a second, and then goes up.
+
+    Had it stood until the window saw it elsewhere, 0.2 s later, it would have jumped there, at 4 to 5 cm/s.
+    """
+    R_LB = levelled(CALIBRATION.cameras[0].R_BC)
+
+    def position(t_s):
+        crept, risen = 2e-3 * np.clip(t_s, 0.0, 4.0), 0.15 * np.clip(t_s - 4.0, 0.0, 1.2) ** 2
+        return np.column_stack([np.zeros_like(t_s), crept, risen])
+
+    flight = ShapedFlight(6.0, position, lambda t_s: np.zeros((len(t_s), 3)), R_LB)
+    sequence = simulated_sequence(flight, pixel_sigma=0.1, duration_s=6.0, seed=seed)
+    run = run_backend(since(sequence, 1), SlidingWindow(), EXACT, drawn_start(sequence, 1, seed))
+    pairs = list(zip(run.states, sequence.true_states[1:], strict=True))
+    assert max(np.linalg.norm(s.v_WB - t.v_WB) for s, t in pairs[80:]) < 0.03
+    errors = [(s.p_WB - t.p_WB, s.cov[3:6, 3:6]) for s, t in pairs]
+    assert max(e @ np.linalg.solve(cov, e) for e, cov in errors) < 12.0
+
+
+def test_a_filter_sets_off_from_where_it_stood_but_for_what_it_trembled():
+    sequence = simulated_sequence("standstill", NOISE, 0.1, duration_s=2.0)
+    frames, noise = sequence.packets[1:4], sequence.calibration.imu
+    backend = Msckf()
+    backend.begin(Start(drawn_start(sequence, 1, 0), prior_of(sequence.calibration), noise, *frames[0]))
+    assert set(backend.process(*frames[1], still=True).stage_seconds) == {"standstill"}
+    expected = copy.deepcopy(backend.state)
+    expected.cov[:9, :9] += np.diag(np.repeat([1e-3, 5e-3, 5e-3], 3) ** 2)
+    imu, tracks = frames[2]
+    expected.propagate(imu, noise, True)
+    in_the_dark = tracks.only(np.zeros(len(tracks.ids), bool))
+    set_off = backend.process(imu, in_the_dark, still=False).state
+    np.testing.assert_allclose(set_off.cov, expected.cov[:IMU, :IMU], rtol=1e-9, atol=1e-15)
 
 
 def test_motion_is_what_the_common_tracks_do_together():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
@@ -121,6 +122,18 @@ def test_joined_segments_integrate_as_one_and_match_the_composition_of_both():
     )
     np.testing.assert_allclose(error_of(one, two), 0.0, atol=1e-12)
     assert join_segments([first, ImuSegment(second.t_ns, second.gyro_B, second.accel_B, 0.07)]).largest_gap_s == 0.07
+
+
+def test_what_is_uncertain_where_the_motion_begins_is_moved_to_its_end():
+    """As it would be if the state it begins from were uncertain; also when the readings are integrated anew."""
+    imu, sigma = exact_segment(0.3, 1.1, 200.0), np.repeat([0.01, 0.03, 0.2], 3)
+    begun = preintegrate(imu, ZERO, ZERO, NOISE, sigma)
+    for bias in (ZERO, 0.02 * np.ones(3)):
+        state = replace(exact_state(0.3), bias_gyro_B=bias, bias_accel_B=bias)
+        uncertain = replace(state, cov=np.diag(np.append(sigma, np.zeros(6)) ** 2))
+        expected = preintegrate(imu, bias, bias, NOISE).predict(uncertain).cov
+        found = begun.repropagated(bias, bias).predict(replace(state, cov=np.zeros((15, 15)))).cov
+        np.testing.assert_allclose(found, expected, atol=1e-9 * expected.max())
 
 
 def test_covariance_agrees_with_samples():

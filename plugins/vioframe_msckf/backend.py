@@ -46,6 +46,7 @@ class Msckf:
             readout=options.calibrate_readout,
         )
         self._imu_noise, self._noise_at_rest = start.calibration.calibration.imu, start.noise_at_rest
+        self._stands = False
         self.point_noise = PointNoise(options.pixel_sigma)
         cameras = len(start.calibration.calibration.cameras)
         self._observations, self._turns = TrackTable(cameras), Turns(cameras)
@@ -59,6 +60,7 @@ class Msckf:
         point_noise, gate = self.point_noise, self._gate
         if still and hold_still(state, imu, self._noise_at_rest, options.first_estimate_jacobians):
             point_noise.begin()
+            self._stands = True
             watch.lap("standstill")
             return Estimate(
                 Status.TRACKING,
@@ -66,6 +68,9 @@ class Msckf:
                 calibration=state.calibration(),
                 stage_seconds=watch.seconds,
             )
+        if self._stands:
+            state.set_off()
+            self._stands = False
         watch.lap("standstill")
 
         state.propagate(imu, noise_over(imu, self._noise_at_rest, self._imu_noise), options.first_estimate_jacobians)

@@ -17,6 +17,7 @@ from vioframe import lapack
 from vioframe.errors import DivergedError
 from vioframe.estimation import rig
 from vioframe.estimation.inertial.propagation import propagate, yaw_consistent_transition
+from vioframe.estimation.standstill import TREMBLE
 from vioframe.geometry import kernels
 from vioframe.geometry.cameras import intrinsics_of
 from vioframe.types import (
@@ -200,6 +201,11 @@ class FilterState:
         for part, density in ((DBG, noise.gyro_walk), (DBA, noise.accel_walk)):
             index = np.arange(part.start, part.stop)
             self.cov[index, index] += density**2 * duration_s
+
+    def set_off(self) -> None:
+        """Leave a standstill, from where the body came to rest but for what it trembled since."""
+        index = np.arange(DV.stop)
+        self.cov[index, index] += TREMBLE**2
 
     def augment_clone(self, gyro_B: Float) -> None:
         """Clone the body's pose; ``gyro_B`` (3,) rad/s is the rate there, free of bias."""

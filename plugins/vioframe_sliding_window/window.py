@@ -48,7 +48,7 @@ from vioframe.estimation.inertial.noise import noise_over
 from vioframe.estimation.inertial.preintegration import Preintegrated, join_segments, preintegrate
 from vioframe.estimation.point_noise import PointNoise
 from vioframe.estimation.repeats import Repeats
-from vioframe.estimation.standstill import Standstill
+from vioframe.estimation.standstill import TREMBLE, Standstill
 from vioframe.geometry.cameras import intrinsics_of
 from vioframe.geometry.kernels import undistorted
 from vioframe.geometry.two_view import rays
@@ -145,7 +145,8 @@ class Window:
     def _integrated(self, imu: ImuSegment) -> Preintegrated:
         """The readings behind the newest state, at its biases."""
         newest, noise = self._states[-1:], noise_over(imu, self._noise_at_rest, self._noise)
-        return preintegrate(imu, newest.bias_gyro_B[0], newest.bias_accel_B[0], noise)
+        trembled = TREMBLE * (len(self) - 1 in self._still)
+        return preintegrate(imu, newest.bias_gyro_B[0], newest.bias_accel_B[0], noise, trembled)
 
     def add_frame(self, imu: ImuSegment, predicted: NavState, tracks: FrameTracks) -> None:
         """Append the frame that ``imu`` leads to from the newest one, which gives way if it is no keyframe."""

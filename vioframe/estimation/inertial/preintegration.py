@@ -18,6 +18,8 @@ from vioframe.geometry.kernels import exp, hat, product, right_jacobian, turned
 from vioframe.jit import kernel
 from vioframe.types import DP, DTHETA, DV, Float, ImuNoise, ImuSegment, NavState, g_W
 
+_EXACT: Float = np.zeros(9)
+
 
 @dataclass(frozen=True, slots=True)
 class Preintegrated:
@@ -25,7 +27,8 @@ class Preintegrated:
 
     ``dR`` (3, 3) = R_BiBj; ``dp`` (3,) m and ``dv`` (3,) m/s in the first body frame [33]. ``cov`` (15, 15) covers
     [dtheta dp dv dbg dba] of the second state given the first, with right perturbation of ``dR``; its bias blocks are
-    the walk. ``bias_jacobian`` (9, 6) is d [dtheta dp dv] / d [bias_gyro bias_accel] [44].
+    the walk. ``bias_jacobian`` (9, 6) is d [dtheta dp dv] / d [bias_gyro bias_accel] [44]. ``sigma_first`` (9,) are the
+    standard deviations of [dtheta dp dv] of where the motion began, given the first state.
     """
 
     dt_s: float
@@ -38,6 +41,7 @@ class Preintegrated:
     bias_accel_B: Float
     imu: ImuSegment
     noise: ImuNoise
+    sigma_first: Float
 
     def corrected(self, bias_gyro_B: Float, bias_accel_B: Float) -> tuple[Float, Float, Float]:
         """``dR``, ``dp``, ``dv`` at other biases, to first order [44]; good for changes of a few 0.01 rad/s."""
@@ -47,7 +51,7 @@ class Preintegrated:
 
     def repropagated(self, bias_gyro_B: Float, bias_accel_B: Float) -> Preintegrated:
         """The same readings integrated anew at other biases, for changes too large for :meth:`corrected`."""
-        return preintegrate(self.imu, bias_gyro_B, bias_accel_B, self.noise)
+        return preintegrate(self.imu, bias_gyro_B, bias_accel_B, self.noise, self.sigma_first)
 
     def predict(self, state: NavState) -> NavState:
         """Where ``state`` leads, with its biases; with covariance if it has one."""
@@ -77,13 +81,18 @@ class Preintegrated:
         return 0.5 * (out + out.T)
 
 
-def preintegrate(imu: ImuSegment, bias_gyro_B: Float, bias_accel_B: Float, noise: ImuNoise) -> Preintegrated:
-    """Integrate ``imu`` at the biases (3,) rad/s and (3,) m/s^2; ``noise`` gives continuous-time densities."""
+def preintegrate(
+    imu: ImuSegment, bias_gyro_B: Float, bias_accel_B: Float, noise: ImuNoise, sigma_first: Float = _EXACT
+) -> Preintegrated:
+    """Integrate ``imu`` at the biases (3,) rad/s and (3,) m/s^2; ``noise`` gives continuous-time densities.
+
+    ``sigma_first`` is that of :class:`Preintegrated`.
+    """
     variance = np.square([noise.gyro_density, noise.accel_density, noise.gyro_walk, noise.accel_walk])
-    dR, dp, dv, cov, bias_jacobian = _integrate(imu.dt, imu.gyro_B - bias_gyro_B, imu.accel_B - bias_accel_B, variance)
-    return Preintegrated(
-        imu.duration_s, dR, dp, dv, cov, bias_jacobian, bias_gyro_B.copy(), bias_accel_B.copy(), imu, noise
-    )
+    gyro, accel = imu.gyro_B - bias_gyro_B, imu.accel_B - bias_accel_B
+    dR, dp, dv, cov, bias_jacobian = _integrate(imu.dt, gyro, accel, variance, sigma_first)
+    biases = bias_gyro_B.copy(), bias_accel_B.copy()
+    return Preintegrated(imu.duration_s, dR, dp, dv, cov, bias_jacobian, *biases, imu, noise, sigma_first)
 
 
 def join_segments(segments: Sequence[ImuSegment]) -> ImuSegment:
@@ -100,7 +109,9 @@ def join_segments(segments: Sequence[ImuSegment]) -> ImuSegment:
 
 
 @kernel
-def _integrate(dt: Float, gyro: Float, accel: Float, variance: Float) -> tuple[Float, Float, Float, Float, Float]:
+def _integrate(
+    dt: Float, gyro: Float, accel: Float, variance: Float, sigma_first: Float
+) -> tuple[Float, Float, Float, Float, Float]:
     """Readings free of bias (N, 3); ``variance`` (4,) = squared densities of gyro, accel, gyro walk, accel walk.
 
     White noise averaged over an interval of h seconds has the variance density^2 / h. Taking the two readings of an
@@ -110,6 +121,8 @@ def _integrate(dt: Float, gyro: Float, accel: Float, variance: Float) -> tuple[F
     cov, bias_jacobian = np.zeros((15, 15)), np.zeros((15, 6))
     for k in range(6):
         bias_jacobian[9 + k, k] = 1.0
+    for k in range(9):
+        cov[k, k] = sigma_first[k] * sigma_first[k]
     by_theta, by_biases = np.zeros((6, 3)), np.zeros((9, 6))
     for i in range(len(dt)):
         h = dt[i]
