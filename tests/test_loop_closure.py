@@ -206,9 +206,10 @@ def test_points_of_uncertain_depth_tell_what_they_can():
         depth = 1.0 + seen.depth_sigma[:, None] * rng.standard_normal((len(seen.points), 1))
         xy = seen.xy + 0.5 / 460.0 * rng.standard_normal(seen.xy.shape)
         noisy = replace(seen, points=source + depth * (seen.points - source), xy=xy)
-        p_A, p_B = seen.p_WC
-        found = _refined(noisy, rotation_z(np.array(yaw)), t, p_A, p_B, tolerance, 25)
-        error = np.append(found.z - (rotation_z(np.array(yaw)) @ p_B + t - p_A), found.yaw - yaw)
+        (p_A, p_B), R_AB = seen.p_WC, rotation_z(np.array(yaw))
+        p_AB = R_AB @ p_B + t
+        found = _refined(noisy, R_AB, p_AB, p_A, p_B, tolerance, 25)
+        error = np.append(found.z - (p_AB - p_A), found.yaw - yaw)
         squares.append(error @ np.linalg.solve(found.cov, error) / 4.0)
         off.append(np.linalg.norm(error[:3]))
     assert 0.5 < np.mean(squares) < 1.5
@@ -217,9 +218,10 @@ def test_points_of_uncertain_depth_tell_what_they_can():
 
 def fitted(seen, yaw, t):
     """How far the fit puts the later camera from where it is, m."""
-    p_A, p_B = seen.p_WC
-    found = _refined(seen, rotation_z(np.array(yaw)), t, p_A, p_B, 3.0 / 460.0, 25)
-    return np.linalg.norm(found.z - (rotation_z(np.array(yaw)) @ p_B + t - p_A))
+    (p_A, p_B), R_AB = seen.p_WC, rotation_z(np.array(yaw))
+    p_AB = R_AB @ p_B + t
+    found = _refined(seen, R_AB, p_AB, p_A, p_B, 3.0 / 460.0, 25)
+    return np.linalg.norm(found.z - (p_AB - p_A))
 
 
 def noisy(seen, rng, sigma_px=0.2):

@@ -88,7 +88,8 @@ def relate(earlier: Seen, later: Seen, focal_px: float, min_inliers: int) -> Rel
     support, yaw, t = ransac(seen, _draw_pairs(seen.side), _COARSE * tolerance)
     if support < min_inliers:
         return None
-    return _refined(seen, rotation_z(yaw), t, earlier[0].p_WB_seen, later[0].p_WB_seen, tolerance, min_inliers)
+    R_AB, p_B = rotation_z(yaw), later[0].p_WB_seen
+    return _refined(seen, R_AB, R_AB @ p_B + t, earlier[0].p_WB_seen, p_B, tolerance, min_inliers)
 
 
 def aligned(
@@ -120,7 +121,7 @@ def aligned(
     )
     tolerance = _ALIGNED_PX / picture.model.focal_px
     least = max(min_inliers, round(_LEAST_SHARE * np.count_nonzero(picture.model.contains(guess))))
-    return _refined(seen, R_AB, p_AB - R_AB @ p_B, place.p_WB_seen, p_B, tolerance, least) or relation
+    return _refined(seen, R_AB, p_AB, place.p_WB_seen, p_B, tolerance, least) or relation
 
 
 def correspondences(earlier: Seen, later: Seen, apart: float) -> Correspondences:
@@ -184,7 +185,7 @@ def _shortened(values: Float, along: Float, sigma: float) -> Float:
 
 
 def _refined(
-    seen: Correspondences, R_AB: Float, t: Float, p_A: Float, p_B: Float, tolerance: float, min_inliers: int
+    seen: Correspondences, R_AB: Float, p_AB: Float, p_A: Float, p_B: Float, tolerance: float, min_inliers: int
 ) -> Relation | None:
     """Iterate to the likeliest fit of what lies within ``tolerance``, which is decided anew each time.
 
@@ -197,7 +198,7 @@ def _refined(
     How far away a point is is known to some per cent, so it counts less along the line on which a wrong depth would
     move it: the farther the two cameras are apart, the more.
     """
-    p_AB, sigma = R_AB @ p_B + t, tolerance / _TOLERATED
+    sigma = tolerance / _TOLERATED
     for _ in range(_ITERATIONS):
         r, J, along = residuals(seen, p_B, p_AB, R_AB)
         off = _shortened(r[:, :, None], along, tolerance / _TOLERATED)[:, :, 0]
