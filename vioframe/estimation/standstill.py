@@ -26,9 +26,9 @@ leave a body that is shaken at rest without corrections for longer."""
 _VELOCITY_SIGMA_M_S = 0.01
 # A body that stands still may yet shake, so its readings scatter this many times more than the sensor's noise.
 _SHAKING = 10.0
-TREMBLE: Float = np.repeat([1e-3, 5e-3, 5e-3], 3)
-"""(9,) [rad, m, m/s] by which a body that sets off may be off from where it came to rest, as a picture of things three
-metres away allows that has not moved by a pixel. Images say what way it took to a hundredth of that: were it thought to
+TREMBLE: Float = np.repeat([5e-4, 2e-3, 5e-3], 3)
+"""(9,) [rad, m, m/s] by which a body that sets off may be off from where it came to rest: for a while a picture of
+things a few metres away shows no more than that. Images say what way it took to a twentieth of it: were it thought to
 have begun just where it came to rest, velocity and biases would answer for the difference."""
 
 
