@@ -203,9 +203,12 @@ class FilterState:
             self.cov[index, index] += density**2 * duration_s
 
     def set_off(self) -> None:
-        """Leave a standstill, from where the body came to rest but for what it trembled since."""
-        index = np.arange(DV.stop)
-        self.cov[index, index] += TREMBLE**2
+        """Leave a standstill, at a velocity that its picture did not show.
+
+        The pose stays what it was: no landmark is known that would tell how it has trembled since.
+        """
+        index = np.arange(DV.start, DV.stop)
+        self.cov[index, index] += TREMBLE[DV] ** 2
 
     def augment_clone(self, gyro_B: Float) -> None:
         """Clone the body's pose; ``gyro_B`` (3,) rad/s is the rate there, free of bias."""
