@@ -45,7 +45,7 @@ from vioframe.estimation.factors.reprojection import (
 from vioframe.estimation.factors.solver import covariance, solve
 from vioframe.estimation.factors.tracks import LandmarkTable, TrackTable
 from vioframe.estimation.inertial.noise import noise_over
-from vioframe.estimation.inertial.preintegration import Preintegrated, join_segments, preintegrate
+from vioframe.estimation.inertial.preintegration import EXACT, Preintegrated, join_segments, preintegrate
 from vioframe.estimation.point_noise import PointNoise
 from vioframe.estimation.repeats import Repeats
 from vioframe.estimation.standstill import TREMBLE, Standstill
@@ -140,20 +140,19 @@ class Window:
 
     def predict(self, imu: ImuSegment) -> NavState:
         """Where the readings lead from the newest state, with covariance."""
-        return self._integrated(imu).predict(self.newest)
+        return self._integrated(imu, EXACT).predict(self.newest)
 
-    def _integrated(self, imu: ImuSegment) -> Preintegrated:
-        """The readings behind the newest state, at its biases."""
+    def _integrated(self, imu: ImuSegment, sigma_first: Float) -> Preintegrated:
+        """The readings behind the newest state, at its biases, from within ``sigma_first`` (9,) of it."""
         newest, noise = self._states[-1:], noise_over(imu, self._noise_at_rest, self._noise)
-        trembled = TREMBLE * (len(self) - 1 in self._still)
-        return preintegrate(imu, newest.bias_gyro_B[0], newest.bias_accel_B[0], noise, trembled)
+        return preintegrate(imu, newest.bias_gyro_B[0], newest.bias_accel_B[0], noise, sigma_first)
 
     def add_frame(self, imu: ImuSegment, predicted: NavState, tracks: FrameTracks) -> None:
         """Append the frame that ``imu`` leads to from the newest one, which gives way if it is no keyframe."""
         if not self._newest_is_keyframe:
             imu = join_segments([self._readings[-1].imu, imu])
             self._drop_newest()
-        self._readings.append(self._integrated(imu))
+        self._readings.append(self._integrated(imu, TREMBLE if len(self) - 1 in self._still else EXACT))
         self._t_ns.append(predicted.t_ns)
         self._states = self._states.append(StateArrays.stack([predicted]))
         self._gyro_B = np.concatenate([self._gyro_B, imu.gyro_B[-1:]])

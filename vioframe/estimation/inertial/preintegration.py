@@ -18,7 +18,8 @@ from vioframe.geometry.kernels import exp, hat, product, right_jacobian, turned
 from vioframe.jit import kernel
 from vioframe.types import DP, DTHETA, DV, Float, ImuNoise, ImuSegment, NavState, g_W
 
-_EXACT: Float = np.zeros(9)
+EXACT: Float = np.zeros(9)
+"""(9,) standard deviations of a motion that begins just at its first state."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,7 +83,7 @@ class Preintegrated:
 
 
 def preintegrate(
-    imu: ImuSegment, bias_gyro_B: Float, bias_accel_B: Float, noise: ImuNoise, sigma_first: Float = _EXACT
+    imu: ImuSegment, bias_gyro_B: Float, bias_accel_B: Float, noise: ImuNoise, sigma_first: Float = EXACT
 ) -> Preintegrated:
     """Integrate ``imu`` at the biases (3,) rad/s and (3,) m/s^2; ``noise`` gives continuous-time densities.
 
