@@ -12,7 +12,7 @@ from vioframe.geometry import so3
 from vioframe.io.calibration import packaged_calibration
 from vioframe.simulation import TrackSequence, simulated_sequence
 from vioframe.simulation.tracks import EUROC_NOISE
-from vioframe.types import Calibration, CalibrationEstimate, CameraSigma, Float, Int, NavState
+from vioframe.types import Calibration, CalibrationEstimate, Float, Int, NavState
 from vioframe_msckf.state import IMU, FilterState
 
 CALIBRATION = packaged_calibration("euroc", cameras=["cam0"])
@@ -38,9 +38,7 @@ def sighting_rows(state: FilterState, clone: int, landmarks: Int, cameras: Int, 
 
 def prior_of(calibration: Calibration) -> CalibrationEstimate:
     """``calibration`` as well known as the life cycle takes any to be."""
-    intrinsics = np.repeat([1.0, 0.005], 4)
-    sigma = CameraSigma(np.full(3, 0.005), np.full(3, 0.015), 0.01, intrinsics)
-    return CalibrationEstimate(calibration, (sigma,) * len(calibration.cameras))
+    return CalibrationEstimate(calibration, (EstimationOptions().camera_sigma,) * len(calibration.cameras))
 
 
 def random_covariance(rng: np.random.Generator, n: int) -> Float:

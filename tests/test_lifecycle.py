@@ -445,7 +445,8 @@ def test_every_estimate_carries_what_is_learned_and_gets_surer(name):
 
 def test_a_backend_that_learns_nothing_passes_on_what_it_began_with():
     sequence = flight()
-    life = begun(created("loose_ekf"))
+    options = EstimationOptions(extrinsics_sigma_deg=2.0, extrinsics_sigma_m=0.05)
+    life = begun(created("loose_ekf"), options)
     learned = [life.process(*packet).calibration for packet in sequence.packets[1:5]]
     for one in learned:
         assert one is not None
@@ -453,4 +454,5 @@ def test_a_backend_that_learns_nothing_passes_on_what_it_began_with():
         assert (camera.model, camera.time_offset_ns, one.calibration.imu) == (given.model, 0, CALIBRATION.imu)
         np.testing.assert_array_equal(camera.R_BC, given.R_BC)
         np.testing.assert_array_equal(camera.p_BC, given.p_BC)
-        np.testing.assert_array_equal(one.sigma[0].rotation, np.full(3, 0.005))
+        np.testing.assert_allclose(one.sigma[0].rotation, np.full(3, np.deg2rad(2.0)))
+        np.testing.assert_array_equal(one.sigma[0].position, np.full(3, 0.05))

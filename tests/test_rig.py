@@ -26,8 +26,8 @@ def test_each_camera_is_known_as_the_first_and_both_beside_each_other_much_bette
     turned = [
         so3.log(given.T @ so3.exp(-a) @ given @ so3.exp(b)) for a, b in zip(one[:, :3], other[:, :3], strict=True)
     ]
-    np.testing.assert_allclose(np.std(turned, axis=0), np.sqrt(2.0) * 0.002, rtol=0.05)
-    np.testing.assert_allclose(np.std(one[:, 3:6] - other[:, 3:6], axis=0), np.sqrt(2.0) * 0.002, rtol=0.05)
+    np.testing.assert_allclose(np.std(turned, axis=0), np.sqrt(2.0) * 0.001, rtol=0.05)
+    np.testing.assert_allclose(np.std(one[:, 3:6] - other[:, 3:6], axis=0), np.sqrt(2.0) * 0.001, rtol=0.05)
     np.testing.assert_allclose(np.std(one[:, 6] - other[:, 6]), np.sqrt(2.0) * 0.001, rtol=0.05)
     assert np.abs(np.corrcoef(one[:, 8], other[:, 8])[0, 1]) < 0.1
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from vioframe.errors import ConfigError, DivergedError, PluginError
 from vioframe.estimation.inertial.preintegration import join_segments, preintegrate
-from vioframe.estimation.initialization import GIVEN, Initializer
+from vioframe.estimation.initialization import Initializer
 from vioframe.estimation.options import EstimationOptions
 from vioframe.estimation.recovery import check_plausible, continued_from
 from vioframe.estimation.soundness import defect_of
@@ -56,7 +56,7 @@ class LifeCycle:
             unknown = next(camera.name for camera in calibration.cameras if not camera.rotation_known)
             raise ConfigError(f"of a rig every camera's rotation on the body must be known, that of {unknown} is not")
         self._given = calibration
-        self._initializer = Initializer(calibration)
+        self._initializer = Initializer(calibration, self._options.camera_sigma)
         self._standstills = [StandstillDetector(self._options.standstill_disparity_px) for _ in calibration.cameras]
         self._initial_state = initial_state
         self._following = False
@@ -66,7 +66,7 @@ class LifeCycle:
         self._settled = Estimate(Status.INITIALISING)  # the newest that is the back-end's own
         self._last: NavState | None = None
         self._corrected_ns = 0
-        self._known = CalibrationEstimate(calibration, (GIVEN,) * len(calibration.cameras))
+        self._known = CalibrationEstimate(calibration, (self._options.camera_sigma,) * len(calibration.cameras))
 
     @property
     def calibration(self) -> Calibration:
@@ -175,7 +175,7 @@ class LifeCycle:
         # It may have been found at this very frame.
         tracks = tracks.undistorted(*calibration.lenses).finite()
         flying = replace(calibration, imu=self._options.in_flight(calibration.imu))
-        sigma = (self._initializer.camera_sigma, *(GIVEN for _ in calibration.cameras[1:]))
+        sigma = (self._initializer.camera_sigma, *(self._options.camera_sigma for _ in calibration.cameras[1:]))
         prior = CalibrationEstimate(flying, sigma)
         return Start(state, prior, calibration.imu, imu, tracks)
 

@@ -8,7 +8,7 @@ from vioframe.types import CalibrationEstimate, Float
 
 # To this the cameras of a rig are known beside each other, rad, m and s: by what they saw together, while only motion
 # tells how all of them sit on the IMU. What the first one's standard deviations have beyond it is common to all.
-_BESIDE = np.repeat([0.002, 0.002, 0.001], [3, 3, 1])
+_BESIDE = np.full(7, 0.001)
 
 
 def covariance(prior: CalibrationEstimate) -> Float:

@@ -27,6 +27,7 @@ from vioframe.estimation.initialization.window import (
     seen_anew,
     unrolled,
 )
+from vioframe.estimation.options import EstimationOptions
 from vioframe.geometry import so3
 from vioframe.types import (
     NS_PER_S,
@@ -60,8 +61,8 @@ _MOST_CONTRADICTIONS = 3
 _WITHOUT_ITS_FRAMES = 2.0
 # A camera that is turned by more than this on the body, rad, no back-end finds by itself.
 _MOUNTED_DIFFERENTLY = np.deg2rad(15.0)
-# How well a calibration is known (rad, m, s, px, distortion), as published for OpenVINS on EuRoC.
-GIVEN = CameraSigma(np.full(3, 0.005), np.full(3, 0.015), 0.01, np.repeat([1.0, 0.005], 4))
+GIVEN = EstimationOptions().camera_sigma
+"""How well the calibration of a camera is known unless somebody says otherwise."""
 
 
 class Initializer:
@@ -73,8 +74,9 @@ class Initializer:
     Every attempt is logged to ``vioframe.estimation.initialization``.
     """
 
-    def __init__(self, calibration: Calibration) -> None:
-        self._given = calibration
+    def __init__(self, calibration: Calibration, sigma: CameraSigma = GIVEN) -> None:
+        """``sigma`` is how well each camera of ``calibration`` is known."""
+        self._given, self._given_sigma = calibration, sigma
         self._calibration = calibration.only(0)
         self._sensors = SensorCheck()
         self._found: Found | None = None
@@ -237,7 +239,7 @@ class Initializer:
             return None
         self._next_stereo_ns = packets[-1][1].t_ns + round((_SOON_S - 1e-3) * NS_PER_S)
         calibration = replace(self.calibration, imu=self._noise_in_motion())
-        first, others = self._sigma(_WITHOUT_ITS_FRAMES), tuple(GIVEN for _ in calibration.cameras[1:])
+        first, others = self._sigma(_WITHOUT_ITS_FRAMES), tuple(self._given_sigma for _ in calibration.cameras[1:])
         wrong = np.sqrt(np.diag(self._doubted(np.diag(first.stacked() ** 2))))
         doubted = replace(CameraSigma.of(wrong), readout_s=first.readout_s)
         known, doubted_cov = (
@@ -287,7 +289,7 @@ class Initializer:
 
     def _sigma(self, factor: float = 1.0) -> CameraSigma:
         """How well the calibration is known, what was found of it ``factor`` times as unsure."""
-        return GIVEN if self._found is None else self._found.sigma(GIVEN, factor)
+        return self._given_sigma if self._found is None else self._found.sigma(self._given_sigma, factor)
 
     def _doubted(self, known: Float) -> Float:
         """``known`` (16, 16), with what the calibration may be wrong by where nothing bears it out."""
