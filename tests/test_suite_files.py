@@ -251,6 +251,14 @@ class TestPlan:
         assert len({task.recording.name for task in tasks}) == 1
         assert [task.config.start_s for task in tasks] == [0.0, 0.5, 1.0]
 
+    def test_recordings_stay_the_same_where_more_are_flown(self, tmp_path):
+        def recordings(seeds):
+            text = TOY.replace("[TOY]", "[{name: hover, duration_s: 5.0}]")
+            suite = read(tmp_path, f"{text}seeds: {seeds}\nseeds_vary: recording\n")
+            return [task.recording for task in plan(suite, (), INSTALLED)]
+
+        assert recordings(3)[:1] == recordings(1)
+
     def test_what_a_result_depends_on_is_in_its_fingerprint(self, tmp_path):
         def fingerprint(text):
             return plan(read(tmp_path, text.replace("TOY", "hover")), (), INSTALLED)[0].about

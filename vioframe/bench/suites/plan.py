@@ -64,14 +64,15 @@ def _flights(suite: Suite, folders: Sequence[Path], installed: Registry) -> Iter
     conditions = [(CLEAR, 0.0)] if suite.clear else []
     conditions += [(name, level) for name, levels in suite.conditions.items() for level in levels]
     rig: RigName = "stereo" if any(backend.rig == "stereo" for backend in suite.backends) else "mono"
+    # Of a recording that all seeds share there is enough for the one that starts last.
+    shift_s = SEED_SHIFT_S * (suite.seeds - 1) if suite.seeds_vary == "start" else 0.0
     found = {each.name: sources.find_source(each.name, folders, installed) for each in suite.sequences}
     create_metrics(suite.metrics, installed)  # says what is wrong with one before anything is flown
     for sequence, (condition, level), seed in product(suite.sequences, conditions, range(suite.seeds)):
         flown = sources.flown(
             found[sequence.name],
             start_s=sequence.start_s,
-            # Whichever seed comes last, there is enough of it for all.
-            duration_s=None if sequence.duration_s is None else sequence.duration_s + SEED_SHIFT_S * (suite.seeds - 1),
+            duration_s=None if sequence.duration_s is None else sequence.duration_s + shift_s,
             conditions={condition: level} if level else {},
             rig=rig,
             seed=seed_for(suite.worlds, seed if suite.seeds_vary == "recording" else 0),
