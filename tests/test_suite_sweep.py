@@ -163,6 +163,14 @@ class TestSweep:
             run(tmp_path, GRID, toy, out="mine", overwrite=True)
         assert (tmp_path / "mine" / "thesis.tex").exists()
 
+    def test_more_seeds_are_flown_beside_those_there_are(self, tmp_path, toy, results, cluster):
+        kept = estimates(results)
+        outcome, _, _ = run(tmp_path, GRID.replace("seeds: 2", "seeds: 3"), toy, scheduler=cluster)
+        assert (outcome.done, outcome.reused, outcome.failed) == (2, 4, {})
+        assert estimates(results).items() > kept.items()
+        with pytest.raises(RunError, match="another suite's results, which differs in seeds"):
+            run(tmp_path, GRID, toy, scheduler=cluster)
+
     def test_two_sweeps_keep_out_of_each_others_folder(self, tmp_path, toy, results):
         with Store.at(results).alone(), pytest.raises(RunError, match="another sweep is at work"):
             run(tmp_path, GRID, toy)

@@ -48,20 +48,21 @@ class Store:
         return tuple(f"{self.recordings.name}/{file}" for file in ("*.bag", ".lock", *beside, *made))
 
     def begin(self, suite: Suite, *, overwrite: bool) -> None:
-        """Make the folder that of ``suite``, or go on with it; raises :class:`RunError` where it is another suite's."""
+        """Make the folder that of ``suite``, or go on with it; raises :class:`RunError` where it is another suite's.
+
+        With more seeds than before it is the same one.
+        """
         text, file = to_yaml(suite), self.path / SUITE_FILE
         if self.path.exists() and any(self.path.iterdir()):
             if not file.is_file():
                 raise RunError(
                     f"{self.path} holds no {SUITE_FILE}, is no results folder and stays; choose another --out"
                 )
-            if file.read_text(encoding="utf-8") != text:
+            if file.read_text(encoding="utf-8") != text and (differing := _differing(file, suite)):
                 if not overwrite:
-                    before, now = read_tree(file), to_jsonable_python(suite.model_dump())
-                    differing = ", ".join(key for key in now if before.get(key) != now[key]) or "what it says"
                     raise RunError(
-                        f"{self.path} holds another suite's results, which differs in {differing}; choose another "
-                        "--out, or --overwrite to begin anew"
+                        f"{self.path} holds another suite's results, which differs in {', '.join(differing)}; choose "
+                        "another --out, or --overwrite to begin anew"
                     )
                 remove_written(self.path, (*RESULT_FILES, *self._own_recordings))
         try:
@@ -108,6 +109,15 @@ class Store:
             path.unlink(missing_ok=True)
             for folder in (simulation_folder(path), sidecar_folder(path)):
                 shutil.rmtree(folder, ignore_errors=True)
+
+
+def _differing(file: Path, suite: Suite) -> list[str]:
+    """In what the suite in ``file`` is another than ``suite``; in nothing where that only has more seeds."""
+    before, now = read_tree(file), to_jsonable_python(suite.model_dump())
+    keys = [key for key in now if before.get(key) != now[key]]
+    if keys == ["seeds"] and before.get("seeds") in range(suite.seeds):
+        return []
+    return keys or ["what it says"]
 
 
 @contextmanager
