@@ -578,6 +578,19 @@ def contest() -> str:
     return markdown(shown) + suite_source("stress")
 
 
+def exact_points() -> str:
+    """What is left of Shi-Tomasi's error in the suite ``stress`` where its points are exact, by condition."""
+    rows = recorded("exact_points.json")
+    rows = rows.assign(ratio=rows["exact_mm"] / rows["ate_mm"])
+    degraded = rows[rows["condition"] != "clear"].assign(condition="all degraded")
+    shown = [
+        {"": str(condition)}
+        | {f"`{name}`": f"{geometric_mean(of['ratio']):.2f} (n = {len(of)})" for name, of in own.groupby("backend")}
+        for condition, own in pd.concat([rows, degraded]).groupby("condition", sort=False)
+    ]
+    return markdown(shown) + source(rows)
+
+
 def tuning() -> str:
     """The suite ``tuning``: what each variant reaches by Shi-Tomasi's ATE, in the clear and in all that is degraded."""
     table = _duels("tuning")
@@ -665,6 +678,7 @@ FIGURES: dict[str, Callable[[], str]] = {
             targets,
             stress,
             contest,
+            exact_points,
             throughput,
             rolling_shutter,
             planted_faults,
