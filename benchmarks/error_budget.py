@@ -22,7 +22,7 @@ this flies MH_02, MH_03 and V1_01.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -91,10 +91,11 @@ class Case:
     true_start: bool = False
 
 
+EXACT_POINTS = Case("exact points", points="exact")
 CASES = (
     Case("as flown"),
     Case("white noise", points="white"),
-    Case("exact points", points="exact"),
+    EXACT_POINTS,
     Case("published path", path="published"),
     Case("specified IMU", path="smooth", imu="specified"),
     Case("exact IMU", path="smooth", imu="exact"),
@@ -165,8 +166,12 @@ def follow(recording: SimulatedRecording, config: Config, installed: Registry) -
     incidents, offset_ns = Incidents(), calibration.cameras[0].time_offset_ns
     frontend = Frontend(detector, calibration, config.frontend_options, incidents)
     packets = synchronise(recording.measurements(), incidents=incidents, time_offset_ns=offset_ns)
-    tracks = [frontend.track(imu, frames, calibration) for imu, frames in packets]
-    (camera,) = calibration.cameras
+    return with_landmarks([frontend.track(imu, frames, calibration) for imu, frames in packets], recording)
+
+
+def with_landmarks(tracks: Sequence[FrameTracks], recording: SimulatedRecording) -> Followed:
+    """The ``tracks`` of a camera that flew in the world of ``recording``, with the landmarks behind them."""
+    (camera,) = recording.calibration.cameras
     R_WB, p_WB = recording.scenario.motion(np.array([frame.t_ns for frame in tracks]))[:2]
     known = landmarks_of(tracks, *camera.pose(R_WB, p_WB), recording.world.mesh.corners)
     kept, landmarks, errors = [], [], []
@@ -210,9 +215,9 @@ def estimated(
 def _sequence(case: Case, followed: Followed, recording: SimulatedRecording, seed: int) -> TrackSequence:
     frames_ns = np.array([frame.t_ns for frame in followed.tracks])
     calibration, scenario = recording.calibration, recording.scenario
-    folder = recording.config.recorded
-    assert folder is not None
     if case.path == "published":
+        folder = recording.config.recorded
+        assert folder is not None
         published = load_euroc(folder, start_s=recording.config.start_s, duration_s=recording.config.duration_s)
         scenario = replace(scenario, motion=published.motion)
     elif case.path == "smooth":
@@ -231,7 +236,7 @@ def _sequence(case: Case, followed: Followed, recording: SimulatedRecording, see
             xy = xy + rng.normal(0.0, sigma_px, xy.shape)
         packets.append((imu, replace(tracks, xy=xy).only(ahead).undistorted(*calibration.lenses).finite()))
     truth = Trajectory(frames_ns, R_WB, p_WB)
-    return TrackSequence(folder.name, calibration, tuple(packets), truth, scenario.states_at(frames_ns))
+    return TrackSequence(recording.scenario.name, calibration, tuple(packets), truth, scenario.states_at(frames_ns))
 
 
 def _flown(

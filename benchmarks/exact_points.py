@@ -18,24 +18,18 @@ from pathlib import Path
 import click
 import numpy as np
 from common import present
-from error_budget import pixels
-from threadpoolctl import threadpool_limits
+from error_budget import EXACT_POINTS, estimated, with_landmarks
 
-from vioframe.bench import Row, backend_row, run_backend
+from vioframe.bench import Row
 from vioframe.bench.suites import suite as suites
 from vioframe.bench.suites.plan import plan
 from vioframe.bench.suites.tasks import FlightTask
 from vioframe.cores import usable_cores
-from vioframe.evaluation.tracks import landmarks_of
 from vioframe.geometry.cameras import Camera
-from vioframe.geometry.trajectory import Trajectory
 from vioframe.parts import registry
 from vioframe.runs.folder import RunFolder
 from vioframe.runs.results import SUITE_FILE, read_rows
-from vioframe.simulation import TrackSequence
-from vioframe.simulation.config import SimulationConfig
 from vioframe.simulation.recording import SimulatedRecording
-from vioframe.simulation.tracks import cut_segments
 from vioframe.types import FrameTracks
 
 COLUMNS = {"condition": "", "level": ".2f", "seed": "d", "backend": "", "ate_mm": ".1f", "exact_mm": ".1f"}
@@ -57,45 +51,20 @@ def main(results: Path, keep: bool) -> None:
     settings = {"suite": suite.title, "detector": detector, "flights": len(flights)}
     with ProcessPoolExecutor(usable_cores(), mp_context=get_context("spawn")) as workers:
         rows = workers.map(with_exact_points, *zip(*whole, strict=True), [results] * len(whole))
-        present(
-            "exact_points",
-            f"ATE by {detector}, and with its points where they truly are",
-            rows,
-            COLUMNS,
-            settings,
-            keep,
-        )
+        title = f"ATE by {detector}, and with its points where they truly are"
+        present("exact_points", title, rows, COLUMNS, settings, keep)
 
 
 def with_exact_points(task: FlightTask, flown: Row, results: Path) -> Row:
     """The flight of ``task``, which has been ``flown``, estimated again."""
-    installed, recording = registry.load(), task.recording
-    assert recording is not None
-    config = task.config
-    backend = installed.create_backend(config.backend.name, config.backend.options)
-    sequence = exact(RunFolder.open(results / flown["folder"]), recording.config)
-    with threadpool_limits(1):
-        estimated = backend_row(sequence, run_backend(sequence, backend, config.estimation_options))
+    assert task.recording is not None
+    installed = registry.load()
+    recording = SimulatedRecording(task.recording.config, installed)
+    (lens,) = recording.calibration.lenses
+    followed = with_landmarks(list(of_frames(RunFolder.open(results / flown["folder"]), lens)), recording)
+    estimated_again = estimated(EXACT_POINTS, followed, recording, task.config, installed, flown["seed"])
     about = {column: flown[column] for column in ("condition", "level", "seed", "backend")}
-    return {**about, "ate_mm": 1e3 * flown["ate_m"], "exact_mm": 1e3 * estimated["ate_m"]}
-
-
-def exact(run: RunFolder, simulation: SimulationConfig) -> TrackSequence:
-    """The tracks of ``run``, of one camera, each where its landmark is, with the readings of the ``simulation``."""
-    recording = SimulatedRecording(simulation, registry.load())
-    (camera,), scenario = recording.calibration.cameras, recording.scenario
-    steps = list(of_frames(run, camera.model))
-    frames_ns = np.array([step.t_ns for step in steps])
-    R_WB, p_WB, _ = scenario.motion(frames_ns)
-    p_WF = landmarks_of(steps, *camera.pose(R_WB, p_WB), recording.world.mesh.corners)
-    packets = []
-    segments = cut_segments(scenario.imu_ns, scenario.gyro_B, scenario.accel_B, frames_ns)
-    for imu, step, R, p in zip(segments, steps, R_WB, p_WB, strict=True):
-        xy, ahead = pixels(camera, R, p, p_WF[step.ids])
-        tracks = FrameTracks(step.t_ns, step.ids, step.camera, xy, camera.model.undistort(xy))
-        packets.append((imu, tracks.only(ahead).finite()))
-    truth = Trajectory(frames_ns, R_WB, p_WB)
-    return TrackSequence(scenario.name, recording.calibration, tuple(packets), truth, scenario.states_at(frames_ns))
+    return {**about, "ate_mm": 1e3 * flown["ate_m"], "exact_mm": estimated_again["ate_mm"]}
 
 
 def of_frames(run: RunFolder, lens: Camera) -> Iterator[FrameTracks]:
