@@ -168,7 +168,7 @@ def test_command_trains_weights_whose_points_are_taken_first_to_last(flight, tmp
     installed = registry.load()
     assert installed.create_detector("keypointnet", {"weights": str(made), "threads": 1}).best_first
     assert not installed.create_detector("keypointnet", {"threads": 1}).best_first
-    with pytest.raises(ConfigError, match="descriptors_only=true"):
+    with pytest.raises(ConfigError, match="only=descriptors"):
         installed.create_detector("keypointnet", {"weights": str(made), "threads": 1, "descriptors": True})
 
 
@@ -176,11 +176,11 @@ def test_descriptors_trained_afterwards_leave_the_target_as_it_was(tmp_path):
     trained = Training(SMALL, scenes())
     assert not trained.weights().has_descriptors
     weights.save(tmp_path / "a.safetensors", trained.weights())
-    later = Training(replace(SMALL, target="repeatability", descriptors_only=True), scenes())
+    later = Training(replace(SMALL, target="repeatability", only="descriptors"), scenes())
     later.start_from(weights.load(tmp_path / "a.safetensors"))
     assert (later.weights().target, later.weights().has_descriptors) == ("drift", True)
     later.save(tmp_path / "checkpoint.pt", [])
-    again = Training(replace(SMALL, target="repeatability", descriptors_only=True), scenes())
+    again = Training(replace(SMALL, target="repeatability", only="descriptors"), scenes())
     again.resume(tmp_path / "checkpoint.pt")
     assert again.weights().target == "drift"
     anew = Training(replace(SMALL, target="repeatability"), scenes())
@@ -205,7 +205,7 @@ def test_recordings_that_nobody_simulated_are_refused(tmp_path):
     [
         ({"network": "full"}, "full says nothing"),
         ({"lesson_epochs": 1}, "--finetune"),
-        ({"descriptors_only": True}, "--finetune"),
+        ({"only": "descriptors"}, "--finetune"),
         ({"target": "depth"}, "target"),
     ],
 )

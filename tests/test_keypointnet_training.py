@@ -77,20 +77,28 @@ def test_steps_lower_the_loss_of_a_fixed_batch(pictures, options, taught):
 
 
 @pytest.mark.parametrize(
-    ("taught", "descriptors_only", "total"),
-    [(False, False, 1.0 + 2.0 * 10.0 + 100.0 + 1000.0), (False, True, 10.0), (True, False, 7.0), (True, True, 4.0)],
+    ("taught", "only", "total"),
+    [
+        (False, None, 1.0 + 2.0 * 10.0 + 100.0 + 1000.0),
+        (False, "detector", 1.0 + 100.0),
+        (False, "descriptors", 10.0),
+        (True, None, 1.0 + 2.0 + 4.0),
+        (True, "detector", 1.0 + 2.0),
+        (True, "descriptors", 4.0),
+    ],
 )
-def test_losses_are_weighted_as_published(pictures, monkeypatch, taught, descriptors_only, total):
+def test_losses_are_weighted_as_published(pictures, monkeypatch, taught, only, total):
     """Twice the descriptors', once the others (alpha 1, beta 2, lambda 1); of lessons, what they say themselves."""
-    of_each = {"location": 1.0, "descriptor": 10.0, "score": 100.0, "inlier": 1000.0}
+    of_detector = {"location": torch.tensor(1.0), "score": torch.tensor(100.0)}
+    of_all = of_detector | {"descriptor": torch.tensor(10.0), "inlier": torch.tensor(1000.0)}
     told = {
-        "losses": lambda *_: {name: torch.tensor(value) for name, value in of_each.items()},
+        "losses": lambda a, b, homography, judge: of_detector if judge is None else of_all,
         "matching_loss": lambda *_: torch.tensor(4.0),
         "teach": lambda *_: {"place": torch.tensor(1.0), "corner": torch.tensor(2.0)},
     }
     for name, stand_in in told.items():
         monkeypatch.setattr(trainer, name, stand_in)
-    training = Training(replace(SMALL, descriptors_only=descriptors_only), pictures)
+    training = Training(replace(SMALL, only=only), pictures)
     pairs = batch(pictures, training.options, 0)
     values = step_losses(training.network, training.judge, training.options, pairs, taught=taught)
     assert float(values["total"]) == total
@@ -98,7 +106,7 @@ def test_losses_are_weighted_as_published(pictures, monkeypatch, taught, descrip
 
 @pytest.mark.parametrize("options", [SMALL, PUBLISHED], ids=["compact", "full"])
 def test_descriptors_alone_are_trained_beside_a_detector_left_as_it_is(pictures, options):
-    training = Training(replace(options, descriptors_only=True, lesson_epochs=1), pictures)
+    training = Training(replace(options, only="descriptors", lesson_epochs=1), pictures)
     before = training.weights()
     totals = [values["total"] for values in training.steps()]
     after = training.weights()
@@ -109,6 +117,26 @@ def test_descriptors_alone_are_trained_beside_a_detector_left_as_it_is(pictures,
     found = [runtimes.start("torch", "float32", w, asked)(image) for w in (before, after)]
     np.testing.assert_array_equal(found[0][0], found[1][0])
     assert np.abs(found[0][1] - found[1][1]).max() > 1e-4
+
+
+@pytest.mark.parametrize("options", [SMALL, PUBLISHED], ids=["compact", "full"])
+def test_a_detector_trained_alone_is_the_same_detector(pictures, options):
+    """What it is taught does not depend on whether descriptors are computed beside; these have no weights then."""
+    options = replace(options, dropout=0.0)
+    pairs = batch(pictures, options, 0)
+    gradients = []
+    for only, judged in ((None, True), ("detector", False)):
+        training = Training(replace(options, only=only), pictures)
+        for part in (training.network, training.judge):
+            part.train()
+        values = step_losses(training.network, training.judge, training.options, pairs)
+        assert ("descriptor" in values) == ("inlier" in values) == judged
+        (values["location"] + values["score"]).backward()
+        detecting = [w for part in trainer._detecting(training.network) for w in part.parameters()]
+        gradients.append([w.grad for w in detecting if w.grad is not None])
+        assert training.weights().has_descriptors == judged
+    for alone, beside in zip(*gradients, strict=True):
+        torch.testing.assert_close(alone, beside)
 
 
 def states(training):

@@ -29,7 +29,7 @@ class KeypointNet:
         if options.descriptors and not weights.has_descriptors:
             raise ConfigError(
                 f"the descriptors of weights={options.weights} are older than their detector; train them with "
-                "`vioframe train keypointnet --finetune WEIGHTS -o descriptors_only=true`, or use weights=compact"
+                "`vioframe train keypointnet --finetune WEIGHTS -o only=descriptors`, or use weights=compact"
             )
         calibrated = weights.activation_ranges is not None
         self._runtime, self.precision = runtimes.choose(options.runtime, options.precision, calibrated)

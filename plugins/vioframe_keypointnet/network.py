@@ -31,7 +31,7 @@ class Detection:
     xy: Tensor
     """(B, 2, h, w) px."""
     descriptors: Tensor
-    """(B, D, H/4, W/4), not yet normalised; :func:`describe` samples them."""
+    """(B, D, H/4, W/4), not yet normalised; :func:`describe` samples them. D is 0 where none were asked for."""
     response: Tensor | None = None
     """(B, 64, h, w) for a network of peaks: but for a constant, the logarithm of how likely each pixel is."""
 
@@ -54,7 +54,7 @@ class KeypointNet(nn.Module):
         self.act, self.pool = nn.LeakyReLU(inplace=True), nn.MaxPool2d(2)
         self.dropout = nn.Dropout2d(dropout)
 
-    def forward(self, grey: Tensor) -> Detection:
+    def forward(self, grey: Tensor, *, descriptors: bool = True) -> Detection:
         """Of ``grey`` (B, 1, H, W) in [0, 1], H and W multiples of 8; for training."""
         after = self._encode(grey)
         score, response = self._regress("D", after[4])[:, 0], None
@@ -66,7 +66,8 @@ class KeypointNet(nn.Module):
             place = offsets(self._regress("P", after[4]))
         # The outermost ring of cells scores 0.
         score = pad(torch.sigmoid(score)[:, 1:-1, 1:-1], (1, 1, 1, 1))
-        return Detection(score, keypoint_places(place), self._describe(after), response)
+        described = self._describe(after) if descriptors else after[3][:, :0]
+        return Detection(score, keypoint_places(place), described, response)
 
     def found(self, grey: Tensor, *, descriptors: bool) -> tuple[Tensor, ...]:
         """What is needed to choose keypoints of ``grey`` (B, 1, H, W) in [0, 1]; OpenVINO's graph gives the same.

@@ -72,8 +72,9 @@ class TrainingOptions:
     """Epochs to train."""
     lesson_epochs: NonNegativeInt = 0
     """First epochs in which corners are taught instead; what makes hours of training out of days."""
-    descriptors_only: bool = False
-    """Leave the detector as it is and train what only descriptors need; with --finetune."""
+    only: Literal["detector", "descriptors"] | None = None
+    """detector: a third of the time, and descriptors come afterwards; descriptors: the detector stays as it is, with
+    --finetune; null: both."""
     halve_at: tuple[int, ...] = (40,)
     """Epochs after which the learning rate is halved."""
     epoch_samples: int | None = None
@@ -102,7 +103,7 @@ class TrainingOptions:
                     f"the network {self.network} says nothing of a pixel; target={self.target} needs compact, quick or "
                     "far"
                 )
-            if self.lesson_epochs or self.descriptors_only:
+            if self.lesson_epochs or self.only == "descriptors":
                 raise ConfigError(
                     "lessons and descriptors are of target=repeatability; train them apart, with --finetune"
                 )

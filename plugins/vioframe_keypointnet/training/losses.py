@@ -97,8 +97,11 @@ def warp(homography: Tensor, xy: Tensor) -> Tensor:
     return homogeneous[..., :2] / homogeneous[..., 2:].clamp(min=1e-6)
 
 
-def losses(source: Detection, target: Detection, homography: Tensor, judge: InlierOutlierNet) -> Mapping[str, Tensor]:
-    """The four, unweighted: ``location``, ``descriptor``, ``score`` and ``inlier``.
+def losses(
+    source: Detection, target: Detection, homography: Tensor, judge: InlierOutlierNet | None
+) -> Mapping[str, Tensor]:
+    """The four, unweighted: ``location``, ``score``, ``descriptor`` and ``inlier``; without a ``judge`` the first two,
+    which are those that need no descriptors.
 
     ``homography`` (B, 3, 3) takes pixels of the source to pixels of the target; both are of the same size.
     """
@@ -107,14 +110,18 @@ def losses(source: Detection, target: Detection, homography: Tensor, judge: Inli
     distance, nearest = nearest_candidates(warped, b)
     near = seen & (distance < NEAR_PX)
     scores = a.score[near], b.score.gather(1, nearest)[near]
+    of_detector = {
+        "location": _mean(distance[near]),  # Eq. 2
+        "score": score_loss(*scores, distance[near]),
+    }
+    if judge is None:
+        return of_detector
 
     descriptors_a = describe(source.descriptors, a.xy.detach())
     descriptors_b = describe(target.descriptors, b.xy.detach())
     positives = describe(target.descriptors, warped.detach())
-    return {
-        "location": _mean(distance[near]),  # Eq. 2
+    return of_detector | {
         "descriptor": descriptor_loss(descriptors_a, positives, descriptors_b, warped.detach(), b.xy.detach(), seen),
-        "score": score_loss(*scores, distance[near]),
         "inlier": inlier_loss(judge, a, b, warped, descriptors_a, descriptors_b, size),
     }
 

@@ -39,7 +39,7 @@ _CALIBRATION_IMAGES = 64
 _VALIDATION_IMAGES = 50
 """At most so many of the images held out are looked at after each epoch."""
 _VALIDATION_SIZE, _VALIDATION_TOP = (320, 240), 300
-_DESCRIPTOR_WEIGHT = 2.0
+_LOSS_WEIGHTS = {"descriptor": 2.0}
 """As published; the other losses have weight one."""
 
 _FREE = frozenset({"epochs", "device", "threads", "workers"})
@@ -131,7 +131,7 @@ class Training:
         network = KeypointNet(options.architecture, options.dropout)
         self.network = in_channels_last(network.to(self._device))
         self.judge = InlierOutlierNet().to(self._device)
-        self._frozen = _detecting(self.network) if options.descriptors_only else []
+        self._frozen = _detecting(self.network) if options.only == "descriptors" else []
         for part in self._frozen:
             part.requires_grad_(False)
         trained = [p for p in (*self.network.parameters(), *self.judge.parameters()) if p.requires_grad]
@@ -158,7 +158,7 @@ class Training:
                 f"{self.options.architecture.name}; choose it with -o network= and -o width="
             )
         fill(self.network, other)
-        if self.options.descriptors_only:
+        if self.options.only == "descriptors":
             self.target = other.target
         self.saw(other.card.get("simulated_worlds", ()))
 
@@ -265,7 +265,7 @@ class Training:
         """The network's weights as they are now."""
         state = self.network.state_dict()
         tensors = {n: x.cpu().numpy().copy() for n, x in state.items() if not n.endswith("num_batches_tracked")}
-        describes = self.options.target == "repeatability"
+        describes = self.options.target == "repeatability" and self.options.only != "detector"
         return weights.Weights(self.options.architecture, tensors, {"target": self.target, "descriptors": describes})
 
     def write(self, path: Path, sample: Sequence[Picture], about: Mapping[str, Any]) -> None:
@@ -291,7 +291,8 @@ class _Samples(Dataset[Any]):
         step, taught = key
         if self.options.target != "repeatability":
             return told(cast(Sequence[Followed], self.pictures), self.options, step)
-        return batch(self.pictures, self.options, step, corners_taught=taught and not self.options.descriptors_only)
+        corners_taught = taught and self.options.only != "descriptors"
+        return batch(self.pictures, self.options, step, corners_taught=corners_taught)
 
 
 def _on_one_thread(_: int) -> None:
@@ -310,19 +311,20 @@ def step_losses(
     taught: bool = False,
 ) -> dict[str, Tensor]:
     """The losses of a batch of pairs, of the lessons where it is ``taught``; ``total`` is what is minimised."""
+    detecting, describing = options.only != "descriptors", options.only != "detector"
     with torch.autocast(pairs.source.device.type, torch.bfloat16, enabled=options.precision == "bfloat16"):
-        a, b = (network(x.contiguous(memory_format=torch.channels_last)) for x in (pairs.source, pairs.target))
+        views = (x.contiguous(memory_format=torch.channels_last) for x in (pairs.source, pairs.target))
+        a, b = (network(view, descriptors=describing) for view in views)
     if taught:
-        values = {"matching": matching_loss(a, b, pairs.homography)}
-        if not options.descriptors_only:
+        values = {"matching": matching_loss(a, b, pairs.homography)} if describing else {}
+        if detecting:
             values |= teach(a, b, pairs.source_lesson, pairs.target_lesson)
         return values | {"total": sum(values.values(), torch.zeros(()))}
-    values = dict(losses(a, b, pairs.homography, judge))
-    if options.descriptors_only:
+    values = dict(losses(a, b, pairs.homography, judge if describing else None))
+    if not detecting:
         return {"descriptor": values["descriptor"], "total": values["descriptor"]}
-    values["total"] = (
-        values["location"] + _DESCRIPTOR_WEIGHT * values["descriptor"] + values["score"] + values["inlier"]
-    )
+    weighted = (_LOSS_WEIGHTS.get(name, 1.0) * value for name, value in values.items())
+    values["total"] = sum(weighted, torch.zeros(()))
     return values
 
 
