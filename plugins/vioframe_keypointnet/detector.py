@@ -15,6 +15,7 @@ from vioframe_keypointnet.options import KeypointNetOptions
 from vioframe_keypointnet.selection import describe, first_varied, padded_to_cells, peaks, select
 from vioframe_keypointnet.weights import Weights
 
+_HALF = np.float32(0.5)
 _LOG = logging.getLogger(__name__)
 
 
@@ -50,18 +51,26 @@ class KeypointNet:
         """At most ``max_points`` keypoints of ``image`` (H, W), at sub-pixel places."""
         if image.ndim != 2 or image.dtype != np.uint8:
             raise ConfigError(f"KeypointNet wants images (H, W) of uint8, not {image.shape} of {image.dtype}")
-        halvings = self._halvings(min(image.shape))
-        for _ in range(halvings):
-            image = np.asarray(cv2.pyrDown(image), np.uint8)
+        side_px = 2 ** self._halvings(min(image.shape))
+        image = _shrunk(image, side_px)
         padded = padded_to_cells(image)
         found, *described = self._run(padded)
         xy, score = self._choose(found, padded, cast(tuple[int, int], image.shape), max_points, self._options)
-        # A pixel of half the size lies where every second one of the image does.
-        places = xy * np.float32(2**halvings)
+        places = (xy + _HALF) * np.float32(side_px) - _HALF
         return Keypoints(places, score, describe(described[0], xy) if described else None)
 
     def _halvings(self, side_px: int) -> int:
-        """Of an image whose shorter side has ``side_px``."""
+        """How often an image is halved whose shorter side has ``side_px``."""
         if self._options.halvings is not None:
             return self._options.halvings
         return max((side_px // self._least_side_px).bit_length() - 1, 0) if self._least_side_px else 0
+
+
+def _shrunk(image: Image, side_px: int) -> Image:
+    """The means of its squares of ``side_px``, as photographs are shrunk for training; what is left at the end of rows
+    and columns goes, as there are no keypoints anyway."""
+    if side_px == 1:
+        return image
+    rows, columns = (max(length // side_px, 1) for length in image.shape)
+    whole = image[: rows * side_px, : columns * side_px]
+    return np.asarray(cv2.resize(whole, (columns, rows), interpolation=cv2.INTER_AREA), np.uint8)
