@@ -147,7 +147,8 @@ class Architecture:
 FULL = Architecture("full", 3, ((32, 32), (64, 64), (128, 128), (256, 256)), 256, 256)
 """The published network (Tang et al., ICLR 2020)."""
 COMPACT = Architecture("compact", 1, ((), (16, 16, 16), (32,), (64,)), 64, 64)
-QUICK = Architecture("quick", 1, ((), (16, 16), (32,), (64,)), 64, 64, response_kernel=1)
+QUICK = Architecture("quick", 1, ((), (16, 32), (32,), (64,)), 64, 64, folded_px=4)
+"""Half the products of ``compact``: folded as wide as ``far``."""
 FAR = Architecture("far", 1, ((), (32,) * 6, (32,), (64,)), 64, 64, folded_px=4)
 """Sees 28 px about a pixel, where ``compact`` sees 8: beyond the patch that is followed."""
 ARCHITECTURES = {architecture.name: architecture for architecture in (FULL, COMPACT, QUICK, FAR)}
