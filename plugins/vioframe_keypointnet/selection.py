@@ -20,8 +20,8 @@ OFFSET_PX = 2.0 * (CELL_PX - 1) / 2
 """How far a regressed keypoint may lie from its cell's centre along either axis: 2 half cells, the published cross
 ratio, so that neighbours reach into each other."""
 
-_CONTRAST_REACH_PX = 8
-"""Half the side of the window in which the image must vary for a keypoint to be there."""
+CONTRAST_REACH_PX = 8
+"""Half the side of the window in which an image must vary for a keypoint to be there."""
 _SUMMITS_A_POINT = 2
 """So many of the highest that may be peaks are looked at for each point that is wanted, before all are."""
 
@@ -38,15 +38,21 @@ def padded_to_cells(image: Image) -> Image:
 
 
 def select(
-    heads: Array, image: Image, shape: tuple[int, int], max_points: int, rules: KeypointNetOptions
+    heads: Array,
+    image: Image,
+    shape: tuple[int, int],
+    max_points: int,
+    rules: KeypointNetOptions,
+    within_px: int = CONTRAST_REACH_PX,
 ) -> tuple[Array, Array]:
     """``xy`` (N, 2) px and ``score`` (N,) in (0, 1), strongest first, of the candidates ``heads`` (3, h, w).
 
     ``heads`` are the score, x and y of each cell as the network gives them before sigmoid and tanh; ``image``
     (8 h, 8 w) is what it saw. Not taken: the outermost ring of cells, which sees less than it should, what lies outside
-    the image's first ``shape`` (H, W) pixels, which are not padding, and what is near a stronger candidate.
+    the image's first ``shape`` (H, W) pixels, which are not padding, what is near a stronger candidate, and where the
+    image does not vary ``within_px``.
     """
-    return first_varied(strongest(heads, rules.nms_px), image, shape, max_points, rules)
+    return first_varied(strongest(heads, rules.nms_px), image, shape, max_points, rules, within_px)
 
 
 def strongest(heads: Array, nms_px: float) -> Array:
@@ -64,11 +70,16 @@ def reach_cells(nms_px: float) -> int:
 
 
 def first_varied(
-    found: Array, image: Image, shape: tuple[int, int], max_points: int, rules: KeypointNetOptions
+    found: Array,
+    image: Image,
+    shape: tuple[int, int],
+    max_points: int,
+    rules: KeypointNetOptions,
+    within_px: int = CONTRAST_REACH_PX,
 ) -> tuple[Array, Array]:
     """Of what :func:`strongest` found, the first that are within ``shape`` and about which the image varies."""
     found = found[: np.count_nonzero(found[:, 2] > -np.inf)]
-    kept = found[_first_varied(image, found, shape[0], shape[1], rules.min_contrast, max_points)]
+    kept = found[_first_varied(image, found, *shape, rules.min_contrast, within_px, max_points)]
     return kept[:, :2], _sigmoid(kept[:, 2])
 
 
@@ -82,7 +93,12 @@ def candidate_places(heads: Array) -> tuple[Array, Array]:
 
 
 def peaks(
-    found: Array, image: Image, shape: tuple[int, int], max_points: int, rules: KeypointNetOptions
+    found: Array,
+    image: Image,
+    shape: tuple[int, int],
+    max_points: int,
+    rules: KeypointNetOptions,
+    within_px: int = CONTRAST_REACH_PX,
 ) -> tuple[Array, Array]:
     """``xy`` (N, 2) px and ``score`` (N,) in (0, 1), strongest first, of the peaks of ``found`` (H/f, W/f, f^2).
 
@@ -96,7 +112,9 @@ def peaks(
     for most in (_SUMMITS_A_POINT * max_points, len(height)):
         highest = np.sort(np.argpartition(-height, most)[:most]) if most < len(height) else np.arange(len(height))
         highest = highest[np.argsort(-height[highest], stable=True)]
-        xy, taken = _first_peaks(response, levels, at[highest], reach, image, *shape, rules.min_contrast, max_points)
+        xy, taken = _first_peaks(
+            response, levels, at[highest], reach, image, *shape, rules.min_contrast, within_px, max_points
+        )
         if len(taken) == max_points or len(height) <= most:
             break
     return xy, _sigmoid(height[highest[taken]])
@@ -221,6 +239,7 @@ def _first_peaks(
     height: int,
     width: int,
     min_contrast: int,
+    within_px: int,
     most: int,
 ) -> tuple[Array, Int]:
     """Of the columns and rows ``at`` (N, 2) px the first ``most`` that are peaks where the image varies: where they are
@@ -233,7 +252,7 @@ def _first_peaks(
         x, y = at[k]
         if x >= width or y >= height or not _is_peak(response, levels, y, x, reach):
             continue
-        if _varies(image, x, y, height, width, min_contrast):
+        if _varies(image, x, y, height, width, min_contrast, within_px):
             here = response_at(response, levels, y, x)
             xy[count, 0] = x + _summit(
                 response_at(response, levels, y, x - 1), here, response_at(response, levels, y, x + 1)
@@ -265,7 +284,9 @@ def _summit(before: np.float32, here: np.float32, after: np.float32) -> float:
 
 
 @kernel
-def _first_varied(image: Image, at: Int | Array, height: int, width: int, min_contrast: int, most: int) -> Int:
+def _first_varied(
+    image: Image, at: Int | Array, height: int, width: int, min_contrast: int, within_px: int, most: int
+) -> Int:
     """Which of ``at``, (N, 2) px or more columns, are the first ``most`` in the image around which it varies."""
     kept = np.empty(min(most, len(at)), np.int64)
     count = 0
@@ -274,19 +295,19 @@ def _first_varied(image: Image, at: Int | Array, height: int, width: int, min_co
             break
         x, y = at[k, 0], at[k, 1]
         column, row = int(np.rint(x)), int(np.rint(y))
-        if x <= width - 1 and y <= height - 1 and _varies(image, column, row, height, width, min_contrast):
+        if x <= width - 1 and y <= height - 1 and _varies(image, column, row, height, width, min_contrast, within_px):
             kept[count] = k
             count += 1
     return kept[:count]
 
 
 @kernel(inlined=True)
-def _varies(image: Image, x: int, y: int, height: int, width: int, min_contrast: int) -> bool:
+def _varies(image: Image, x: int, y: int, height: int, width: int, min_contrast: int, within_px: int) -> bool:
     low = high = int(image[y, x])
     if min_contrast <= 0:
         return True
-    for r in range(max(y - _CONTRAST_REACH_PX, 0), min(y + _CONTRAST_REACH_PX + 1, height)):
-        for c in range(max(x - _CONTRAST_REACH_PX, 0), min(x + _CONTRAST_REACH_PX + 1, width)):
+    for r in range(max(y - within_px, 0), min(y + within_px + 1, height)):
+        for c in range(max(x - within_px, 0), min(x + within_px + 1, width)):
             low, high = min(low, int(image[r, c])), max(high, int(image[r, c]))
             if high - low >= min_contrast:
                 return True
