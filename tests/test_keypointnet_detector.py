@@ -212,6 +212,17 @@ def test_large_images_are_seen_as_in_training(shape, halvings):
     assert np.abs(at - [307.5, 207.5]).max() < 3.0
 
 
+@pytest.mark.parametrize("name", ["compact", "quick"])
+def test_large_images_vary_as_near_keypoints_as_small_ones(name):
+    pytest.importorskip("openvino")
+    image = np.full((480, 640), 90, np.uint8)
+    image[200:280, 300:400] = texture((80, 100))
+    xy = FACTORY(weights=name, threads=1).detect(image, 300).xy
+    assert len(xy) > 20
+    # Half a square and half a pixel of it, by the summit of a parabola, beyond the window.
+    assert (np.abs(xy - [349.5, 239.5]) < np.array([50.0, 40.0]) + 8.0 + 2.0).all()
+
+
 def test_weights_trained_on_larger_views_see_more(tmp_path):
     pytest.importorskip("openvino")
     path, card = tmp_path / "large.safetensors", {"options": {"size": [640, 480]}}

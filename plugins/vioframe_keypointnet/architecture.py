@@ -58,8 +58,6 @@ class Architecture:
     blocks: tuple[tuple[PositiveInt, ...], _Block, _Block, _Block]
     head: PositiveInt
     descriptor: PositiveInt
-    response_kernel: Literal[1, 3] = 3
-    """Side of the kernel that gives the response of a network of peaks."""
     folded_px: Literal[2, 4] = 2
     """Side of the squares that a network of peaks folds: twice as large, its layers see twice as far at a quarter of
     the cost."""
@@ -106,7 +104,7 @@ class Architecture:
         """All layers in order: the encoder's, then the heads of score (D), place (R or P) and descriptors (F)."""
         _, fine, quarter, deepest = (block[-1] if block else 0 for block in self.blocks)
         if self.peaks:
-            place = [Layer("R", fine, self.fold**2, self.response_kernel, normalised=False)]
+            place = [Layer("R", fine, self.fold**2, normalised=False)]
         else:
             place = [Layer("Pa", deepest, self.head), Layer("Pb", self.head, 2, normalised=False)]
         return (
