@@ -19,18 +19,13 @@ from vioframe.testing import check_detector  # noqa: E402
 from vioframe_keypointnet import vioframe_detectors  # noqa: E402
 from vioframe_keypointnet import weights as weights_file  # noqa: E402
 from vioframe_keypointnet.network import strongest  # noqa: E402
-from vioframe_keypointnet.options import KeypointNetOptions  # noqa: E402
-from vioframe_keypointnet.selection import candidate_places, first_varied, padded_to_cells, peaks  # noqa: E402
+from vioframe_keypointnet.selection import Rules, candidate_places, first_varied, padded_to_cells, peaks  # noqa: E402
 from vioframe_keypointnet.selection import select as chosen  # noqa: E402
 
 FACTORY = vioframe_detectors()["keypointnet"]
 
 
-def rules_of(nms_px, min_contrast):
-    return KeypointNetOptions(nms_px=nms_px, min_contrast=min_contrast)
-
-
-NO_RULES = rules_of(0.0, 0)
+NO_RULES = Rules(0.0, 0)
 
 
 @pytest.fixture(scope="module")
@@ -84,7 +79,7 @@ def select(request):
 
 @pytest.mark.parametrize("nms_px", [0.0, 2.5, 4.0, 9.0, 15.0])
 def test_selection_is_as_defined(select, nms_px):
-    heads, image, rules = random_heads(15, 20), half_blank((120, 160)), rules_of(nms_px, 4)
+    heads, image, rules = random_heads(15, 20), half_blank((120, 160)), Rules(nms_px, 4)
     xy, score = select(heads, image, (117, 155), 1000, rules)
     expected = by_definition(heads, image, (117, 155), rules)
     assert len(expected) > (20 if nms_px < 10.0 else 5)
@@ -123,7 +118,7 @@ def peaks_by_definition(response, image, shape, rules):
 @pytest.mark.parametrize("fold", [2, 4])
 @pytest.mark.parametrize("nms_px", [0.0, 3.0, 4.0, 4.5, 15.0])
 def test_peaks_are_as_defined(nms_px, fold):
-    response, image, rules = response_of_peaks(), half_blank((120, 160)), rules_of(nms_px, 4)
+    response, image, rules = response_of_peaks(), half_blank((120, 160)), Rules(nms_px, 4)
     xy, score = peaks(folded(response, fold), image, (110, 155), 1000, rules)
     expected = peaks_by_definition(response, image, (110, 155), rules)
     assert len(expected) > 5
@@ -137,14 +132,14 @@ def test_peaks_are_as_defined(nms_px, fold):
 def test_a_peak_between_pixels_is_found_there():
     rows, columns = np.indices((40, 48), dtype=np.float32)
     response = -((columns - 20.3) ** 2) - (rows - 17.6) ** 2
-    xy, _ = peaks(folded(response), texture((40, 48)), (40, 48), 5, rules_of(4.0, 0))
+    xy, _ = peaks(folded(response), texture((40, 48)), (40, 48), 5, Rules(4.0, 0))
     assert np.abs(xy - [[20.3, 17.6]]).max() < 1e-3
 
 
 def test_of_a_plateau_the_first_pixel_is_the_peak():
     response = np.zeros((40, 48), np.float32)
     response[20:22, 30:33] = 1.0
-    xy, _ = peaks(folded(response), texture((40, 48)), (40, 48), 1, rules_of(3.0, 0))
+    xy, _ = peaks(folded(response), texture((40, 48)), (40, 48), 1, Rules(3.0, 0))
     assert np.abs(xy - [[30.5, 20.5]]).max() < 1e-6
 
 
@@ -152,7 +147,7 @@ def test_equal_scores_leave_one_of_two_neighbours(select):
     heads = random_heads()
     heads[0] = 1.0
     image = texture((240, 320))
-    rules = rules_of(4.0, 0)
+    rules = Rules(4.0, 0)
     xy, _ = select(heads, image, (240, 320), 10_000, rules)
     gap = np.linalg.norm(xy[:, None] - xy[None], axis=2)
     assert gap[np.triu_indices(len(xy), 1)].min() >= 4.0

@@ -12,7 +12,15 @@ from vioframe.errors import ConfigError
 from vioframe.types import Image, Keypoints
 from vioframe_keypointnet import runtimes
 from vioframe_keypointnet.options import KeypointNetOptions
-from vioframe_keypointnet.selection import CONTRAST_REACH_PX, describe, first_varied, padded_to_cells, peaks, select
+from vioframe_keypointnet.selection import (
+    CONTRAST_REACH_PX,
+    Rules,
+    describe,
+    first_varied,
+    padded_to_cells,
+    peaks,
+    select,
+)
 from vioframe_keypointnet.weights import Weights
 
 _HALF = np.float32(0.5)
@@ -55,8 +63,8 @@ class KeypointNet:
         image = _shrunk(image, side_px)
         padded = padded_to_cells(image)
         found, *described = self._run(padded)
-        shape, within_px = cast(tuple[int, int], image.shape), max(CONTRAST_REACH_PX // side_px, 1)
-        xy, score = self._choose(found, padded, shape, max_points, self._options, within_px)
+        rules = Rules(self._options.nms_px, self._options.min_contrast, max(CONTRAST_REACH_PX // side_px, 1))
+        xy, score = self._choose(found, padded, cast(tuple[int, int], image.shape), max_points, rules)
         places = (xy + _HALF) * np.float32(side_px) - _HALF
         return Keypoints(places, score, describe(described[0], xy) if described else None)
 

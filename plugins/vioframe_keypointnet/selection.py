@@ -7,6 +7,7 @@ keypoints (:func:`peaks`).
 from __future__ import annotations
 
 from math import ceil, isqrt
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,18 +15,28 @@ from numpy.typing import NDArray
 from vioframe.jit import kernel
 from vioframe.types import Image, Int
 from vioframe_keypointnet.architecture import CELL_PX
-from vioframe_keypointnet.options import KeypointNetOptions
 
 OFFSET_PX = 2.0 * (CELL_PX - 1) / 2
 """How far a regressed keypoint may lie from its cell's centre along either axis: 2 half cells, the published cross
 ratio, so that neighbours reach into each other."""
 
 CONTRAST_REACH_PX = 8
-"""Half the side of the window in which an image must vary for a keypoint to be there."""
+"""Half the side of the window in which the image as given must vary for a keypoint to be there."""
 _SUMMITS_A_POINT = 2
 """So many of the highest that may be peaks are looked at for each point that is wanted, before all are."""
 
 Array = NDArray[np.float32]
+
+
+class Rules(NamedTuple):
+    """What is no keypoint, of all that a network finds; in pixels of the image that it saw."""
+
+    nms_px: float
+    """What is nearer than this to a stronger one."""
+    min_contrast: int
+    """What has grey levels about it that vary by less."""
+    within_px: int = CONTRAST_REACH_PX
+    """Half the side of the window in which they do."""
 
 
 def padded_to_cells(image: Image) -> Image:
@@ -37,22 +48,14 @@ def padded_to_cells(image: Image) -> Image:
     return np.ascontiguousarray(image)
 
 
-def select(
-    heads: Array,
-    image: Image,
-    shape: tuple[int, int],
-    max_points: int,
-    rules: KeypointNetOptions,
-    within_px: int = CONTRAST_REACH_PX,
-) -> tuple[Array, Array]:
+def select(heads: Array, image: Image, shape: tuple[int, int], max_points: int, rules: Rules) -> tuple[Array, Array]:
     """``xy`` (N, 2) px and ``score`` (N,) in (0, 1), strongest first, of the candidates ``heads`` (3, h, w).
 
     ``heads`` are the score, x and y of each cell as the network gives them before sigmoid and tanh; ``image``
     (8 h, 8 w) is what it saw. Not taken: the outermost ring of cells, which sees less than it should, what lies outside
-    the image's first ``shape`` (H, W) pixels, which are not padding, what is near a stronger candidate, and where the
-    image does not vary ``within_px``.
+    the image's first ``shape`` (H, W) pixels, which are not padding, and what the ``rules`` leave out.
     """
-    return first_varied(strongest(heads, rules.nms_px), image, shape, max_points, rules, within_px)
+    return first_varied(strongest(heads, rules.nms_px), image, shape, max_points, rules)
 
 
 def strongest(heads: Array, nms_px: float) -> Array:
@@ -70,16 +73,11 @@ def reach_cells(nms_px: float) -> int:
 
 
 def first_varied(
-    found: Array,
-    image: Image,
-    shape: tuple[int, int],
-    max_points: int,
-    rules: KeypointNetOptions,
-    within_px: int = CONTRAST_REACH_PX,
+    found: Array, image: Image, shape: tuple[int, int], max_points: int, rules: Rules
 ) -> tuple[Array, Array]:
     """Of what :func:`strongest` found, the first that are within ``shape`` and about which the image varies."""
     found = found[: np.count_nonzero(found[:, 2] > -np.inf)]
-    kept = found[_first_varied(image, found, *shape, rules.min_contrast, within_px, max_points)]
+    kept = found[_first_varied(image, found, *shape, rules.min_contrast, rules.within_px, max_points)]
     return kept[:, :2], _sigmoid(kept[:, 2])
 
 
@@ -92,14 +90,7 @@ def candidate_places(heads: Array) -> tuple[Array, Array]:
     return np.clip(offset[0], 0.0, w * CELL_PX - 1.0), np.clip(offset[1], 0.0, h * CELL_PX - 1.0)
 
 
-def peaks(
-    found: Array,
-    image: Image,
-    shape: tuple[int, int],
-    max_points: int,
-    rules: KeypointNetOptions,
-    within_px: int = CONTRAST_REACH_PX,
-) -> tuple[Array, Array]:
+def peaks(found: Array, image: Image, shape: tuple[int, int], max_points: int, rules: Rules) -> tuple[Array, Array]:
     """``xy`` (N, 2) px and ``score`` (N,) in (0, 1), strongest first, of the peaks of ``found`` (H/f, W/f, f^2).
 
     A peak is the highest of all pixels nearer than ``nms_px`` along both axes, of equals the first row by row; its
@@ -113,7 +104,7 @@ def peaks(
         highest = np.sort(np.argpartition(-height, most)[:most]) if most < len(height) else np.arange(len(height))
         highest = highest[np.argsort(-height[highest], stable=True)]
         xy, taken = _first_peaks(
-            response, levels, at[highest], reach, image, *shape, rules.min_contrast, within_px, max_points
+            response, levels, at[highest], reach, image, *shape, rules.min_contrast, rules.within_px, max_points
         )
         if len(taken) == max_points or len(height) <= most:
             break
