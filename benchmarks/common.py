@@ -50,8 +50,8 @@ bags_option = click.option(
 )
 
 
-def benchmark(command: Callable[..., None]) -> click.Command:
-    """A script with the options all of them have; a :class:`VioframeError` becomes one line and exit code 2."""
+def script(command: Callable[..., None]) -> click.Command:
+    """A script, of which a :class:`VioframeError` becomes one line and exit code 2."""
 
     @wraps(command)
     def checked(**arguments: Any) -> None:
@@ -61,6 +61,11 @@ def benchmark(command: Callable[..., None]) -> click.Command:
             click.echo(f"error: {error}", err=True)
             sys.exit(2)
 
+    return click.command()(checked)
+
+
+def benchmark(command: Callable[..., None]) -> click.Command:
+    """A :func:`script` with the options that most of them have."""
     for option in (
         click.option("--record", "keep", is_flag=True, help="Write the results to benchmarks/results."),
         click.option("-o", "--option", "assignments", multiple=True, metavar="KEY=VALUE", help="Set a part's option."),
@@ -72,8 +77,8 @@ def benchmark(command: Callable[..., None]) -> click.Command:
             help="Folder of the recordings.  [default: ../shared/data]",
         ),
     ):
-        checked = option(checked)
-    return click.command()(checked)
+        command = option(command)
+    return script(command)
 
 
 def backend_rows(

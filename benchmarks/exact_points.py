@@ -17,7 +17,7 @@ from pathlib import Path
 
 import click
 import numpy as np
-from common import present
+from common import present, script
 from error_budget import EXACT_POINTS, estimated, with_landmarks
 
 from vioframe.bench import Row
@@ -35,7 +35,7 @@ from vioframe.types import FrameTracks
 COLUMNS = {"condition": "", "level": ".2f", "seed": "d", "backend": "", "ate_mm": ".1f", "exact_mm": ".1f"}
 
 
-@click.command()
+@script
 @click.argument("results", type=click.Path(exists=True, file_okay=False, path_type=Path))
 @click.option("--record", "keep", is_flag=True, help="Write the results to benchmarks/results.")
 def main(results: Path, keep: bool) -> None:

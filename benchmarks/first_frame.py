@@ -20,7 +20,7 @@ from statistics import median
 from tempfile import TemporaryDirectory
 
 import click
-from common import SHARED_DATA, present
+from common import SHARED_DATA, present, script
 from speed import first_and_last_frame_s, on_cores
 
 from vioframe.bench import Row
@@ -41,7 +41,7 @@ _PACKAGES = {
 }
 
 
-@click.command()
+@script
 @click.option("--record", "keep", is_flag=True, help="Write the results to benchmarks/results.")
 @click.option("--rounds", default=9, show_default=True, help="Runs of each, in turn.")
 @click.option("--data", type=click.Path(exists=True, path_type=Path), default=SHARED_DATA / "euroc/MH_01_easy_15s")

@@ -17,7 +17,7 @@ from time import perf_counter
 import click
 import numpy as np
 import psutil
-from common import present
+from common import present, script
 
 from vioframe.bench import Row
 from vioframe.cores import limited_threads
@@ -42,7 +42,7 @@ COLUMNS = {
 FRAME_RATE_HZ, POINTS = 10.0, 60
 
 
-@click.command()
+@script
 @click.option("--record", "keep", is_flag=True, help="Write the results to benchmarks/results.")
 @click.option("--minutes", default=60.0, show_default=True, help="Length of the flight.")
 @click.option("--backend", "backends", multiple=True, default=["msckf", "sliding_window", "loose_ekf"])

@@ -16,7 +16,7 @@ from statistics import median
 from tempfile import TemporaryDirectory
 
 import click
-from common import SHARED_DATA, present
+from common import SHARED_DATA, present, script
 
 from vioframe.bench import Row
 
@@ -52,7 +52,7 @@ print(json.dumps(1e3 * seconds / frames))
 """
 
 
-@click.command()
+@script
 @click.option("--record", "keep", is_flag=True, help="Write the results to benchmarks/results.")
 @click.option("--rounds", default=5, show_default=True, help="Runs of each, in turn.")
 @click.option("--data", type=click.Path(exists=True, path_type=Path), default=SHARED_DATA / "euroc/MH_01_easy_15s")

@@ -29,7 +29,7 @@ from tempfile import TemporaryDirectory
 from time import monotonic, sleep
 
 import click
-from common import HERE, SHARED_DATA, present
+from common import HERE, SHARED_DATA, present, script
 
 from vioframe.bench import Row
 from vioframe.parts import registry
@@ -60,7 +60,7 @@ _POLL_S = 0.005
 _OF_A_RUN = ("frames_s", "real_time", "first_s")
 
 
-@click.command()
+@script
 @click.option("--record", "keep", is_flag=True, help="Write the results to benchmarks/results.")
 @click.option("--rounds", default=5, show_default=True, help="Runs of each, in turn.")
 @click.option(

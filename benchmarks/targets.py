@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import get_args
 
 import click
-from common import present, render
+from common import present, render, script
 from threadpoolctl import threadpool_limits
 
 from vioframe.bench import Row
@@ -61,7 +61,7 @@ OPTIONS = TrainingOptions(
 COLUMNS = {"trained for": "", "steps": "d"} | {f"order.{target}": ".2f" for target in TARGETS}
 
 
-@click.command()
+@script
 @click.option("--out", type=click.Path(file_okay=False, path_type=Path), default=Path("targets"), show_default=True)
 @click.option("--flights", default=24, show_default=True, help="Flights that are followed.")
 @click.option("--record", "keep", is_flag=True, help="Write the results to benchmarks/results.")

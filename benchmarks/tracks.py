@@ -14,7 +14,7 @@ from tempfile import TemporaryDirectory
 
 import click
 import numpy as np
-from common import HERE, SHARED_DATA, present, render
+from common import HERE, SHARED_DATA, present, render, script
 from rendered_flights import seeds
 from threadpoolctl import threadpool_limits
 
@@ -46,7 +46,7 @@ COLUMNS = {
 }
 
 
-@click.command()
+@script
 @click.option("--record", "keep", is_flag=True, help="Write the results to benchmarks/results.")
 @click.option(
     "--data",

@@ -14,7 +14,7 @@ from tempfile import TemporaryDirectory
 
 import click
 import numpy as np
-from common import SHARED_DATA, present
+from common import SHARED_DATA, present, script
 from euroc_clips import run
 from position_clock import position_clock, with_positions_of_later
 
@@ -39,7 +39,7 @@ _CLIP, _FLIGHTS = "euroc/MH_01_easy_15s", "euroc_imu_gt"
 _BACKENDS = ("msckf", "sliding_window")
 
 
-@click.command()
+@script
 @click.option("--record", "keep", is_flag=True, help="Write the results to benchmarks/results.")
 @click.option("--data", type=click.Path(exists=True, path_type=Path), default=SHARED_DATA)
 def main(keep: bool, data: Path) -> None:

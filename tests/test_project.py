@@ -9,6 +9,7 @@ from pathlib import Path
 from zipfile import ZipFile
 
 import pytest
+from click.testing import CliRunner
 
 from vioframe.parts import registry
 from vioframe.parts.options import REQUIRED
@@ -68,6 +69,17 @@ def test_every_benchmark_finds_what_it_imports():
     search = os.pathsep.join(filter(None, [str(folder), os.environ.get("PYTHONPATH")]))
     importing = "import importlib, sys; [importlib.import_module(name) for name in sys.argv[1:]]"
     call({**os.environ, "PYTHONPATH": search}, *scripts, code=importing)
+
+
+def test_a_benchmark_says_in_one_line_what_is_wrong(monkeypatch, tmp_path):
+    monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
+    import exact_points
+
+    done = CliRunner().invoke(exact_points.main, [str(tmp_path)])
+    assert done.exit_code == 2
+    (line,) = done.output.splitlines()
+    assert line.startswith("error: ")
+    assert "suite.yaml" in line
 
 
 @pytest.mark.parametrize("name", INSTALLED.names(registry.DETECTOR))
