@@ -79,7 +79,7 @@ def test_latex_is_a_booktabs_table_with_everything_escaped():
 def test_every_table_is_written_three_times_and_its_links_lead_somewhere(compared, tmp_path):
     folder = compared.results.path / "report" / "tables"
     written = write_tables(tables(compared), folder, "../..")
-    names = ("accuracy", "band", "timing", "nees_flights", "failures", "evo", "provenance")
+    names = ("duels", "accuracy", "band", "timing", "nees_flights", "failures", "evo", "provenance")
     assert [path.name for path in written] == [f"{name}.{ending}" for name in names for ending in ("csv", "md", "tex")]
     links = {
         link for path in folder.glob("*.md") for link in re.findall(r"\]\((.*?)\)", path.read_text(encoding="utf-8"))

@@ -238,8 +238,8 @@ def _levels(study: Study) -> Table:
 
 
 def _duels(study: Study) -> Table | None:
-    """Against the baseline: a row for each condition and contender; last, over all of them."""
-    if not study.is_stress or (baseline := study.baseline) is None:
+    """Against the baseline: a row for each condition and contender; last, over all that are degraded."""
+    if (baseline := study.baseline) is None:
         return None
     rows = []
     for _, family in groupby(duels(study.flights, baseline), key=lambda duel: duel.condition is None):
@@ -266,7 +266,8 @@ def _duels(study: Study) -> Table | None:
         f"than {baseline}. Its interval is by the bootstrap over sequences and seeds, of which there must be "
         f"{ENOUGH_TO_DRAW_FROM}. The two-sided sign test takes the pairs for independent, which flights in one world "
         "are not quite; Holm's p counts that there are as many tests as rows, those over all degraded flights apart. "
-        f"All degraded: the rows above together, but for the clear ones. {data_caption(study.flights)}"
+        f"{'All degraded: the rows above together, but for the clear ones. ' if study.is_stress else ''}"
+        f"{data_caption(study.flights)}"
     )
     return Table("duels", f"Against {baseline}", caption, tuple(rows))
 
