@@ -49,12 +49,7 @@ COLUMNS = {
     "first_s": ".2f",
     "ratio": ".2f",
 }
-RUNS = (
-    "shi_tomasi+msckf",
-    "shi_tomasi+sliding_window",
-    "keypointnet+msckf",
-    "keypointnet:weights=quick+msckf",
-)
+RUNS = ("shi_tomasi+msckf", "shi_tomasi+sliding_window", "keypointnet+msckf")
 _FLIGHT, _FLIGHT_S = "figure_eight", 20
 _POLL_S = 0.005
 _OF_A_RUN = ("frames_s", "real_time", "first_s")

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import torch
 
-from vioframe_keypointnet.architecture import COMPACT, FAR, FULL, QUICK, Architecture
+from vioframe_keypointnet.architecture import COMPACT, FAR, FULL, Architecture
 from vioframe_keypointnet.network import KeypointNet
 from vioframe_keypointnet.weights import Weights
 
@@ -12,7 +12,7 @@ TINY = Architecture("tiny", 1, ((4,), (8,), (8,), (12, 8)), 16, 8)
 COLOUR = Architecture("colour", 3, ((6,), (8,), (8,), (8,)), 8, 8)
 PEAKS = Architecture("peaks", 3, ((), (8, 12), (16,), (8,)), 16, 8)
 NARROW = FULL.widened(0.125)
-ARCHITECTURES = {architecture.name: architecture for architecture in (TINY, COLOUR, PEAKS, NARROW, COMPACT, QUICK, FAR)}
+ARCHITECTURES = {architecture.name: architecture for architecture in (TINY, COLOUR, PEAKS, NARROW, COMPACT, FAR)}
 
 
 def network(architecture: Architecture, seed: int = 0) -> KeypointNet:

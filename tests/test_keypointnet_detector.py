@@ -96,10 +96,10 @@ def response_of_peaks(shape=(120, 160), seed=0):
     return cv2.GaussianBlur(np.random.default_rng(seed).normal(size=shape).astype(np.float32), (0, 0), 1.0)
 
 
-def folded(response, f=2):
-    """As networks give it: (H/f, W/f, f^2)."""
-    rows, columns = response.shape[0] // f, response.shape[1] // f
-    return response.reshape(rows, f, columns, f).swapaxes(1, 2).reshape(rows, columns, f * f)
+def folded(response):
+    """As networks give it: (H/4, W/4, 16)."""
+    rows, columns = response.shape[0] // 4, response.shape[1] // 4
+    return response.reshape(rows, 4, columns, 4).swapaxes(1, 2).reshape(rows, columns, 16)
 
 
 def peaks_by_definition(response, image, shape, rules):
@@ -115,17 +115,16 @@ def peaks_by_definition(response, image, shape, rules):
     return np.array(kept)
 
 
-@pytest.mark.parametrize("fold", [2, 4])
 @pytest.mark.parametrize("nms_px", [0.0, 3.0, 4.0, 4.5, 15.0])
-def test_peaks_are_as_defined(nms_px, fold):
+def test_peaks_are_as_defined(nms_px):
     response, image, rules = response_of_peaks(), half_blank((120, 160)), Rules(nms_px, 4)
-    xy, score = peaks(folded(response, fold), image, (110, 155), 1000, rules)
+    xy, score = peaks(folded(response), image, (110, 155), 1000, rules)
     expected = peaks_by_definition(response, image, (110, 155), rules)
     assert len(expected) > 5
     assert np.array_equal(np.round(xy)[:, ::-1], expected)
     assert np.allclose(score, 1.0 / (1.0 + np.exp(-response[tuple(expected.T)])))
     assert 0.05 < np.abs(xy - np.round(xy)).mean() < 0.35
-    first, _ = peaks(folded(response, fold), image, (110, 155), 7, rules)
+    first, _ = peaks(folded(response), image, (110, 155), 7, rules)
     assert np.array_equal(first, xy[:7])
 
 
@@ -195,24 +194,23 @@ def test_large_images_are_seen_as_in_training(shape, halvings):
     means = image[: rows * side, : columns * side].reshape(rows, side, columns, side).mean(axis=(1, 3))
     # OpenCV rounds halves up in squares of two, and to even numbers in others.
     small = (np.floor(means + 0.5) if side == 2 else np.rint(means)).astype(np.uint8)
-    as_it_is = FACTORY(weights="quick", threads=1, halvings=0)
-    found, expected = FACTORY(weights="quick", threads=1).detect(image, 200), as_it_is.detect(small, 200)
+    as_it_is = FACTORY(weights="compact", threads=1, halvings=0)
+    found, expected = FACTORY(weights="compact", threads=1).detect(image, 200), as_it_is.detect(small, 200)
     assert len(found.xy) == 200
     np.testing.assert_array_equal(found.xy, (expected.xy + np.float32(0.5)) * np.float32(side) - np.float32(0.5))
     assert np.array_equal(found.score, expected.score)
     # A dot is found where it is.
     dot = np.full(shape, 90, np.uint8)
     dot[200:216, 300:316] = 220
-    at = FACTORY(weights="quick", threads=1).detect(cv2.GaussianBlur(dot, (0, 0), 6.0), 1).xy
+    at = FACTORY(weights="compact", threads=1).detect(cv2.GaussianBlur(dot, (0, 0), 6.0), 1).xy
     assert np.abs(at - [307.5, 207.5]).max() < 3.0
 
 
-@pytest.mark.parametrize("name", ["compact", "quick"])
-def test_large_images_vary_as_near_keypoints_as_small_ones(name):
+def test_large_images_vary_as_near_keypoints_as_small_ones():
     pytest.importorskip("openvino")
     image = np.full((480, 640), 90, np.uint8)
     image[200:280, 300:400] = texture((80, 100))
-    xy = FACTORY(weights=name, threads=1).detect(image, 300).xy
+    xy = FACTORY(weights="compact", threads=1).detect(image, 300).xy
     assert len(xy) > 20
     # Half a square and half a pixel of it, by the summit of a parabola, beyond the window.
     assert (np.abs(xy - [349.5, 239.5]) < np.array([50.0, 40.0]) + 8.0 + 2.0).all()
@@ -221,7 +219,7 @@ def test_large_images_vary_as_near_keypoints_as_small_ones(name):
 def test_weights_trained_on_larger_views_see_more(tmp_path):
     pytest.importorskip("openvino")
     path, card = tmp_path / "large.safetensors", {"options": {"size": [640, 480]}}
-    weights_file.save(path, replace(weights_file.load("quick"), card=card))
+    weights_file.save(path, replace(weights_file.load("compact"), card=card))
     image = texture((500, 640))
     found, expected = (
         FACTORY(weights=str(path), threads=1, **more).detect(image, 50) for more in ({}, {"halvings": 0})

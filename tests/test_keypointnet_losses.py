@@ -3,6 +3,7 @@
 import math
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 
@@ -233,7 +234,7 @@ def test_gradients_of_the_losses_are_those_of_differences(moving, checked):
     """
     torch.manual_seed(1)
     judge = InlierOutlierNet().double().eval()
-    H = torch.from_numpy(random_homography(np.random.default_rng(3), SIZE))[None]
+    H = torch.from_numpy(random_homography(np.random.default_rng(3), SIZE, (0.7, 1.0)))[None]
     leaves = [*free_detection(0), *free_detection(1)]
 
     def values(*leaves):
@@ -276,7 +277,7 @@ def test_homography_there_and_back():
     rng = np.random.default_rng(0)
     xy = rng.uniform(0.0, 60.0, (50, 2))
     for _ in range(20):
-        H = random_homography(rng, SIZE)
+        H = random_homography(rng, SIZE, (0.7, 1.0))
         there = transfer(H, xy)
         np.testing.assert_allclose(transfer(np.linalg.inv(H), there), xy, atol=1e-8)
         by_torch = losses.warp(torch.from_numpy(H)[None], torch.from_numpy(xy)[None])[0]
@@ -290,9 +291,20 @@ def test_homographies_show_what_is_in_the_image(monkeypatch):
     monkeypatch.setattr(samples, "_SCALE", (0.9, 1.0))
     corners_px = np.array([[0, 0], [95, 0], [95, 63], [0, 63]], np.float64)
     for _ in range(100):
-        seen = transfer(np.linalg.inv(random_homography(rng, SIZE)), corners_px)
+        seen = transfer(np.linalg.inv(random_homography(rng, SIZE, (0.7, 0.7))), corners_px)
         assert (seen >= -1.0).all()
         assert (seen <= np.array(SIZE) + 1.0).all()
+
+
+@pytest.mark.parametrize("patch_ratio", [(0.7, 0.7), (0.9, 1.0)])
+def test_views_are_of_as_much_of_the_image_as_asked_for(monkeypatch, patch_ratio):
+    rng = np.random.default_rng(2)
+    monkeypatch.setattr(samples, "_SCALE", (1.0, 1.0))
+    corners_px = np.array([[0, 0], [95, 0], [95, 63], [0, 63]], np.float32)
+    seen = [transfer(np.linalg.inv(random_homography(rng, SIZE, patch_ratio)), corners_px) for _ in range(200)]
+    sides = [np.sqrt(cv2.contourArea(each.astype(np.float32)) / cv2.contourArea(corners_px)) for each in seen]
+    assert np.mean(sides) == pytest.approx(np.mean(patch_ratio), rel=0.02)
+    assert np.ptp(sides) > 0.0
 
 
 def squares():

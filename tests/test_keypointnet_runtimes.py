@@ -9,7 +9,7 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from keypointnet_helpers import ARCHITECTURES, COMPACT, FAR, NARROW, QUICK, network, texture, weights  # noqa: E402
+from keypointnet_helpers import ARCHITECTURES, COMPACT, FAR, NARROW, network, texture, weights  # noqa: E402
 
 from vioframe.errors import ConfigError, PluginError  # noqa: E402
 from vioframe_keypointnet import runtimes  # noqa: E402
@@ -17,7 +17,7 @@ from vioframe_keypointnet.graph import model  # noqa: E402
 from vioframe_keypointnet.network import describe as describe_in_torch  # noqa: E402
 from vioframe_keypointnet.options import KeypointNetOptions  # noqa: E402
 from vioframe_keypointnet.quantisation import measure_ranges  # noqa: E402
-from vioframe_keypointnet.selection import candidate_places, describe, response_at  # noqa: E402
+from vioframe_keypointnet.selection import by_pixel, candidate_places, describe, response_at  # noqa: E402
 
 ON_CPU = ("openvino", "torch")
 each_architecture = pytest.mark.parametrize("architecture", ARCHITECTURES.values(), ids=ARCHITECTURES)
@@ -82,7 +82,7 @@ def test_one_runtime_takes_images_of_several_sizes(runtime):
         assert np.abs(heads - as_trained(net, image)[0][0]).max() < 1e-4
 
 
-@pytest.mark.parametrize("architecture", [COMPACT, QUICK, FAR, NARROW], ids=lambda a: a.name)
+@pytest.mark.parametrize("architecture", [COMPACT, FAR, NARROW], ids=lambda a: a.name)
 def test_int8_is_near(architecture):
     pytest.importorskip("openvino")
     net = network(architecture)
@@ -95,7 +95,7 @@ def test_int8_is_near(architecture):
     assert max(errors) < INT8_ERROR[architecture.name]
 
 
-INT8_ERROR = {"compact": 0.13, "quick": 0.13, "far": 0.13, "full-x0.125": 0.22}
+INT8_ERROR = {"compact": 0.13, "far": 0.13, "full-x0.125": 0.22}
 """The narrow network has twice as many layers that each add to the error, and half as many channels to average it."""
 
 
@@ -118,12 +118,11 @@ def test_places_are_those_of_the_trained_network():
     assert np.abs(np.stack(candidate_places(heads)) - found.xy[0].numpy()).max() < 1e-3
 
 
-@pytest.mark.parametrize("architecture", [COMPACT, QUICK, FAR], ids=lambda a: a.name)
+@pytest.mark.parametrize("architecture", [COMPACT, FAR], ids=lambda a: a.name)
 def test_the_response_of_each_pixel_is_that_of_the_trained_network(architecture):
     (response, _), found = as_trained(network(architecture), texture())
-    levels = architecture.fold.bit_length() - 1
     rows, columns = np.indices(texture().shape)
-    at = np.vectorize(lambda row, column: response_at(response.reshape(len(response), -1), levels, row, column))
+    at = np.vectorize(lambda row, column: response_at(by_pixel(response), row, column))
     expected = torch.nn.functional.pixel_shuffle(found.response, 8)[0, 0].numpy()
     assert np.array_equal(at(rows, columns), expected)
 
@@ -133,7 +132,7 @@ def test_only_what_is_needed_is_in_the_graph(descriptors):
     pytest.importorskip("openvino")
     graph = model(weights(network(COMPACT)), (48, 64), descriptors=descriptors)
     convolutions = [node for node in graph.get_ops() if node.get_type_name() == "Convolution"]
-    assert len(convolutions) == (2 + 1 + 1 + 4 + 2 if descriptors else 3 + 1)
+    assert len(convolutions) == (2 + 1 + 1 + 4 + 1 if descriptors else 2 + 1)
     assert len(graph.outputs) == (2 if descriptors else 1)
 
 

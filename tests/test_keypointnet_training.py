@@ -392,6 +392,7 @@ def test_command_reads_options_from_a_file(folder, tmp_path):
         (["--images", "{folder}", "-o", "epochs=0"], "epochs=0: Input should be greater than 0"),
         (["--images", "{folder}", "-o", "epoch=1"], "did you mean 'epochs'"),
         (["--images", "{folder}", "-o", "size=[90, 64]"], "multiples of 8"),
+        (["--images", "{folder}", "-o", "patch_ratio=[0.9, 0.7]"], "the least and the largest"),
         (["--images", "{folder}", "--resume"], "nothing to resume"),
         (["--images", "{folder}", "--finetune", "/nowhere.ckpt"], "/nowhere.ckpt"),
         (["--images", "{folder}", "--hold-out", "cat"], "no image is named like"),

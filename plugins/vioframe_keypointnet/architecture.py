@@ -13,6 +13,8 @@ from pydantic import Field, PositiveInt, TypeAdapter
 
 CELL_PX = 8
 """Side of the cells of which each gives one candidate keypoint."""
+FOLD_PX = 4
+"""Side of the squares of pixels that a network of peaks sees as one place each, pixels as channels."""
 FAINT = 0.02
 """Deviation, of a range of one, that local normalisation takes for noise rather than contrast."""
 HEADS = "heads"
@@ -58,9 +60,6 @@ class Architecture:
     blocks: tuple[tuple[PositiveInt, ...], _Block, _Block, _Block]
     head: PositiveInt
     descriptor: PositiveInt
-    folded_px: Literal[2, 4] = 2
-    """Side of the squares that a network of peaks folds: twice as large, its layers see twice as far at a quarter of
-    the cost."""
 
     def widened(self, factor: float) -> Architecture:
         """With ``factor`` times the channels in every layer."""
@@ -82,7 +81,7 @@ class Architecture:
     @property
     def fold(self) -> int:
         """Side of the squares of pixels that become channels of one place."""
-        return self.folded_px if self.peaks else 1
+        return FOLD_PX if self.peaks else 1
 
     def halves(self, block: int) -> bool:
         """Whether the resolution is halved before the ``block``, or folding has made it as low already."""
@@ -144,9 +143,7 @@ class Architecture:
 
 FULL = Architecture("full", 3, ((32, 32), (64, 64), (128, 128), (256, 256)), 256, 256)
 """The published network (Tang et al., ICLR 2020)."""
-COMPACT = Architecture("compact", 1, ((), (16, 16, 16), (32,), (64,)), 64, 64)
-QUICK = Architecture("quick", 1, ((), (16, 32), (32,), (64,)), 64, 64, folded_px=4)
-"""Half the products of ``compact``: folded as wide as ``far``."""
-FAR = Architecture("far", 1, ((), (32,) * 6, (32,), (64,)), 64, 64, folded_px=4)
-"""Sees 28 px about a pixel, where ``compact`` sees 8: beyond the patch that is followed."""
-ARCHITECTURES = {architecture.name: architecture for architecture in (FULL, COMPACT, QUICK, FAR)}
+COMPACT = Architecture("compact", 1, ((), (32, 32), (32,), (64,)), 64, 64)
+FAR = Architecture("far", 1, ((), (32,) * 6, (32,), (64,)), 64, 64)
+"""Sees 28 px about a pixel, where ``compact`` sees 12: beyond the patch that is followed."""
+ARCHITECTURES = {architecture.name: architecture for architecture in (FULL, COMPACT, FAR)}

@@ -61,7 +61,7 @@ def import_openvino() -> Any:
 def model(weights: Weights, shape: tuple[int, int], *, descriptors: bool = False, int8: bool = False) -> Model:
     """The graph for grey images of ``shape`` (H, W), multiples of 8.
 
-    It takes (1, C, h, w), what an :class:`~vioframe_keypointnet.seeing.Eye` sees, and gives what
+    It takes (1, h, w, C), what an :class:`~vioframe_keypointnet.seeing.Eye` sees, and gives what
     :meth:`vioframe_keypointnet.network.KeypointNet.found` does, which it equals on R = G = B but for rounding.
     """
     openvino = import_openvino()
@@ -69,13 +69,14 @@ def model(weights: Weights, shape: tuple[int, int], *, descriptors: bool = False
     architecture, tensors, f = weights.architecture, weights.tensors, weights.architecture.fold
     ranges: Mapping[str, float] = weights.activation_ranges or {} if int8 else {}
     kind = np.float32 if architecture.peaks and not int8 else np.uint8
-    image = ops.parameter([1, f * f, shape[0] // f, shape[1] // f], kind)
+    image = ops.parameter([1, shape[0] // f, shape[1] // f, f * f], kind)
     if int8:
         x = _dequantised(image, CONTRAST_STEP if architecture.peaks else np.float32(1.0), ZERO)
     elif architecture.peaks:
         x = _Values(image)
     else:
         x = _Values(ops.subtract(ops.convert(image, np.float32), np.float32(_NEUTRAL_GREY)))
+    x = x._replace(node=ops.transpose(x.node, np.array([0, 3, 1, 2])))
     after = dict[int, _Values]()
     for number, layers in architecture.encoder.items():
         if number > 2 and architecture.peaks and not descriptors:

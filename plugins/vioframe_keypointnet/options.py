@@ -13,6 +13,7 @@ from vioframe_keypointnet.architecture import ARCHITECTURES, Architecture
 Runtime = Literal["auto", "cuda", "openvino", "torch"]
 Precision = Literal["auto", "float32", "float16", "int8"]
 TrainingPrecision = Literal["float32", "bfloat16"]
+_Share = Annotated[float, Field(gt=0.0, le=1.0)]
 Target = Literal["repeatability", "life", "drift", "faithful", "information", "clean"]
 """Of a training; what each but the first says of a point is in :mod:`vioframe_keypointnet.training.followed`."""
 
@@ -51,8 +52,8 @@ class TrainingOptions:
     Raises :class:`ConfigError` where they do not fit together.
     """
 
-    network: Literal["full", "compact", "quick", "far"] = "compact"
-    """full (as published), compact, quick, or far, which sees farther about a pixel."""
+    network: Literal["full", "compact", "far"] = "compact"
+    """full (as published), compact, or far, which sees farther about a pixel."""
     width: PositiveFloat = 1.0
     """Factor on the channels of every layer."""
     target: Target = "repeatability"
@@ -81,6 +82,9 @@ class TrainingOptions:
     """Pairs an epoch; null: each image once."""
     learning_rate: PositiveFloat = 1e-3
     """Of Adam; 1e-4 is usual for fine-tuning."""
+    patch_ratio: tuple[_Share, _Share] = (0.7, 0.7)
+    """Side of the part of the first view that fills the second, of the view's: least and largest, as published. Where
+    views may also be as large as the image, points are found again more often, and a little less exactly."""
     photometric_probability: Annotated[float, Field(ge=0.0, le=1.0)] = 0.5
     """Of each effect of light, lens and sensor on a view; the weights that ship were trained with 0.25."""
     frames_per_recording: PositiveInt = 200
@@ -100,13 +104,14 @@ class TrainingOptions:
         if self.target != "repeatability":
             if not self.architecture.peaks:
                 raise ConfigError(
-                    f"the network {self.network} says nothing of a pixel; target={self.target} needs compact, quick or "
-                    "far"
+                    f"the network {self.network} says nothing of a pixel; target={self.target} needs compact or far"
                 )
             if self.lesson_epochs or self.only == "descriptors":
                 raise ConfigError(
                     "lessons and descriptors are of target=repeatability; train them apart, with --finetune"
                 )
+        if self.patch_ratio[0] > self.patch_ratio[1]:
+            raise ConfigError(f"patch_ratio must be the least and the largest, not {self.patch_ratio}")
         if self.epoch_samples is not None and self.epoch_samples < self.batch:
             raise ConfigError(f"epoch_samples must be at least the batch, {self.batch}, not {self.epoch_samples}")
 

@@ -66,7 +66,8 @@ def start(runtime: str, precision: str, weights: Weights, options: KeypointNetOp
 
 def _by_openvino(weights: Weights, descriptors: bool, int8: bool, threads: int) -> Run:
     """OpenVINO's graph on a CPU, compiled for each size of image when the first comes."""
-    core, see = import_openvino().Core(), Eye(weights.architecture, eight_bits=int8)
+    openvino = import_openvino()
+    core = openvino.Core()
     settings: dict[str, Any] = {"INFERENCE_PRECISION_HINT": "f32", "PERFORMANCE_HINT": "LATENCY"}
     # It would wait for one core while the back-end is on that, though the other is free.
     settings["ENABLE_CPU_PINNING"] = False
@@ -75,14 +76,19 @@ def _by_openvino(weights: Weights, descriptors: bool, int8: bool, threads: int) 
         settings["INFERENCE_NUM_THREADS"] = threads
 
     @lru_cache(maxsize=4)
-    def compiled(shape: tuple[int, int]) -> Any:
+    def compiled(shape: tuple[int, int]) -> tuple[Eye, Any, tuple[NDArray[np.float32], ...]]:
+        """What sees, the network, and what that gives, each of which finds what the one before leaves."""
+        eye = Eye(weights.architecture, shape, eight_bits=int8)
         graph = model(weights, shape, descriptors=descriptors, int8=int8)
-        return core.compile_model(graph, "CPU", settings).create_infer_request()
+        request = core.compile_model(graph, "CPU", settings).create_infer_request()
+        request.set_input_tensor(openvino.Tensor(eye.seen[None], shared_memory=True))
+        return eye, request, tuple(tensor.data[0] for tensor in request.output_tensors)
 
     def run(image: Image) -> tuple[NDArray[np.float32], ...]:
-        request = compiled(cast(tuple[int, int], image.shape))
-        found = request.infer({0: see(image)[None]}, share_inputs=True, share_outputs=True)
-        return tuple(array[0] for array in found.to_tuple())
+        see, request, outputs = compiled(cast(tuple[int, int], image.shape))
+        see(image)
+        request.infer(share_outputs=True)
+        return outputs
 
     return run
 

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
 from vioframe.jit import kernel
 from vioframe.types import Image
-from vioframe_keypointnet.architecture import FAINT, Architecture
+from vioframe_keypointnet.architecture import FAINT, FOLD_PX, Architecture
 
 COARSE_PX = 4
 """Side of the squares of pixels whose means the local means are made of."""
@@ -17,62 +19,36 @@ CONTRAST_STEP = np.float32(6.0 / 127.0)
 """Of local contrast in 8 bits, which end at 6 deviations: what lies farther out is noise on a blank surface."""
 
 _FAINT = np.float32((255.0 * FAINT) ** 2)
-_AROUND = 5
-"""So many squares along either axis make a local mean."""
 
 Floats = NDArray[np.float32]
 
 
 class Eye:
-    """Sees images whose sides are multiples of 8; what it gives stays as it is until the next image.
+    """Sees images of one ``shape`` (H, W), multiples of 8; what it sees is in ``seen``, which stays where it is.
 
-    The grey levels themselves, (1, H, W); for a network of peaks the local contrast of
-    :func:`vioframe_keypointnet.network.locally_normalised`, f x f pixels folded, (f^2, H/f, W/f), or, in
+    That are the grey levels themselves, (H, W, 1); for a network of peaks the local contrast of
+    :func:`vioframe_keypointnet.network.locally_normalised`, 4 x 4 pixels folded, (H/4, W/4, 16), or, in
     ``eight_bits``, steps of :data:`CONTRAST_STEP` from :data:`ZERO`.
     """
 
-    def __init__(self, architecture: Architecture, *, eight_bits: bool) -> None:
-        self._fold, self._eight_bits = architecture.fold, eight_bits
-        self._make_room(0, 0)
+    def __init__(self, architecture: Architecture, shape: tuple[int, int], *, eight_bits: bool) -> None:
+        self._peaks, f = architecture.peaks, architecture.fold
+        self._see = _contrast_in_steps if eight_bits else _contrast
+        kind = np.uint8 if eight_bits or not self._peaks else np.float32
+        self.seen: NDArray[Any] = np.empty((shape[0] // f, shape[1] // f, f * f), kind)
+        # New arrays each time would take longer than what fills them.
+        self._coarse = np.empty((shape[0] // COARSE_PX, shape[1] // COARSE_PX), np.float32)
+        self._mean, self._variance = (np.empty((shape[0] // COARSE_PX, shape[1]), np.float32) for _ in range(2))
 
-    def _make_room(self, rows: int, columns: int) -> None:
-        """Arrays for images of one size: as new ones each time they would take longer than what fills them."""
-        self._contrast = np.empty((rows, columns), np.uint8 if self._eight_bits else np.float32)
-        f = self._fold
-        self._seen = np.empty((f * f, rows // f, columns // f), np.uint8 if self._eight_bits else np.float32)
-        self._coarse, self._means = (np.empty((rows // COARSE_PX, columns // COARSE_PX), np.float32) for _ in range(2))
-        self._mean, self._variance = (np.empty((rows // COARSE_PX, columns), np.float32) for _ in range(2))
-
-    def __call__(self, image: Image) -> Floats | Image:
-        if self._fold == 1:
-            return image[None]
-        rows, columns = image.shape
-        f = self._fold
-        if image.shape != self._contrast.shape:
-            self._make_room(rows, columns)
+    def __call__(self, image: Image) -> None:
+        if not self._peaks:
+            self.seen[..., 0] = image
+            return
         _means(image, self._coarse)
-        self._smooth(self._mean)
+        _smooth(self._coarse, self._mean)
         _variances(image, self._mean, self._coarse)
-        self._smooth(self._variance)
-        if self._eight_bits:
-            _contrast_in_steps(image, self._mean, self._variance, self._contrast)
-            # The pixels of a row that one place holds are one whole number, of which a cast takes the lowest.
-            places = self._contrast.view(f"<u{f}").reshape(rows // f, f, columns // f).swapaxes(0, 1)
-            for k in range(f):
-                np.right_shift(places, 8 * k, out=self._seen[k::f], casting="unsafe")
-        else:
-            _contrast(image, self._mean, self._variance, self._contrast)
-            by_place = self._contrast.reshape(rows // f, f, columns // f, f).transpose(1, 3, 0, 2)
-            self._seen.reshape(f, f, rows // f, columns // f)[:] = by_place
-        return self._seen
-
-    def _smooth(self, around: Floats) -> None:
-        """Fill ``around`` (H/4, W) with the mean of the coarse values about each, interpolated within the rows; kernels
-        do it between."""
-        import cv2
-
-        cv2.blur(self._coarse, (_AROUND, _AROUND), self._means, borderType=cv2.BORDER_REPLICATE)
-        cv2.resize(self._means, around.shape[::-1], around, interpolation=cv2.INTER_LINEAR)
+        _smooth(self._coarse, self._variance)
+        self._see(image, self._mean, self._variance, self.seen)
 
 
 @kernel
@@ -98,6 +74,31 @@ def _means(image: Image, coarse: Floats) -> None:
 
 
 @kernel
+def _smooth(coarse: Floats, around: Floats) -> None:
+    """Fill ``around`` (H/4, W) with the mean of 5 x 5 ``coarse`` values (H/4, W/4), interpolated within the rows; what
+    is beyond the border is as at it."""
+    rows, columns = coarse.shape
+    total, mean = np.empty(columns + 4, np.float32), np.empty(columns + 2, np.float32)
+    far, near = np.float32(0.375), np.float32(0.125)  # of four pixels those at the sides, and those in the middle
+    for r in range(rows):
+        above, below = coarse[max(r - 2, 0)], coarse[min(r + 2, rows - 1)]
+        over, under = coarse[max(r - 1, 0)], coarse[min(r + 1, rows - 1)]
+        for c in range(columns):
+            total[c + 2] = above[c] + over[c] + coarse[r, c] + under[c] + below[c]
+        total[:2], total[-2:] = total[2], total[-3]
+        for c in range(columns):
+            five = total[c] + total[c + 1] + total[c + 2] + total[c + 3] + total[c + 4]
+            mean[c + 1] = five * np.float32(1.0 / 25.0)
+        mean[0], mean[-1] = mean[1], mean[-2]
+        for c in range(columns):
+            before, here, after = mean[c], mean[c + 1], mean[c + 2]
+            around[r, COARSE_PX * c] = here + far * (before - here)
+            around[r, COARSE_PX * c + 1] = here + near * (before - here)
+            around[r, COARSE_PX * c + 2] = here + near * (after - here)
+            around[r, COARSE_PX * c + 3] = here + far * (after - here)
+
+
+@kernel
 def _variances(image: Image, mean: Floats, variance: Floats) -> None:
     """Fill ``variance`` (H/4, W/4) with the mean square, over each 4 x 4 px, of the image less its local ``mean``."""
     rows, columns = variance.shape
@@ -116,23 +117,32 @@ def _variances(image: Image, mean: Floats, variance: Floats) -> None:
 
 
 @kernel
-def _contrast(image: Image, mean: Floats, variance: Floats, contrast: Floats) -> None:
-    """Fill ``contrast`` (H, W) with the image less its local mean, over the local deviation."""
+def _contrast(image: Image, mean: Floats, variance: Floats, seen: Floats) -> None:
+    """Fill ``seen`` (H/4, W/4, 16) with the image less its local mean, over the local deviation."""
+    contrast = np.empty(image.shape[1], np.float32)
     for y in range(len(image)):
-        _contrast_of_row(image[y], mean, variance, y, contrast[y])
+        _contrast_of_row(image[y], mean, variance, y, contrast)
+        first = FOLD_PX * (y % FOLD_PX)
+        for x in range(len(contrast)):
+            seen[y // FOLD_PX, x // FOLD_PX, first + x % FOLD_PX] = contrast[x]
 
 
 @kernel
-def _contrast_in_steps(image: Image, mean: Floats, variance: Floats, steps: Image) -> None:
+def _contrast_in_steps(image: Image, mean: Floats, variance: Floats, seen: Image) -> None:
     """The same in 8 bits."""
-    contrast = np.empty(image.shape[1], np.float32)
+    contrast, steps = np.empty(image.shape[1], np.float32), np.empty(image.shape[1], np.uint8)
+    # The pixels of a row that are of one place are moved together.
+    of_row, of_places = steps.view(np.uint32), seen.view(np.uint32)
     per_step = np.float32(1.0) / CONTRAST_STEP
     for y in range(len(image)):
         _contrast_of_row(image[y], mean, variance, y, contrast)
         for x in range(len(contrast)):
             rounded = contrast[x] * per_step + np.float32(ZERO + 0.5)
             # By way of int32, as processors convert no vector of floats to bytes.
-            steps[y, x] = np.uint8(np.int32(min(max(rounded, np.float32(0.0)), np.float32(255.0))))
+            steps[x] = np.uint8(np.int32(min(max(rounded, np.float32(0.0)), np.float32(255.0))))
+        places = of_places[y // FOLD_PX]
+        for place in range(len(places)):
+            places[place, y % FOLD_PX] = of_row[place]
 
 
 @kernel(inlined=True)

@@ -6,7 +6,7 @@ keypoints (:func:`peaks`).
 
 from __future__ import annotations
 
-from math import ceil, isqrt
+from math import ceil
 from typing import NamedTuple
 
 import numpy as np
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from vioframe.jit import kernel
 from vioframe.types import Image, Int
-from vioframe_keypointnet.architecture import CELL_PX
+from vioframe_keypointnet.architecture import CELL_PX, FOLD_PX
 
 OFFSET_PX = 2.0 * (CELL_PX - 1) / 2
 """How far a regressed keypoint may lie from its cell's centre along either axis: 2 half cells, the published cross
@@ -22,8 +22,6 @@ ratio, so that neighbours reach into each other."""
 
 CONTRAST_REACH_PX = 8
 """Half the side of the window in which the image as given must vary for a keypoint to be there."""
-_SUMMITS_A_POINT = 2
-"""So many of the highest that may be peaks are looked at for each point that is wanted, before all are."""
 
 Array = NDArray[np.float32]
 
@@ -91,24 +89,20 @@ def candidate_places(heads: Array) -> tuple[Array, Array]:
 
 
 def peaks(found: Array, image: Image, shape: tuple[int, int], max_points: int, rules: Rules) -> tuple[Array, Array]:
-    """``xy`` (N, 2) px and ``score`` (N,) in (0, 1), strongest first, of the peaks of ``found`` (H/f, W/f, f^2).
+    """``xy`` (N, 2) px and ``score`` (N,) in (0, 1), strongest first, of the peaks of ``found`` (H/4, W/4, 16).
 
     A peak is the highest of all pixels nearer than ``nms_px`` along both axes, of equals the first row by row; its
     place is that of the parabolas through it and its neighbours. Not taken: what :func:`select` leaves.
     """
-    levels, reach = isqrt(found.shape[2]).bit_length() - 1, max(ceil(rules.nms_px) - 1, 1)
-    response = found.reshape(len(found), -1)
-    at, height = _summits(response, levels, reach)
-    # The highest nearly always suffice; to sort all takes several times as long.
-    for most in (_SUMMITS_A_POINT * max_points, len(height)):
-        highest = np.sort(np.argpartition(-height, most)[:most]) if most < len(height) else np.arange(len(height))
-        highest = highest[np.argsort(-height[highest], stable=True)]
-        xy, taken = _first_peaks(
-            response, levels, at[highest], reach, image, *shape, rules.min_contrast, rules.within_px, max_points
-        )
-        if len(taken) == max_points or len(height) <= most:
-            break
-    return xy, _sigmoid(height[highest[taken]])
+    response, reach = by_pixel(found), max(ceil(rules.nms_px) - 1, 1)
+    ranked = np.sort(_summits(response, reach))
+    xy, height = _first_peaks(response, ranked, reach, image, *shape, rules.min_contrast, rules.within_px, max_points)
+    return xy, _sigmoid(height)
+
+
+def by_pixel(found: Array) -> Array:
+    """(H/4, W/4, 4, 4) of what a network of peaks gives, (H/4, W/4, 16): see :func:`response_at`."""
+    return found.reshape(*found.shape[:2], FOLD_PX, FOLD_PX)
 
 
 def describe(descriptors: Array, xy: Array) -> Array:
@@ -167,64 +161,66 @@ def _strongest(score: Array, x: Array, y: Array, nms_px: np.float32, reach: int)
 
 
 @kernel
-def _summits(response: Array, levels: int, reach: int) -> tuple[Int, Array]:
-    """Columns and rows (N, 2) px, and heights (N,), of what may be peaks, two rows after the other, off the border.
+def _summits(response: Array, reach: int) -> Int:
+    """(N,) of the squares of 2 x 2 px that may hold a peak, off the border, the :func:`_rank`.
 
-    Of each 2 x 2 px that is the highest, of equals the first, if none of the squares around has a higher one: whether
-    it is a peak :func:`_is_peak` knows. For ``response`` and its ``levels`` see :func:`response_at`.
+    They are those around which no square has a higher pixel than theirs: whether that is a peak :func:`_is_peak` knows.
+    For ``response`` see :func:`response_at`.
     """
-    fold, half = 1 << levels, 1 << (levels - 1)
-    rows, columns = len(response) * half, response.shape[1] // (2 * fold)
-    at, height = np.empty((rows * columns, 2), np.int64), np.empty(rows * columns, np.float32)
-    # Of each 2 x 2 px the highest value, and of three such squares beside each other.
+    rows, places = 2 * len(response), response.shape[1]
+    columns = 2 * places
+    found, count, border = np.empty(rows * columns, np.int64), 0, CELL_PX // 2
+    # Of two rows of pixels the higher ones; of each square the highest, and of three squares beside each other.
+    pair, around = np.empty(2 * columns, np.float32), np.empty(columns, np.float32)
     square, three = np.full((3, columns), -np.inf, np.float32), np.full((3, columns), -np.inf, np.float32)
-    around = np.empty(columns, np.float32)
-    count, border = 0, CELL_PX // 2
+    high = np.empty(columns, np.int64)
     for below in range(border - 1, rows - border + 1):
-        new, line = below % 3, response[below >> (levels - 1)]
-        for column in range(half):
-            k = ((below & (half - 1)) << (levels + 1)) + 2 * column
-            for place in range(columns >> (levels - 1)):
-                highest = max(max(line[k], line[k + 1]), max(line[k + fold], line[k + fold + 1]))
-                square[new, (place << (levels - 1)) + column] = highest
-                k += fold << levels
+        new, within = below % 3, 2 * (below & 1)
+        for place in range(places):
+            pixels = response[below >> 1, place]
+            for k in range(FOLD_PX):
+                pair[FOLD_PX * place + k] = max(pixels[within, k], pixels[within + 1, k])
+        for column in range(columns):
+            square[new, column] = max(pair[2 * column], pair[2 * column + 1])
         for column in range(1, columns - 1):
             three[new, column] = max(square[new, column - 1], square[new, column], square[new, column + 1])
         row = below - 1
         if row < border:
             continue
-        middle, before = row % 3, (row - 1) % 3
-        for left in range(columns):
-            around[left] = max(three[before, left], three[middle, left], three[new, left])
-        for left in range(border, columns - border):
-            highest = square[middle, left]
+        for column in range(columns):
             # All of the squares around are within 3 px.
-            if reach >= 3 and around[left] > highest:
-                continue
-            for k in range(4):
-                y, x = 2 * row + k // 2, 2 * left + k % 2
-                if response_at(response, levels, y, x) == highest:
-                    at[count] = x, y
-                    height[count] = highest
-                    count += 1
-                    break
-    return at[:count], height[:count]
+            around[column] = max(three[0, column], three[1, column], three[2, column]) if reach >= 3 else -np.inf
+        # Which are high no processor can guess: each is noted, and those that are not are overwritten.
+        n = 0
+        for column in range(border, columns - border):
+            high[n] = column
+            n += square[row % 3, column] >= around[column]
+        for column in high[:n]:
+            found[count] = _rank(square[row % 3, column], row, column)
+            count += 1
+    return found[:count]
 
 
 @kernel(inlined=True)
-def response_at(response: Array, levels: int, row: int, column: int) -> np.float32:
-    """That of a pixel, of ``response`` (H/f, f W): of f x f px, row by row, beside that of the next; f is 2^levels."""
-    within = (1 << levels) - 1
-    place = ((column >> levels) << 2 * levels) + ((row & within) << levels) + (column & within)
-    value: np.float32 = response[row >> levels, place]
+def _rank(height: np.float32, row: int, column: int) -> np.int64:
+    """A whole number, the lower the higher a square is, and of equals the earlier; its last 32 bits are where it is."""
+    # The bits of floats are ordered as they are, but for those below zero.
+    bits = np.int64(np.float32(height).view(np.int32))
+    ordered = bits if bits >= 0 else bits ^ 0x7FFFFFFF
+    return -(ordered << 32) + (row << 16) + column
+
+
+@kernel(inlined=True)
+def response_at(response: Array, row: int, column: int) -> np.float32:
+    """That of a pixel, of ``response`` (H/4, W/4, 4, 4), which has that of 4 x 4 px together."""
+    value: np.float32 = response[row >> 2, column >> 2, row & 3, column & 3]
     return value
 
 
 @kernel
 def _first_peaks(
     response: Array,
-    levels: int,
-    at: Int,
+    ranked: Int,
     reach: int,
     image: Image,
     height: int,
@@ -232,36 +228,43 @@ def _first_peaks(
     min_contrast: int,
     within_px: int,
     most: int,
-) -> tuple[Array, Int]:
-    """Of the columns and rows ``at`` (N, 2) px the first ``most`` that are peaks where the image varies: where they are
-    to a part of a pixel, (M, 2), and which (M,)."""
-    xy, taken = np.empty((min(most, len(at)), 2), np.float32), np.empty(min(most, len(at)), np.int64)
+) -> tuple[Array, Array]:
+    """Of the squares ``ranked`` the first ``most`` with peaks where the image varies: where these are to a part of a
+    pixel, (M, 2), and the response there, (M,)."""
+    xy, peak = np.empty((min(most, len(ranked)), 2), np.float32), np.empty(min(most, len(ranked)), np.float32)
     count = 0
-    for k in range(len(at)):
+    for rank in ranked:
         if count == most:
             break
-        x, y = at[k]
-        if x >= width or y >= height or not _is_peak(response, levels, y, x, reach):
+        y, x = _highest(response, (rank >> 16) & 0xFFFF, rank & 0xFFFF)
+        if x >= width or y >= height or not _is_peak(response, y, x, reach):
             continue
         if _varies(image, x, y, height, width, min_contrast, within_px):
-            here = response_at(response, levels, y, x)
-            xy[count, 0] = x + _summit(
-                response_at(response, levels, y, x - 1), here, response_at(response, levels, y, x + 1)
-            )
-            xy[count, 1] = y + _summit(
-                response_at(response, levels, y - 1, x), here, response_at(response, levels, y + 1, x)
-            )
-            taken[count] = k
+            here = response_at(response, y, x)
+            xy[count, 0] = x + _summit(response_at(response, y, x - 1), here, response_at(response, y, x + 1))
+            xy[count, 1] = y + _summit(response_at(response, y - 1, x), here, response_at(response, y + 1, x))
+            peak[count] = here
             count += 1
-    return xy[:count], taken[:count]
+    return xy[:count], peak[:count]
 
 
 @kernel(inlined=True)
-def _is_peak(response: Array, levels: int, row: int, column: int, reach: int) -> bool:
-    here = response_at(response, levels, row, column)
-    for r in range(max(row - reach, 0), min(row + reach + 1, len(response) << levels)):
-        for c in range(max(column - reach, 0), min(column + reach + 1, response.shape[1] >> levels)):
-            there = response_at(response, levels, r, c)
+def _highest(response: Array, row: int, column: int) -> tuple[int, int]:
+    """Row and column of the highest pixel of a square of 2 x 2, of equals the first."""
+    y, x = 2 * row, 2 * column
+    for k in range(1, 4):
+        r, c = 2 * row + (k >> 1), 2 * column + (k & 1)
+        if response_at(response, r, c) > response_at(response, y, x):
+            y, x = r, c
+    return y, x
+
+
+@kernel(inlined=True)
+def _is_peak(response: Array, row: int, column: int, reach: int) -> bool:
+    here = response_at(response, row, column)
+    for r in range(max(row - reach, 0), min(row + reach + 1, FOLD_PX * len(response))):
+        for c in range(max(column - reach, 0), min(column + reach + 1, FOLD_PX * response.shape[1])):
+            there = response_at(response, r, c)
             if there > here or (there == here and (r < row or (r == row and c < column))):
                 return False
     return True

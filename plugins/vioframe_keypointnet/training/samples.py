@@ -34,8 +34,6 @@ _LARGEST_SCALE = 1.2
 _AFFINE_DEG = 15.0
 """Largest turn of the first view."""
 
-_PATCH_RATIO = 0.7
-"""Side of the part of the first view that fills the second."""
 _PERSPECTIVE = 0.2
 """Largest shift of its corners as a share of the view, two standard deviations; never beyond the view's edge."""
 _ROTATION_DEG = 45.0
@@ -172,7 +170,7 @@ def pair(picture: Picture, options: TrainingOptions, number: int, *, corners_tau
     crop = np.eye(3)
     crop[:2, 2] = -rng.uniform(0.0, 1.0, 2) * room
     first = _random_turn(rng, options.size) @ crop
-    second = random_homography(rng, options.size) @ first
+    second = random_homography(rng, options.size, options.patch_ratio) @ first
     if rng.random() < 0.5:
         first, second = second, first
     between = second @ np.linalg.inv(first)
@@ -189,13 +187,17 @@ def pair(picture: Picture, options: TrainingOptions, number: int, *, corners_tau
     )
 
 
-def random_homography(rng: np.random.Generator, size: tuple[int, int]) -> Float:
-    """(3, 3) from pixels of an image of ``size`` (width, height) to pixels of a view of the same size, as published."""
+def random_homography(rng: np.random.Generator, size: tuple[int, int], patch_ratio: tuple[float, float]) -> Float:
+    """(3, 3) from pixels of an image of ``size`` (width, height) to pixels of a view of the same size.
+
+    The view is of a part of the image, whose sides are ``patch_ratio`` of the image's: from the first to the second.
+    """
     import cv2
 
-    patch = np.array([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]]) * _PATCH_RATIO
+    ratio = rng.uniform(*patch_ratio)
+    patch = np.array([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]]) * ratio
     # Symmetric along x, free along y: what a camera does that is turned away about its axes.
-    most = min(_PERSPECTIVE, 0.5 * (1.0 - _PATCH_RATIO))
+    most = min(_PERSPECTIVE, 0.5 * (1.0 - ratio))
     lean = np.clip(rng.normal(0.0, most / 2.0, 3), -most, most)
     patch += np.array([[lean[1], lean[0]], [lean[2], -lean[0]], [lean[2], lean[0]], [lean[1], -lean[0]]])
     patch *= rng.uniform(*_SCALE)

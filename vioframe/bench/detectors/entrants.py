@@ -15,13 +15,13 @@ from vioframe.parts.registry import DETECTOR, Registry, describe
 from vioframe.types import Image, Keypoints
 
 _DESCRIPTORS = "descriptors"
-_QUICK, _TRACKS, _FULL = (f"keypointnet:weights={name}" for name in ("quick", "tracks", "full"))
+_TRACKS, _FULL = (f"keypointnet:weights={name}" for name in ("tracks", "full"))
 # Which sees large images at half their size otherwise.
 _WHOLE = "keypointnet:halvings=0"
 _VARIANTS: Mapping[str, Mapping[str, Sequence[str]]] = {
-    "speed": {"keypointnet": (_WHOLE, _QUICK, _TRACKS, _FULL)},
+    "speed": {"keypointnet": (_WHOLE, _TRACKS, _FULL)},
     # 10 px between corners, the default, suits tracking; it leaves out many that could be found again.
-    "quality": {"shi_tomasi": ("shi_tomasi:min_distance_px=4",), "keypointnet": (_QUICK, _FULL)},
+    "quality": {"shi_tomasi": ("shi_tomasi:min_distance_px=4",), "keypointnet": (_FULL,)},
 }
 
 
