@@ -535,8 +535,9 @@ def clean() -> str:
 
 
 def comparison() -> str:
-    """The suite ``mh05_comparison``: accuracy over its starts."""
+    """The suite ``mh05_comparison``: accuracy over its worlds, and who won in how many of them."""
     table = pd.read_csv(HERE / "results" / "mh05_comparison" / "accuracy.csv")
+    against = {(row["detector"], row["back-end"]): row for _, row in _duels("mh05_comparison").iterrows()}
     shown = [
         {
             "sequence": f"{row['sequence']}, {row['data']}",
@@ -546,8 +547,11 @@ def comparison() -> str:
             "ATE, mean": f"{1e3 * row['ATE, position + yaw [m]']:.1f} ± {1e3 * row['std [m]']:.1f} mm",
             "of the path": f"{row['ATE [% of path]']:.3f} %",
             "completion": f"{row['completion [%]']:.0f} %",
+            "over that of `shi_tomasi`": "-" if duel is None else _with_interval(duel),
+            "won - lost": "-" if duel is None else f"{duel['won']} - {duel['lost']}",
         }
         for _, row in table.iterrows()
+        for duel in [against.get((row["detector"], row["back-end"]))]
     ]
     return markdown(shown) + suite_source("mh05_comparison")
 
