@@ -26,7 +26,7 @@ Floats = NDArray[np.float32]
 class Eye:
     """Sees images of one ``shape`` (H, W), multiples of 8; what it sees is in ``seen``, which stays where it is.
 
-    That are the grey levels themselves, (H, W, 1); for a network of peaks the local contrast of
+    Of the published network that are the grey levels, (H, W, 1); for a network of peaks the local contrast of
     :func:`vioframe_keypointnet.network.locally_normalised`, 4 x 4 pixels folded, (H/4, W/4, 16), or, in
     ``eight_bits``, steps of :data:`CONTRAST_STEP` from :data:`ZERO`.
     """

@@ -162,9 +162,9 @@ def _strongest(score: Array, x: Array, y: Array, nms_px: np.float32, reach: int)
 
 @kernel
 def _summits(response: Array, reach: int) -> Int:
-    """(N,) of the squares of 2 x 2 px that may hold a peak, off the border, the :func:`_rank`.
+    """The :func:`_rank` (N,) of each square of 2 x 2 px, off the border, that may hold a peak.
 
-    They are those around which no square has a higher pixel than theirs: whether that is a peak :func:`_is_peak` knows.
+    It may where none of the squares around has a higher pixel: whether its highest is a peak :func:`_is_peak` knows.
     For ``response`` see :func:`response_at`.
     """
     rows, places = 2 * len(response), response.shape[1]

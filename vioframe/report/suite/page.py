@@ -59,8 +59,9 @@ class Section(NamedTuple):
 
 SECTIONS = (
     Section("speed", "Detector speed", ["detector_fps"], ["detector_fps"], "Frames a second, on this machine."),
+    Section("duels", "Head to head", [], ["duels"], "The same flights by one detector and by another."),
     Section(
-        *("stress", "Hard conditions", ["stress"], ["duels", "stress"]),
+        *("stress", "Hard conditions", ["stress"], ["stress"]),
         "How much worse each contender gets as a condition gets harder, and when it gives up.",
     ),
     Section(
