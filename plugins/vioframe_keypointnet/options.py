@@ -35,7 +35,7 @@ class KeypointNetOptions:
     the first image."""
     halvings: NonNegativeInt | None = None
     """How often the image is halved before the network sees it; null: a small network trained for repeatability sees
-    none that is twice as large as the views in training: those that ship see images of 480 rows or more at half their
+    none that is twice as large as the views in training: compact sees images of 480 rows or more at half their
     size, of 960 or more at a quarter."""
     nms_px: NonNegativeFloat = 4.0
     """A keypoint goes where a stronger one is nearer than this, in pixels of what the network sees."""
