@@ -595,6 +595,25 @@ def exact_points() -> str:
     return markdown(shown) + source(rows)
 
 
+def foresight() -> str:
+    """The ATE over Shi-Tomasi's by KeypointNet, and by points whose fate is known, by condition."""
+    rows = recorded("foresight.json")
+    ates = rows.pivot_table(index=["condition", "world"], columns=["detector", "backend"], values="ate_mm", sort=False)
+    conditions = ates.index.get_level_values("condition")
+    degraded = ates.loc[conditions != "clear"]
+    shown = [
+        {"": str(condition)}
+        | {
+            f"`{name}`, `{backend}`": f"{geometric_mean(of[name, backend] / of['shi_tomasi', backend]):.2f}"
+            for name, backend in of
+            if name != "shi_tomasi"
+        }
+        | {"n": f"{len(of)}"}
+        for condition, of in [*ates.groupby("condition", sort=False), ("all degraded", degraded)]
+    ]
+    return markdown(shown) + source(rows)
+
+
 def tuning() -> str:
     """The suite ``tuning``: what each variant reaches by Shi-Tomasi's ATE, in the clear and in all that is degraded."""
     table = _duels("tuning")
@@ -683,6 +702,7 @@ FIGURES: dict[str, Callable[[], str]] = {
             stress,
             contest,
             exact_points,
+            foresight,
             throughput,
             rolling_shutter,
             planted_faults,

@@ -24,7 +24,7 @@ from common import present, render, script
 from threadpoolctl import threadpool_limits
 
 from vioframe.bench import Row
-from vioframe.bench.suites.sources import EUROC
+from vioframe.bench.suites.sources import tour
 from vioframe.cores import usable_cores
 from vioframe.parts import registry
 from vioframe.simulation.config import SimulationConfig
@@ -82,9 +82,8 @@ def followed(out: Path, number: int) -> Path:
     """Where it is kept what became of the points of the ``number``-th flight for training."""
     kept = out / f"flight_{number:02}.followed"
     if not kept.exists():
-        tour = TOURS[number // 2 % len(TOURS)]
         simulated = SimulationConfig(
-            flight=EUROC[tour].tour(1 + list(EUROC).index(tour)),
+            flight=tour(TOURS[number // 2 % len(TOURS)]),
             duration_s=DURATION_S,
             seed=seed_for("training", number),
             conditions=CONDITIONS[number % len(CONDITIONS)],

@@ -97,7 +97,7 @@ def fates() -> Followed:
         ("life", [1.0, 1.0, 0.25, 1.0, 1.0]),
         ("drift", [1.0, 0.5, 1.0, 1.0 / 9.0, 1.0]),
         ("faithful", [1.0, 1.0, 0.25, 0.5, 1.0]),
-        ("information", [1.0, 0.09 / 0.34, 0.25, 0.5 + 0.5 * 0.09 / 4.09, 1.0]),
+        ("information", [1.0, 0.01 / 0.26, 0.25, 0.5 + 0.5 * 0.01 / 4.01, 1.0]),
         ("clean", [1.0, 1.0, 1.0, 0.0, 1.0]),
     ],
 )
@@ -105,6 +105,19 @@ def test_what_each_target_says_of_a_point(target, worth):
     score, enough = wanted(target, fates())
     np.testing.assert_allclose(score[:5], worth, atol=2e-3)
     assert enough.tolist() == [True] * 5 + [False]
+
+
+def test_information_goes_by_what_is_usual_in_the_image():
+    """Where all points stray three times as far, the same ones are as good; but not where all stray next to nothing."""
+    off_px = np.repeat([[0.2], [0.4], [1.0]], IMAGES, axis=1).astype(np.float16)
+
+    def worth(times):
+        points = replace(fates(), xy=np.zeros((3, 2), np.float32), known=np.ones(off_px.shape, bool))
+        return wanted("information", replace(points, off_px=(times * off_px).astype(np.float16)))[0]
+
+    np.testing.assert_allclose(worth(1.0), [0.64 / (0.64 + off**2) for off in (0.2, 0.4, 1.0)], atol=2e-3)
+    np.testing.assert_allclose(worth(3.0), worth(1.0), atol=2e-3)
+    assert worth(0.05).min() > worth(1.0).min() + 0.3
 
 
 def test_points_are_where_the_crops_show_them():

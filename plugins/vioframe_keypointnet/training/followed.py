@@ -39,16 +39,16 @@ IMAGES = 60
 """In how many images a point is followed, at most: three seconds at 20 Hz."""
 _KNOWN = 20
 """In fewer nothing is learned of it."""
-_EVERY = 6
-"""Of the images of a flight, points are drawn in one of so many."""
-_POINTS, _APART_PX, _STEEPEST = 600, 6.0, 0.5
-"""How many, how far apart, and from which share of the pixels: among them bad ones, or there is nothing to be told."""
+_STEEPEST = 0.5
+"""From which share of the pixels points are drawn: among them bad ones, or there is nothing to be told."""
 _EDGE_PX = 10.0
 """Points so near the edge of a crop are seen in part."""
 
 _STRAYED_PX = 1.0
 """So far from its landmark a point does more harm than good."""
-_DRIFT_PX, _SIGMA_PX = 0.5, 0.3
+_DRIFT_PX = 0.5
+_FINEST_PX = 0.1
+"""Points that are followed more closely than this are all as good."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,8 +64,10 @@ class Followed(Picture):
     """
 
 
-def follow(recording: Path) -> list[Followed]:
-    """Follow points of every sixth image of a simulated ``recording`` by the first of its cameras.
+def follow(recording: Path, *, every: int = 6, points: int = 600, apart_px: float = 6.0) -> list[Followed]:
+    """Follow so many ``points``, ``apart_px`` or more from each other, through a simulated ``recording``.
+
+    They are drawn anew in one of ``every`` so many images of the first of its cameras.
 
     Raises :class:`ConfigError` where it was not simulated: nobody knows its landmarks.
     """
@@ -75,8 +77,8 @@ def follow(recording: Path) -> list[Followed]:
     truth, calibration = dataset.ground_truth, dataset.calibration
     if truth is None or not mesh.is_file():
         raise ConfigError(f"{recording} was not simulated: nobody knows where its points are; use `vioframe simulate`")
-    camera, options = calibration.cameras[0], FrontendOptions(max_points=_POINTS, min_distance_px=_APART_PX)
-    detector = installed.create_detector("random", {"steepest": _STEEPEST, "min_distance_px": _APART_PX})
+    camera, options = calibration.cameras[0], FrontendOptions(max_points=points, min_distance_px=apart_px)
+    detector = installed.create_detector("random", {"steepest": _STEEPEST, "min_distance_px": apart_px})
     incidents, watch = Incidents(), Stopwatch()
     t_ns: list[int] = []
     begun: list[_Set] = []
@@ -86,19 +88,20 @@ def follow(recording: Path) -> list[Followed]:
             continue
         R_C2C1 = camera.R_BC.T @ body_rotation(imu).T @ camera.R_BC
         shown = Shown.of(image, options, watch)
-        for points in begun:
-            points.advance(shown, R_C2C1, frames.t_ns, watch)
-        if len(t_ns) % _EVERY == 0 and shown.pyramid is not None:
-            begun.append(_Set(len(t_ns), shown, View(detector, camera.model, options, incidents), frames.t_ns, watch))
+        for drawn in begun:
+            drawn.advance(shown, R_C2C1, frames.t_ns, watch)
+        if len(t_ns) % every == 0 and shown.pyramid is not None:
+            view = View(detector, camera.model, options, incidents)
+            begun.append(_Set(len(t_ns), shown, view, points, frames.t_ns, watch))
         t_ns.append(frames.t_ns)
     motion, corners = truth.at(t_ns), read_mesh(mesh)
     R_WC, p_WC = camera.pose(motion.R_WB, motion.p_WB)
     out = []
-    for number, points in enumerate(begun):
-        seen = slice(points.first, points.first + IMAGES + 1)
-        off_px, known = _fates(points.xy, R_WC[seen], p_WC[seen], camera.model, corners)
-        xy = points.xy[:, 0].astype(np.float32)
-        out.append(Followed(f"{recording}#{number}", points.image, xy, off_px.astype(np.float16), known))
+    for number, drawn in enumerate(begun):
+        seen = slice(drawn.first, drawn.first + IMAGES + 1)
+        off_px, known = _fates(drawn.xy, R_WC[seen], p_WC[seen], camera.model, corners)
+        xy = drawn.xy[:, 0].astype(np.float32)
+        out.append(Followed(f"{recording}#{number}", drawn.image, xy, off_px.astype(np.float16), known))
     return out
 
 
@@ -121,11 +124,11 @@ def _fates(xy: Float, R_WC: Float, p_WC: Float, camera: Camera, corners: Float) 
 
 
 class _Set:
-    """Points drawn in image ``first``, which ``shown`` is; ``xy`` (N, IMAGES + 1, 2) px, NaN where they are lost."""
+    """``most`` points drawn in image ``first``, which ``shown`` is; ``xy`` (N, IMAGES + 1, 2) px, NaN where lost."""
 
-    def __init__(self, first: int, shown: Shown, view: View, t_ns: int, watch: Stopwatch) -> None:
+    def __init__(self, first: int, shown: Shown, view: View, most: int, t_ns: int, watch: Stopwatch) -> None:
         view.advance(shown, None, t_ns, watch)
-        count = view.refill(0, t_ns, _POINTS)
+        count = view.refill(0, t_ns, most)
         self.first, self.image = first, np.asarray(shown.image, np.uint8)
         self.xy: Float = np.full((count, IMAGES + 1, 2), np.nan)
         self.xy[view.ids, 0] = view.xy
@@ -160,7 +163,10 @@ def _faithful(off_px: Float, there: Bool, known: Bool) -> Float:
 
 
 def _information(off_px: Float, there: Bool, known: Bool) -> Float:
-    return _share(there * _SIGMA_PX**2 / (_SIGMA_PX**2 + np.square(off_px)), known)
+    # By what is usual in the image: also where all points stray, as under blur, there are those to be preferred.
+    usual_px = 2.0 * float(np.median(off_px[there])) if there.any() else 0.0
+    variance = max(usual_px, _FINEST_PX) ** 2
+    return _share(there * variance / (variance + np.square(off_px)), known)
 
 
 def _clean(off_px: Float, there: Bool, _: Bool) -> Float:

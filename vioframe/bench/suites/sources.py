@@ -38,10 +38,6 @@ class Euroc(NamedTuple):
     height_m: float
     conditions: Mapping[str, float]
 
-    def tour(self, route: int) -> PartConfig:
-        options: dict[str, Any] = {"route": route, "mean_speed_m_s": self.mean_speed_m_s}
-        return PartConfig(name="tour", options={**options, "width_m": self.width_m, "height_m": self.height_m})
-
 
 EUROC = {
     "MH_01_easy": Euroc(40.0, 142.0, 0.6, 10.0, 3.0, {}),
@@ -56,6 +52,13 @@ EUROC = {
     "V2_02_medium": Euroc(0.0, 115.0, 0.72, 5.0, 1.5, {}),
     "V2_03_difficult": Euroc(0.0, 115.0, 0.75, 5.0, 1.5, {"motion_blur": 0.3}),
 }
+
+
+def tour(name: str) -> PartConfig:
+    """The simulated flight that stands in for a sequence of EuRoC's, a route of its own at the same speed."""
+    known, route = EUROC[name], 1 + list(EUROC).index(name)
+    options: dict[str, Any] = {"route": route, "mean_speed_m_s": known.mean_speed_m_s}
+    return PartConfig(name="tour", options={**options, "width_m": known.width_m, "height_m": known.height_m})
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,7 +144,7 @@ def flown(
         # It begins at its beginning: there is no shaking before the take-off to be skipped.
         begin_s = 0.0
         settings |= {
-            "flight": known.tour(1 + list(EUROC).index(name)),
+            "flight": tour(name),
             "duration_s": min(known.duration_s, duration_s or known.duration_s),
             "conditions": {**known.conditions, **conditions},
         }
