@@ -120,6 +120,16 @@ def test_information_goes_by_what_is_usual_in_the_image():
     assert worth(0.05).min() > worth(1.0).min() + 0.3
 
 
+def test_foresight_offers_what_will_tell_most_and_knows_no_other_image():
+    from foresight import Foresight
+
+    points = replace(fates(), xy=np.arange(12, dtype=np.float32).reshape(6, 2))
+    detector = Foresight([points])
+    found = detector.detect(points.pixels.copy(), 3)
+    assert sorted(found.xy[:, 0].tolist()) == [0.0, 8.0, 10.0]  # that stay for as long as they are known
+    assert len(detector.detect(points.pixels + np.uint8(1), 3).xy) == 0
+
+
 def test_points_are_where_the_crops_show_them():
     """Mirrored or not: what is white in a picture is so in its crops."""
     rng = np.random.default_rng(1)
