@@ -22,16 +22,14 @@ import numpy as np
 from common import HERE, backend_rows, present, render, script
 from rendered_flights import seeds
 from threadpoolctl import threadpool_limits
+from tracks import packets
 
 from vioframe.bench import Row
 from vioframe.bench.suites import suite
 from vioframe.bench.suites.sources import tour
 from vioframe.cores import usable_cores
-from vioframe.frontend import Frontend, FrontendOptions
 from vioframe.geometry.trajectory import Trajectory
-from vioframe.incidents import Incidents
 from vioframe.interfaces import Detector
-from vioframe.io.synchronise import synchronise
 from vioframe.parts import registry
 from vioframe.parts.registry import Registry
 from vioframe.simulation import TrackSequence
@@ -104,17 +102,12 @@ def flown(condition: str, world: int) -> list[Row]:
 def seen(bag: Path, detector: Detector, installed: Registry) -> TrackSequence:
     """What the front-end makes of the points of ``detector`` in the simulated recording ``bag``."""
     dataset = installed.open_dataset(bag)
-    calibration, truth = dataset.calibration, dataset.ground_truth
+    truth = dataset.ground_truth
     assert truth is not None  # it is simulated
-    frontend = Frontend(detector, calibration, FrontendOptions(), Incidents())
-    packets = tuple(
-        (imu, frontend.track(imu, frames, calibration))
-        for imu, frames in synchronise(dataset.measurements(), incidents=Incidents())
-        if truth.covers([frames.t_ns])[0]
-    )
-    t_ns = np.array([tracks.t_ns for _, tracks in packets])
+    followed = tuple(packets(dataset, detector, truth))
+    t_ns = np.array([tracks.t_ns for _, tracks in followed])
     motion = truth.at(t_ns)
-    return TrackSequence(bag.stem, calibration, packets, Trajectory(t_ns, motion.R_WB, motion.p_WB))
+    return TrackSequence(bag.stem, dataset.calibration, followed, Trajectory(t_ns, motion.R_WB, motion.p_WB))
 
 
 if __name__ == "__main__":
