@@ -14,8 +14,12 @@ from rich.table import Table
 from threadpoolctl import threadpool_limits
 
 from vioframe.bench import Row, backend_row, record, run_backend
-from vioframe.cores import usable_cores
+from vioframe.cores import limited_threads, usable_cores
 from vioframe.errors import VioframeError
+from vioframe.frontend import Frontend, FrontendOptions
+from vioframe.incidents import Incidents
+from vioframe.interfaces import Dataset, Detector
+from vioframe.io.synchronise import synchronise
 from vioframe.parts import config as configuration
 from vioframe.parts import registry
 from vioframe.parts.config import Config, PartConfig
@@ -99,6 +103,21 @@ def render(simulated: SimulationConfig, installed: Registry, bag: Path) -> None:
     """Write the recording that ``simulated`` describes to ``bag``, in place of one that is there."""
     recording = SimulatedRecording(complete(simulated, installed), installed, usable_cores())
     write_recording(recording, [bag], overwrite=True)
+
+
+def tracked(dataset: Dataset, detector: Detector, options: FrontendOptions | None = None) -> TrackSequence:
+    """What the front-end makes of the points of ``detector`` in the images of ``dataset`` that its truth covers."""
+    calibration, truth, incidents = dataset.calibration, dataset.ground_truth, Incidents()
+    assert truth is not None
+    frontend = Frontend(detector, calibration, options or FrontendOptions(), incidents)
+    offset_ns = calibration.cameras[0].time_offset_ns
+    with limited_threads():
+        packets = tuple(
+            (imu, frontend.track(imu, frames, calibration))
+            for imu, frames in synchronise(dataset.measurements(), incidents, time_offset_ns=offset_ns)
+            if truth.covers([frames.t_ns])[0]
+        )
+    return TrackSequence(dataset.name, calibration, packets, truth)
 
 
 def present(

@@ -29,7 +29,7 @@ from typing import Any
 
 import click
 import numpy as np
-from common import benchmark, present
+from common import benchmark, present, tracked
 from threadpoolctl import threadpool_limits
 
 from vioframe.arrays import Float, Int
@@ -37,10 +37,7 @@ from vioframe.bench import Row, backend_row, run_backend
 from vioframe.bench.suites.sources import EUROC
 from vioframe.cores import usable_cores
 from vioframe.evaluation.tracks import landmarks_of
-from vioframe.frontend import Frontend
 from vioframe.geometry.trajectory import Trajectory
-from vioframe.incidents import Incidents
-from vioframe.io.synchronise import synchronise
 from vioframe.parts import config as configuration
 from vioframe.parts import registry
 from vioframe.parts.config import Config, PartConfig
@@ -147,7 +144,9 @@ def main(
                 settings = {"recorded": folder, "start_s": start_s, "duration_s": duration_s, "seed": world}
                 simulation = complete(SimulationConfig.model_validate(settings), installed)
                 recording = SimulatedRecording(simulation, installed, usable_cores())
-                followed = follow(recording, config, installed)
+                detector = installed.create_detector(config.detector.name, config.detector.options)
+                sequence = tracked(recording, detector, config.frontend_options)
+                followed = with_landmarks([tracks for _, tracks in sequence.packets], recording)
                 flown_mm = None
                 for case in CASES:
                     row = estimated(case, followed, recording, config, installed, world)
@@ -157,16 +156,6 @@ def main(
 
     about = {"backend": backend, "options": list(assignments), "duration_s": duration_s, "outlier_px": OUTLIER_PX}
     present("error_budget", f"{backend}: where the error comes from", rows(), COLUMNS, about, keep)
-
-
-def follow(recording: SimulatedRecording, config: Config, installed: Registry) -> Followed:
-    """Follow points through the images of ``recording``, and find the landmarks behind them."""
-    calibration = recording.calibration
-    detector = installed.create_detector(config.detector.name, config.detector.options)
-    incidents, offset_ns = Incidents(), calibration.cameras[0].time_offset_ns
-    frontend = Frontend(detector, calibration, config.frontend_options, incidents)
-    packets = synchronise(recording.measurements(), incidents=incidents, time_offset_ns=offset_ns)
-    return with_landmarks([frontend.track(imu, frames, calibration) for imu, frames in packets], recording)
 
 
 def with_landmarks(tracks: Sequence[FrameTracks], recording: SimulatedRecording) -> Followed:

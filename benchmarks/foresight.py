@@ -19,20 +19,16 @@ from tempfile import TemporaryDirectory
 
 import click
 import numpy as np
-from common import HERE, backend_rows, present, render, script
+from common import HERE, backend_rows, present, render, script, tracked
 from rendered_flights import seeds
 from threadpoolctl import threadpool_limits
-from tracks import packets
 
 from vioframe.bench import Row
 from vioframe.bench.suites import suite
 from vioframe.bench.suites.sources import tour
 from vioframe.cores import usable_cores
-from vioframe.geometry.trajectory import Trajectory
 from vioframe.interfaces import Detector
 from vioframe.parts import registry
-from vioframe.parts.registry import Registry
-from vioframe.simulation import TrackSequence
 from vioframe.simulation.config import SimulationConfig
 from vioframe.types import Image, Keypoints
 from vioframe_keypointnet.training.followed import Followed, follow, wanted
@@ -68,7 +64,14 @@ def main(worlds: int, keep: bool) -> None:
     """The error of back-ends by points of which it is known what will become of them."""
     conditions = "", *suite.read(HERE / "suites" / "stress.yaml").conditions
     flights = list(product(conditions, seeds(worlds)))
-    settings = {"flight": FLIGHT, "duration_s": DURATION_S, "level": LEVEL, "every": EVERY, "points": POINTS}
+    settings = {
+        "flight": FLIGHT,
+        "duration_s": DURATION_S,
+        "level": LEVEL,
+        "every": EVERY,
+        "points": POINTS,
+        "apart_px": APART_PX,
+    }
     with ProcessPoolExecutor(usable_cores(), mp_context=get_context("spawn")) as workers:
         rows = chain.from_iterable(workers.map(flown, *zip(*flights, strict=True)))
         present("foresight", "ATE by points whose fate is known", rows, COLUMNS, settings, keep)
@@ -92,22 +95,14 @@ def flown(condition: str, world: int) -> list[Row]:
         }
         detectors["foresight"] = Foresight(follow(bag, every=EVERY, points=POINTS, apart_px=APART_PX))
         sequences = [
-            ({"condition": condition or "clear", "world": world, "detector": name}, seen(bag, detector, installed))
+            (
+                {"condition": condition or "clear", "world": world, "detector": name},
+                tracked(installed.open_dataset(bag), detector),
+            )
             for name, detector in detectors.items()
         ]
         rows = [{**row, "backend": backend} for backend in BACKENDS for row in backend_rows(sequences, backend, ())]
     return [{**row, "ate_mm": 1e3 * row["ate_m"]} for row in rows if "ate_m" in row]
-
-
-def seen(bag: Path, detector: Detector, installed: Registry) -> TrackSequence:
-    """What the front-end makes of the points of ``detector`` in the simulated recording ``bag``."""
-    dataset = installed.open_dataset(bag)
-    truth = dataset.ground_truth
-    assert truth is not None  # it is simulated
-    followed = tuple(packets(dataset, detector, truth))
-    t_ns = np.array([tracks.t_ns for _, tracks in followed])
-    motion = truth.at(t_ns)
-    return TrackSequence(bag.stem, dataset.calibration, followed, Trajectory(t_ns, motion.R_WB, motion.p_WB))
 
 
 if __name__ == "__main__":

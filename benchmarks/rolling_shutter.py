@@ -17,13 +17,10 @@ from tempfile import TemporaryDirectory
 
 import click
 import numpy as np
-from common import benchmark, present, render
+from common import benchmark, present, render, tracked
 
 from vioframe.bench import Row, backend_row, run_backend
 from vioframe.cores import limited_threads
-from vioframe.frontend import Frontend, FrontendOptions
-from vioframe.incidents import Incidents
-from vioframe.io.synchronise import synchronise
 from vioframe.parts import config as configuration
 from vioframe.parts import registry
 from vioframe.parts.config import Config, PartConfig
@@ -76,7 +73,10 @@ def main(data: Path, backend: str, assignments: tuple[str, ...], keep: bool, rec
             folder.mkdir(parents=True, exist_ok=True)
             for (flight, duration_s), world in product(FLIGHTS_S.items(), WORLDS):
                 bags = {ms: rendered(folder, flight, world, duration_s, ms, installed) for ms in (0.0, READOUT_MS)}
-                seen = {ms: tracked(bag) for ms, bag in bags.items()}
+                seen = {
+                    ms: tracked(installed.open_dataset(bag), installed.create_detector("shi_tomasi"))
+                    for ms, bag in bags.items()
+                }
                 for shutter, (true_ms, told_ms, estimate) in CASES.items():
                     for start_s in np.arange(0.0, duration_s - PIECE_S + 0.5 * EVERY_S, EVERY_S).tolist():
                         sequence = piece(seen[true_ms], start_s, 1e-3 * told_ms)
@@ -121,21 +121,6 @@ def rendered(folder: Path, flight: str, world: int, duration_s: float, readout_m
         )
         render(config, installed, bag)
     return bag
-
-
-def tracked(bag: Path) -> TrackSequence:
-    """What the front-end, with its defaults, follows in a recording."""
-    installed = registry.load()
-    dataset = installed.open_dataset(bag)
-    calibration, incidents = dataset.calibration, Incidents()
-    frontend = Frontend(installed.create_detector("shi_tomasi"), calibration, FrontendOptions(), incidents)
-    with limited_threads():
-        packets = tuple(
-            (imu, frontend.track(imu, frames, calibration))
-            for imu, frames in synchronise(dataset.measurements(), incidents=incidents)
-        )
-    assert dataset.ground_truth is not None
-    return TrackSequence(bag.stem, calibration, packets, dataset.ground_truth)
 
 
 def piece(sequence: TrackSequence, start_s: float, told_s: float) -> TrackSequence:

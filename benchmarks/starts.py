@@ -15,18 +15,15 @@ from pathlib import Path
 import click
 import numpy as np
 from april_board import april_sequence
-from common import benchmark, present
+from common import benchmark, present, tracked
 from threadpoolctl import threadpool_limits
 
 from vioframe.bench import Row
 from vioframe.bench.processes import installed, map_in_processes
 from vioframe.errors import TrajectoryError
 from vioframe.evaluation import evaluate
-from vioframe.frontend import Frontend, FrontendOptions
 from vioframe.geometry import so3
 from vioframe.geometry.trajectory import Trajectory
-from vioframe.incidents import Incidents
-from vioframe.io.synchronise import synchronise
 from vioframe.odometry import Odometry
 from vioframe.parts import config as configuration
 from vioframe.parts.config import Config, PartConfig
@@ -100,7 +97,9 @@ def main(
 
 def sequences(data: Path) -> Iterator[tuple[str, TrackSequence]]:
     """The recordings as tracks with truth."""
-    yield "MH_01_easy_15s", tracked(data / "euroc/MH_01_easy_15s")
+    parts = installed()
+    clip = parts.open_dataset(data / "euroc/MH_01_easy_15s", options={"cameras": ["cam0"]})
+    yield clip.name, tracked(clip, parts.create_detector("shi_tomasi"))
     for seed, (name, duration_s) in enumerate(FLIGHTS.items(), _FIRST_WORLD):
         bias_gyro_B, bias_accel_B = np.array([-0.002, 0.02, 0.08]), np.array([-0.02, 0.13, 0.07])
         flown = simulated_sequence(
@@ -108,23 +107,6 @@ def sequences(data: Path) -> Iterator[tuple[str, TrackSequence]]:
         )
         yield name, flown
     yield "april", april_sequence(data / "euroc_imu_april")
-
-
-def tracked(folder: Path) -> TrackSequence:
-    """What the front-end makes of real images."""
-    parts = installed()
-    source = parts.open_dataset(folder, options={"cameras": ["cam0"]})
-    calibration, truth = source.calibration, source.ground_truth
-    assert truth is not None
-    detector = parts.create_detector("shi_tomasi")
-    frontend = Frontend(detector, calibration, FrontendOptions(), Incidents())
-    packets = [
-        (imu, frontend.track(imu, frames, calibration))
-        for imu, frames in synchronise(
-            source.measurements(), Incidents(), time_offset_ns=calibration.cameras[0].time_offset_ns
-        )
-    ]
-    return TrackSequence(folder.name, calibration, tuple(packets), truth)
 
 
 def faulty(calibration: Calibration, fault: str) -> Calibration:

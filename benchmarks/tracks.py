@@ -14,24 +14,18 @@ from tempfile import TemporaryDirectory
 
 import click
 import numpy as np
-from common import HERE, SHARED_DATA, present, render, script
+from common import HERE, SHARED_DATA, present, render, script, tracked
 from rendered_flights import seeds
 from threadpoolctl import threadpool_limits
 
 from vioframe.bench import Row
 from vioframe.bench.suites import suite
 from vioframe.evaluation.tracks import TrackLives, track_lives
-from vioframe.frontend import Frontend, FrontendOptions
 from vioframe.geometry.meshes import read_mesh
-from vioframe.geometry.trajectory import Trajectory
-from vioframe.incidents import Incidents
-from vioframe.interfaces import Dataset, Detector
-from vioframe.io.synchronise import synchronise
 from vioframe.parts import registry
 from vioframe.parts.config import PartConfig
 from vioframe.parts.registry import Registry
 from vioframe.simulation.config import MESH, SimulationConfig, simulation_folder
-from vioframe.simulation.tracks import Packet
 
 FLIGHT, START_S, DURATION_S = "V1_02_medium", 5.0, 15.0
 LEVEL = 0.67
@@ -85,21 +79,11 @@ def main(keep: bool, data: Path) -> None:
 
 def lives(bag: Path, detector: PartConfig, installed: Registry) -> TrackLives:
     """Of the tracks through the simulated recording ``bag`` by the front-end with ``detector``."""
-    dataset = installed.open_dataset(bag)
-    truth = dataset.ground_truth
-    assert truth is not None  # it is simulated
     made = installed.create_detector(detector.name, detector.options)
-    steps = [tracks for _, tracks in packets(dataset, made, truth)]
-    return track_lives(steps, truth, dataset.calibration.cameras[0], read_mesh(simulation_folder(bag) / MESH))
-
-
-def packets(dataset: Dataset, detector: Detector, truth: Trajectory) -> Iterator[Packet]:
-    """What the front-end makes of the points of ``detector`` in the frames that the ``truth`` covers."""
-    calibration = dataset.calibration
-    frontend = Frontend(detector, calibration, FrontendOptions(), Incidents())
-    for imu, frames in synchronise(dataset.measurements(), incidents=Incidents()):
-        if truth.covers([frames.t_ns])[0]:
-            yield imu, frontend.track(imu, frames, calibration)
+    sequence = tracked(installed.open_dataset(bag), made)
+    steps = [tracks for _, tracks in sequence.packets]
+    (camera,) = sequence.calibration.cameras
+    return track_lives(steps, sequence.ground_truth, camera, read_mesh(simulation_folder(bag) / MESH))
 
 
 def summary(lives: TrackLives) -> Row:
