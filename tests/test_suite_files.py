@@ -123,7 +123,7 @@ class TestFiles:
         assert [each.called for each in part.detectors] == ["keypointnet"]
         assert [each.called for each in part.backends] == ["msckf"]
         assert part.seeds == 1
-        with pytest.raises(ConfigError, match="it has shi_tomasi, keypointnet"):
+        with pytest.raises(ConfigError, match="it has shi_tomasi, shi_tomasi:min_distance_px=4, keypointnet"):
             suites.narrowed(whole, detectors=["orb"])
 
     @pytest.mark.parametrize(
