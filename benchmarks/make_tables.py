@@ -553,7 +553,14 @@ def comparison() -> str:
         for _, row in table.iterrows()
         for duel in [against.get((row["detector"], row["back-end"]))]
     ]
-    return markdown(shown) + suite_source("mh05_comparison")
+    # Geometric means over the same worlds: the quotient of two is that of one detector to the other.
+    rival = "shi_tomasi:min_distance_px=4"
+    over = [
+        f"{against['keypointnet', backend]['ratio'] / against[rival, backend]['ratio']:.2f} (`{backend}`)"
+        for backend in table["back-end"].unique()
+    ]
+    told = f"\nOver that of `{rival}`, `keypointnet` has {', '.join(over)}.\n"
+    return markdown(shown) + told + suite_source("mh05_comparison")
 
 
 def stress() -> str:
@@ -615,8 +622,18 @@ def foresight() -> str:
 
 
 def tuning() -> str:
-    """The suite ``tuning``: what each variant reaches by Shi-Tomasi's ATE, in the clear and in all that is degraded."""
-    table = _duels("tuning")
+    """The suite ``tuning``."""
+    return _variants("tuning")
+
+
+def targets_flown() -> str:
+    """The suite ``targets``."""
+    return _variants("targets")
+
+
+def _variants(suite: str) -> str:
+    """What each detector of it reaches by the first one's ATE, in the clear and in all that is degraded."""
+    table = _duels(suite)
     ratios = table.pivot_table(index="detector", columns=["back-end", "condition"], values="ratio", sort=False)
     conditions = "clear", "all degraded"
     shown = [
@@ -627,7 +644,7 @@ def tuning() -> str:
         }
         for detector, row in ratios.iterrows()
     ]
-    return markdown(shown) + suite_source("tuning")
+    return markdown(shown) + suite_source(suite)
 
 
 def targets() -> str:

@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Iterator
-from itertools import islice
+from itertools import islice, product
 from pathlib import Path
 from typing import Any
 
@@ -42,6 +42,15 @@ def compared(tmp_path_factory: pytest.TempPathFactory) -> Study:
 @pytest.fixture(scope="module")
 def stressed(tmp_path_factory: pytest.TempPathFactory) -> Study:
     return stress(tmp_path_factory.mktemp("suite") / "results").study()
+
+
+@pytest.fixture(scope="module")
+def crowded(tmp_path_factory: pytest.TempPathFactory) -> Study:
+    """Three detectors with two back-ends each."""
+    made = MadeUp(tmp_path_factory.mktemp("crowded") / "r")
+    for detector, backend in product(("orb", "shi_tomasi", "sift"), ("msckf", "sliding_window")):
+        made.flight(labels(detector=detector, backend=backend))
+    return made.study()
 
 
 def named(study: Study) -> dict[str, Figure]:
@@ -120,6 +129,25 @@ def test_the_band_is_shaded_and_each_line_says_how_much_of_it_is_inside(compared
     assert axes[1, 0].get_legend().get_texts()[0].get_text() == f"{share['y']:.1f} % inside"
     assert [text.get_text() for text in canvas.legends[0].get_texts()] == ["shi_tomasi", "keypointnet"]
     assert "±20 cm" in canvas.get_supxlabel()
+
+
+@pytest.mark.parametrize("name", ["trajectories_3d", "relative_error"])
+def test_a_legend_of_many_tells_detectors_by_colour_and_back_ends_by_dashes_or_shade(crowded, name):
+    legend = drawn(crowded, name).legends[0]
+    shown = dict(zip((text.get_text() for text in legend.get_texts()), legend.legend_handles, strict=True))
+    shown.pop("ground truth", None)
+    assert list(shown) == ["orb", "shi_tomasi", "sift", "msckf", "sliding_window"]
+    lines = name == "trajectories_3d"
+    looks = [(h.get_color(), h.get_linestyle()) if lines else h.get_facecolor() for h in shown.values()]
+    assert len(set(looks)) == len(looks)
+
+
+def test_notes_in_two_lines_leave_room_for_the_title(crowded):
+    canvas = drawn(crowded, "comparison")
+    canvas.draw_without_rendering()
+    ax = canvas.axes[0]
+    assert len(ax.get_legend().get_texts()) == 3
+    assert ax._left_title.get_window_extent().y0 >= ax.get_legend().get_window_extent().y1
 
 
 def test_without_a_reference_no_band_is_shaded(tmp_path):

@@ -7,6 +7,7 @@ A column a back-end, or one for each of several pictures side by side: on paper 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from math import ceil
 from pathlib import Path
 from textwrap import fill
 from types import MappingProxyType
@@ -16,7 +17,7 @@ import numpy as np
 
 from vioframe.errors import RunError
 from vioframe.report.figures import Case, Figure, Layout, Trace
-from vioframe.report.style import DASHES, RC
+from vioframe.report.style import DASHES, RC, SERIES
 
 _DPI = 200
 """Twice what a figure is laid out for."""
@@ -28,6 +29,8 @@ _SPREAD = 4.0
 """Columns whose errors differ by more than this factor each have a scale of their own."""
 _DASHES = dict(zip(DASHES, ("-", (0, (5, 1.6)), (0, (1.5, 1.2)), (0, (6, 1.5, 1.5, 1.5))), strict=True))
 _MARKERS = {"circle": "o", "square": "s", "triangle-up": "^", "diamond": "D", "line-ew": "_"}
+_NO_COLOUR = "#555555"
+"""Stands for all colours in a legend."""
 _THICK = 2.5
 """Points; a line that is broader than this is the ground truth, below all others."""
 _VIEWS = {"top_view": (0, 1), "side_view": (0, 2)}
@@ -105,9 +108,10 @@ def _draw(case: Case, caption: str) -> Any:
     for k, (title, traces, layout) in enumerate(columns):
         for row, ax in enumerate(panels[:, k]):
             own = [trace for trace in traces if trace.get("yaxis", "y") == f"y{row + 1 if row else ''}"]
-            _panel(ax, own, layout, row, by_backend=bool(title))
+            noted = _panel(ax, own, layout, row, by_backend=bool(title))
             ax.set_ylabel("" if k and not spatial else ax.get_ylabel())
-        panels[0, k].set_title(title or layout.get("title", {}).get("text", ""), pad=22 if rows > 1 else None)
+            if row == 0:
+                ax.set_title(title or layout.get("title", {}).get("text", ""), pad=6 + 16 * noted)
     for row in () if spatial or equal else panels:
         _same_scale(row)
     canvas.align_ylabels(() if spatial else panels[:, 0])
@@ -132,7 +136,8 @@ def _columns(case: Case) -> Iterator[tuple[str, Sequence[Trace], Layout]]:
             yield backend, [t for t in traces if t["meta"].get("backend", backend) == backend], layout
 
 
-def _panel(ax: Any, traces: Sequence[Trace], layout: Layout, row: int, *, by_backend: bool) -> None:
+def _panel(ax: Any, traces: Sequence[Trace], layout: Layout, row: int, *, by_backend: bool) -> int:
+    """Draw it; returns in how many lines its notes stand above it."""
     from matplotlib.lines import Line2D
 
     scene = layout.get("scene")
@@ -180,6 +185,7 @@ def _panel(ax: Any, traces: Sequence[Trace], layout: Layout, row: int, *, by_bac
         _space(ax, scene)
     if layout.get("equal"):
         ax.set_aspect("equal", adjustable="datalim")
+    return ceil(len(notes) / columns) if notes else 0
 
 
 def _scatter(ax: Any, trace: Trace, x: Any, y: Any, style: Mapping[str, Any]) -> None:
@@ -292,11 +298,46 @@ def _legend(canvas: Any, panels: Iterable[Any]) -> None:
             # A line says more of its series than the area about it.
             if label not in handles or isinstance(handles[label], Polygon):
                 handles[label] = handle
-    if handles:
+    if handles := _apart(handles):
         how: dict[str, Any] = {"loc": "outside upper left", "borderaxespad": 0.2}
         how["ncols"] = _columns_that_fit(canvas.get_figwidth(), list(handles), letters_an_inch=11.0)
         for shown in canvas.legend(list(handles.values()), list(handles), **how).get_lines():
             shown.set(lw=max(2.0, shown.get_linewidth()), alpha=1.0)
+
+
+def _apart(handles: dict[str, Any]) -> dict[str, Any]:
+    """Detectors by colour and back-ends by dashes or shade, where each is drawn with each and this says it shorter."""
+    from matplotlib.lines import Line2D
+    from matplotlib.patches import PathPatch
+
+    both = {label: handle for label, handle in handles.items() if SERIES in label}
+    detectors, backends = (list(dict.fromkeys(label.split(SERIES)[k] for label in both)) for k in (0, 1))
+    told = all(
+        isinstance(handle, PathPatch) or (isinstance(handle, Line2D) and handle.get_linestyle() != "None")
+        for handle in both.values()
+    )
+    if not told or len(both) < len(detectors) * len(backends) or len(both) <= len(detectors) + len(backends):
+        return handles
+    return (
+        {label: handle for label, handle in handles.items() if label not in both}
+        | {name: _alone(both[f"{name}{SERIES}{backends[0]}"], colour=True) for name in detectors}
+        | {name: _alone(both[f"{detectors[0]}{SERIES}{name}"], colour=False) for name in backends}
+    )
+
+
+def _alone(handle: Any, *, colour: bool) -> Any:
+    """What in a legend stands for the colour of a line or box, or for its dashes or shade."""
+    from matplotlib.lines import Line2D
+    from matplotlib.patches import Patch
+
+    if isinstance(handle, Line2D):
+        line = Line2D([], [])
+        line.update_from(handle)
+        line.set(**({"linestyle": "-"} if colour else {"color": _NO_COLOUR}))
+        return line
+    if colour:
+        return Patch(color=handle.get_edgecolor())
+    return Patch(facecolor=(_NO_COLOUR, handle.get_facecolor()[-1]), edgecolor=_NO_COLOUR)
 
 
 def _columns_that_fit(inch: float, labels: Sequence[str], letters_an_inch: float) -> int:

@@ -12,6 +12,8 @@ from vioframe.runs.evaluated import Evaluated
 _COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
 TRUTH_COLOUR = "#b0b0b0"
 DASHES = ("solid", "dash", "dot", "dashdot")
+SERIES = " · "
+"""Between detector and back-end, where a series is called by both."""
 
 RC: Mapping[Any, Any] = MappingProxyType(
     {

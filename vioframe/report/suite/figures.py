@@ -99,7 +99,7 @@ class Look:
         """In legends and tables; what all contenders share is left out."""
         if len(self.detectors) < 2:
             return backend
-        return detector if len(self.backends) < 2 else f"{detector} · {backend}"
+        return detector if len(self.backends) < 2 else f"{detector}{style.SERIES}{backend}"
 
     def meta(self, detector: str, backend: str, **more: Any) -> dict[str, Any]:
         return {"series": self.name(detector, backend), "detector": detector, "backend": backend, **more}
