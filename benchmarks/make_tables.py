@@ -716,6 +716,7 @@ FIGURES: dict[str, Callable[[], str]] = {
             comparison,
             tuning,
             targets,
+            targets_flown,
             stress,
             contest,
             exact_points,
