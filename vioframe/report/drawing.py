@@ -151,7 +151,7 @@ def _panel(ax: Any, traces: Sequence[Trace], layout: Layout, row: int, *, by_bac
         shift, width = 0.82 * shift, 0.68 / max(1, len(groups))
         line = trace.get("line", {})
         style = {"color": line.get("color"), "lw": max(0.4, (_SPATIAL if scene else 1.0) * 0.8 * line.get("width", 0))}
-        style["ls"] = "-" if by_backend else _DASHES[line.get("dash", "solid")]
+        style["ls"] = _dashes(line, by_backend)
         meta = trace["meta"]
         label = meta["detector"] if by_backend and "detector" in meta else meta.get("series", "")
         if trace["type"] == "scatter3d":
@@ -177,7 +177,10 @@ def _panel(ax: Any, traces: Sequence[Trace], layout: Layout, row: int, *, by_bac
             ax.axhspan(shape["y0"], shape["y1"], color=shape["fillcolor"], alpha=shape["opacity"], lw=0)
     notes = [(trace, note) for trace in traces if (note := trace["meta"].get("note"))]
     if notes:
-        handles = [Line2D([], [], color=trace["line"]["color"], label=note) for trace, note in notes]
+        lines = ((trace["line"], note) for trace, note in notes)
+        handles = [
+            Line2D([], [], color=line["color"], ls=_dashes(line, by_backend), label=note) for line, note in lines
+        ]
         panel_inch = ax.figure.get_figwidth() / ax.get_gridspec().ncols - 1.0
         columns = _columns_that_fit(panel_inch, [note for _, note in notes], letters_an_inch=13.0)
         ax.legend(handles=handles, loc="lower right", bbox_to_anchor=(1.0, 0.97), ncols=columns, fontsize=9.5)
@@ -186,6 +189,11 @@ def _panel(ax: Any, traces: Sequence[Trace], layout: Layout, row: int, *, by_bac
     if layout.get("equal"):
         ax.set_aspect("equal", adjustable="datalim")
     return ceil(len(notes) / columns) if notes else 0
+
+
+def _dashes(line: Mapping[str, Any], by_backend: bool) -> Any:
+    """Those of a line, where panels do not tell back-ends apart already."""
+    return "-" if by_backend else _DASHES[line.get("dash", "solid")]
 
 
 def _scatter(ax: Any, trace: Trace, x: Any, y: Any, style: Mapping[str, Any]) -> None:
